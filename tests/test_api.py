@@ -318,7 +318,7 @@ def test_another_batch_size_without_a_reset_is_refused(boat_agent):
         ({"high": "ucb"}, "has no options to choose"),
         ({"env": 3}, "must be a name such as"),
         ({"env": "nosuch"}, "env=nosuch: no such choice"),
-        ({"env": "CartPole-v1"}, r"action space Discrete\(2\)"),
+        ({"env": "toy_environments:Texting", "env.max_steps": 5}, r"action space Tuple\(Discrete\(2\), Text\("),
         ({"env": lambda: 3}, "is no environment"),
         ({"env": Reach}, "no time limit of its own; set env.max_steps"),
         ({"config_dirs": ["nowhere"]}, "there is no folder nowhere"),

@@ -9,16 +9,22 @@ import numpy as np
 import pytest
 import torch
 from action_trees import PAIR, TREES, UNIT, Recorder
+from conftest import compose_config
 from gymnasium import spaces
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, OneOf, Tuple
 from gymnasium_players import action
+from test_masks import SHORT
 from torchrl.envs.utils import check_env_specs
 
+import hpamdp
 from hpamdp import keys
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.env.gymnasium_form import VectorForm
 from hpamdp.policies.low_level.random import Random
+from hpamdp.run.train import run
 from hpamdp.specs import PAMDPSpecs
 
 STEPS = 200
@@ -359,12 +365,52 @@ def test_the_mask_of_a_state_may_be_a_dict_of_masks_in_a_vector_of_states():
         form.read(np.zeros(2, np.float32), {"action_mask": [1, 1, 0, 0, 0]})
 
 
+@pytest.mark.parametrize("form_of", [GymnasiumEnv.gymnasium_form, VectorForm], ids=["own", "vector"])
 @pytest.mark.parametrize("tree", TREES)
-def test_the_gymnasium_form_gives_actions_of_the_space(tree):
+def test_the_gymnasium_forms_give_actions_of_their_spaces(tree, form_of):
     env = make(tree, 3)
-    form = env.gymnasium_form()
+    form = form_of(env)
     acted = Random(PAMDPSpecs.from_env(env)).policy(env.reset())
     assert form.action_space.contains(form.write(acted[:1], is_batch=False))
     batch = form.write(acted, is_batch=True)
     rows = list(gymnasium.vector.utils.iterate(gymnasium.vector.utils.batch_space(form.action_space, 3), batch))
     assert len(rows) == 3 and all(form.action_space.contains(row) for row in rows)
+
+
+def test_the_form_of_a_problem_reads_bounds_and_masks_of_components():
+    env = saying("discretes and a box", {**BOUNDS, "action_mask": [1] * 6}, action_mask="info", parameter_bounds="info")
+    form = VectorForm(env)
+    observation, info = np.zeros(6, np.float32), {**BOUNDS, "action_mask": np.array([1, 0, 0, 1, 0, 1])}
+    rows, _ = form.read(observation, info)
+    assert rows[keys.PARAMETER_LOW].tolist() == BOUNDS["parameter_low"][None].tolist()
+    for changed, line in (
+        ({"action_mask": [1, 1, 0, 0, 0, 1]}, "action_mask of row 0 allows nothing of component 1"),
+        ({"action_mask": [1, 1, 0, 2, 0, 1]}, "action_mask must be 0 or 1"),
+        ({"parameter_low": [0.5]}, r"parameter_low must be numbers in shape \[1, 2\]"),
+        ({"parameter_low": None}, r"parameter_low must be numbers in shape \[1, 2\]"),
+    ):
+        with pytest.raises(ValueError, match=line):
+            form.read(observation, {**info, **changed})
+    with pytest.raises(ValueError, match="give the info of the step with its action_mask"):
+        form.read(observation)
+
+
+@pytest.mark.parametrize("low", ["random", "hppo", "hyar", "pdqn"])
+def test_a_problem_without_parameters_can_be_learned(low, tmp_path):
+    words = [f"low={low}", *SHORT[low], "high=none", "env=gymnasium", "env.entry_point=action_trees:Recorder"]
+    words += ["env.kwargs={tree: discrete}", "env.max_steps=10", "num_envs=4", "steps_per_batch=16"]
+    assert run(compose_config([*words, "total_frames=256", "eval.layouts=2"]), tmp_path) == 0
+
+
+def test_an_agent_acts_in_the_space_and_inside_the_bounds_of_the_state():
+    settings = {"total_frames": 64, "num_envs": 4, "steps_per_batch": 16, "high": "none", "low.minibatch_size": 16}
+    settings |= {"env.max_steps": 10, "env.parameter_bounds": "info"}
+    agent = hpamdp.train(lambda: Said("discretes and a box", BOUNDS), low="hppo", **settings)
+    for greedy in (True, False):
+        first, second, box = agent.act(np.zeros(2, np.float32), BOUNDS, greedy=greedy)
+        assert agent.action_space.contains((first, second, box))
+        assert (box >= BOUNDS["parameter_low"]).all() and (box <= BOUNDS["parameter_high"]).all()
+    with pytest.raises(ValueError, match="act: give the info of the step, which holds parameter_low and "):
+        agent.act(np.zeros(2, np.float32))
+    with pytest.raises(ConfigError, match="export: HPPO cannot be exported: the problem has bounds of the parameters"):
+        agent.export("agent.onnx")

@@ -248,7 +248,8 @@ class Agent:
 
         The inputs are `observation`, float32 `[N, observation_dim]`, the masks `action_mask` and `option_mask` if the
         problem has them, and, if the agent chooses options, `held_option`, int64 `[N]`, and `is_decision`, bool `[N]`.
-        The outputs are `discrete`, int64 `[N]`, `parameters`, float32 `[N, num_parameters]`, and `option`, int64 `[N]`.
+        The outputs are `discrete`, int64 `[N]`, or `[N, num_components]` if there are several components, `parameters`,
+        float32 `[N, num_parameters]`, and `option`, int64 `[N]`.
         The file scales observations as the agent does. Its properties name the actions and hold the parameters' bounds.
 
         Raises:

@@ -82,7 +82,9 @@ class GreedyStep(nn.Module):
         return {name: value.to(self.device) for name, value in inputs.items()}
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the discrete actions `[N]`, the parameters `[N, num_parameters]` and, if any, the options `[N]`.
+        """Return the discrete actions, the parameters `[N, num_parameters]` and, if any, the options `[N]`.
+
+        With one component the discrete actions are `[N]`, with several `[N, num_components]`.
 
         Args:
             inputs: as `names` says: the observation as a vector `[N, observation_dim]`; the masks, if the problem has
@@ -127,7 +129,8 @@ class GreedyStep(nn.Module):
         discrete, parameters = acted[0].get(keys.DISCRETE), acted[0].get(keys.PARAMETERS)
         for option, own in enumerate(acted[1:], 1):
             rows = td.get(keys.OPTION) == option
-            discrete = torch.where(rows, own.get(keys.DISCRETE), discrete)
+            chosen = own.get(keys.DISCRETE)
+            discrete = torch.where(rows.reshape(-1, *[1] * (chosen.ndim - 1)), chosen, discrete)
             parameters = torch.where(rows.unsqueeze(-1), own.get(keys.PARAMETERS), parameters)
         return discrete, parameters
 
@@ -171,6 +174,8 @@ def properties(specs: PAMDPSpecs, env: PAMDPEnv, option_length: float | None) ->
         "parameter_dims": specs.parameter_dims,
         "parameter_low": specs.parameter_low,
         "parameter_high": specs.parameter_high,
+        "component_sizes": specs.components.sizes,
+        "integer_parameters": specs.integer_parameters,
         "option_length": None if option_length in (None, math.inf) else option_length,
         "hpamdp_version": __version__,
     }
@@ -196,6 +201,11 @@ def _check_levels(agent: HierarchicalAgent) -> None:
             refusal = f"reads {' and '.join(level.needs)} entries, which only the environment can write"
         if refusal is not None:
             raise ConfigError(f"export: {type(level).__name__} cannot be exported: it {refusal}")
+    if agent.specs.has_parameter_bounds or agent.specs.has_pair_mask:
+        what = "bounds of the parameters in each state" if agent.specs.has_parameter_bounds else "a pair_mask"
+        raise ConfigError(
+            f"export: {_names(agent)} cannot be exported: the problem has {what}, which files cannot read"
+        )
     if agent.router.state_keys:
         raise ConfigError(f"export: {_names(agent)} cannot be exported: it remembers {agent.router.state_keys}")
 

@@ -21,6 +21,7 @@ from tensordict import TensorDict, TensorDictBase
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.batched_env import GOING_ON, SUCCESS, BatchedEnv
+from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium_adapter import (
     GymnasiumAdapter,
     GymnasiumVectorAdapter,
@@ -149,6 +150,8 @@ class NumpyBatchedEnv(NumpyRows):
     final_infos = ("is_success",)
 
     def __init__(self, env: BatchedEnv, batch: tuple[int, ...]) -> None:
+        if not env.components.is_single or any(env.integer_parameters):
+            raise ProblemError(f"{env.title}: the Gymnasium form of a BatchedEnv has one component of real parameters")
         super().__init__(rows_of(env), batch)
         self.action_space = _action_space(env)
         low, high = (np.array(side, np.float32) for side in env.observation_bounds)

@@ -74,7 +74,9 @@ class VectorForm(GymnasiumForm):
     """The form of a problem that Gymnasium sees as this package does.
 
     An observation is a vector. An action is `(discrete, (parameters of action 0, ..., of action K - 1))`. If the agent
-    chooses an option of the problem, the option comes first.
+    chooses an option of the problem, the option comes first. If there are several components, the action is a tuple of
+    these forms, one for each component; a box, which is a component of one discrete action, is its parameters alone.
+    Parameters are float32, or int64 if all of a discrete action's parameters are whole.
 
     Args:
         env: the problem, of any number of environments.
@@ -84,28 +86,63 @@ class VectorForm(GymnasiumForm):
         self._has_option = env.has_choice and env.option_actions is None  # grouped actions need no option to be taken
         self._device = env.device
         self._ends = np.cumsum(env.parameter_dims)[:-1]
-        self._mask_sizes = {
-            name: env.observation_spec[name].shape[-1]
-            for name in (keys.ACTION_MASK, keys.OPTION_MASK)
-            if name in env.observation_spec.keys()
+        self._components = env.components
+        observed = env.observation_spec_unbatched
+        self._mask_shapes = {
+            name: tuple(observed[name].shape)
+            for name in (keys.ACTION_MASK, keys.OPTION_MASK, keys.PAIR_MASK)
+            if name in observed.keys()
         }
-        self.num_entries = env.observation_spec_unbatched[keys.OBSERVATION].shape[-1]
+        self._bounds = [name for name in (keys.PARAMETER_LOW, keys.PARAMETER_HIGH) if name in observed.keys()]
+        self._num_parameters = sum(env.parameter_dims)
+        self.num_entries = observed[keys.OBSERVATION].shape[-1]
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.num_entries,), np.float32)
         bounds = env.full_action_spec_unbatched[keys.PARAMETERS].space
         lows, highs = (np.split(side.cpu().numpy().reshape(-1), self._ends) for side in (bounds.low, bounds.high))
-        boxes = [spaces.Box(low, high, dtype=np.float32) for low, high in zip(lows, highs, strict=True)]
-        parts: list[spaces.Space] = [spaces.Discrete(len(boxes)), spaces.Tuple(boxes)]
+        is_whole = np.array(env.integer_parameters or (False,) * self._num_parameters, bool)
+        self._dtypes = [
+            np.dtype(np.int64 if own.size and own.all() else np.float32) for own in np.split(is_whole, self._ends)
+        ]
+        boxes = [
+            spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
+            for low, high, dtype in zip(lows, highs, self._dtypes, strict=True)
+        ]
+        parts: list[spaces.Space] = self._grouped([spaces.Discrete(size) for size in self._components.sizes], boxes)
         if self._has_option:
             parts.insert(0, spaces.Discrete(len(env.option_names)))
         self.action_space = spaces.Tuple(parts)
 
+    def _grouped(self, discrete: Sequence[Any], own: Sequence[Any]) -> list[Any]:
+        """Return the parts of the action, of each component's discrete action and all discrete actions' parameters.
+
+        The parts are spaces if these are spaces, and values otherwise.
+        """
+        of_spaces = isinstance(discrete[0], spaces.Space)
+        joined: Any = spaces.Tuple if of_spaces else tuple
+        components = self._components
+        if components.is_single:
+            return [discrete[0], joined(own)]
+        parts = []
+        for number, start, size in zip(discrete, components.starts, components.sizes, strict=True):
+            of_component = joined(own[start : start + size])
+            parts.append(own[start] if size == 1 else joined((number, of_component)))
+        return parts
+
     def read(self, observation: Any, info: Mapping[str, Any] | None = None) -> tuple[TensorDict, bool]:
         """Return the rows of `GymnasiumForm.read`."""
         vectors, is_batch = self._vectors(observation)
+        num = len(vectors)
         rows = {keys.OBSERVATION: torch.from_numpy(vectors)}
-        for name in self._mask_sizes:
-            rows[name] = self._mask(name, info, len(vectors))
-        return TensorDict(rows, batch_size=[len(vectors)]).to(self._device), is_batch
+        for name, shape in self._mask_shapes.items():
+            mask = self._entry(name, "forbids some choices", info, (num, *shape))
+            if not np.isin(mask, (0, 1)).all():
+                raise ValueError(f"{name} must be 0 or 1, but is {info and info[name]!r:.80}")
+            sizes = self._components.sizes if name == keys.ACTION_MASK and not self._components.is_single else ()
+            rows[name] = checked_mask(name, mask, sizes)
+        for name in self._bounds:
+            bound = self._entry(name, "has other bounds in each state", info, (num, self._num_parameters))
+            rows[name] = torch.from_numpy(bound.astype(np.float32))
+        return TensorDict(rows, batch_size=[num]).to(self._device), is_batch
 
     def _vectors(self, observation: Any) -> tuple[np.ndarray, bool]:
         try:
@@ -124,25 +161,28 @@ class VectorForm(GymnasiumForm):
             raise ValueError(f"entry {int(np.argwhere(~np.isfinite(vectors))[0][-1])} of the observation is not finite")
         return vectors.reshape(-1, self.num_entries), vectors.ndim == 2
 
-    def _mask(self, name: str, info: Mapping[str, Any] | None, num: int) -> Tensor:
+    def _entry(self, name: str, why: str, info: Mapping[str, Any] | None, shape: tuple[int, ...]) -> np.ndarray:
+        """Return an entry of the info, whose first dimension may be left out if it is 1."""
         if info is None or name not in info:
-            raise ValueError(f"the problem forbids some choices, so give the info of the step with its {name}")
-        size = self._mask_sizes[name]
-        mask = np.asarray(info[name])
-        if mask.shape not in ((num, size), (size,) if num == 1 else (num, size)) or not np.isin(mask, (0, 1)).all():
-            raise ValueError(f"{name} must be 0 or 1 in shape [{num}, {size}], but is {info[name]!r:.80}")
-        return checked_mask(name, mask.reshape(num, size))
+            raise ValueError(f"the problem {why}, so give the info of the step with its {name}")
+        array = np.asarray(info[name])
+        if array.shape not in (shape, shape[1:] if shape[0] == 1 else shape) or array.dtype.kind not in "biuf":
+            raise ValueError(f"{name} must be numbers in shape {list(shape)}, but is {info[name]!r:.80}")
+        return array.reshape(shape)
 
     def write(self, acted: TensorDictBase, *, is_batch: bool) -> Any:
         """Return the action of `GymnasiumForm.write`."""
         discrete, parameters = (acted.get(key).cpu().numpy() for key in (keys.DISCRETE, keys.PARAMETERS))
-        own = np.split(parameters, self._ends, axis=-1)
+        parts = np.split(parameters, self._ends, axis=-1)
+        own = [part.astype(dtype, copy=False) for part, dtype in zip(parts, self._dtypes, strict=True)]
+        numbers = [discrete] if self._components.is_single else list(discrete.T)
         if not is_batch:
-            discrete, own = discrete[0], [each[0] for each in own]
+            numbers, own = [each[0] for each in numbers], [each[0] for each in own]
+        action = tuple(self._grouped(numbers, own))
         if not self._has_option:
-            return discrete, tuple(own)
+            return action
         option = acted.get(keys.OPTION).cpu().numpy()
-        return (option if is_batch else option[0]), discrete, tuple(own)
+        return (option if is_batch else option[0]), *action
 
 
 def checked_mask(name: str, mask: np.ndarray, component_sizes: Sequence[int] = ()) -> Tensor:

@@ -1,1 +1,1 @@
-"""The way in for other people's Gymnasium environments with parameterised actions."""
+"""The way in for other people's Gymnasium environments."""

@@ -1,4 +1,4 @@
-"""Any Gymnasium environment with parameterised actions, as one batched TorchRL environment."""
+"""Any Gymnasium environment, as one batched TorchRL environment."""
 
 from __future__ import annotations
 

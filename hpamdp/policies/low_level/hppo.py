@@ -216,10 +216,11 @@ class HPPO(OnPolicy, Learner):
             error = self.credit_critic.total(features, contributions) - rows["raw_advantage"]
             critic_loss = critic_loss + error.square().mean()
         loss = self.options.critic_weight * critic_loss - gain - entropy_weight * bonus
+        scale = distribution.log_scale.detach().mean().exp()
         return loss, {
             "critic": critic_loss,
             "discrete_entropy": discrete_entropy,
-            "scale": distribution.log_scale.detach().mean().exp(),
+            "scale": scale if self.specs.num_parameters else torch.zeros_like(scale),
             "discrete_kl": kl_estimate(discrete_log_ratio.detach()),
             "parameter_kl": kl_estimate(parameter_log_ratio.detach()),
             "discrete_clipped": clipped_fraction(discrete_log_ratio.detach(), self.options.clip),
