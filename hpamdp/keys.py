@@ -24,6 +24,9 @@ DECISION_OBSERVATION = "decision_observation"
 OPTION_ENDED = "option_ended"  # only where options may end inside their episodes
 EPISODE_RETURN, EPISODE_STEPS = "episode_return", "episode_steps"
 
+# Written by the agent with agent.termination=chosen: after how many steps the option ends.
+OPTION_LENGTH = "option_length"
+
 # Written by the agent for its learners if there is `option_ended`: the option that holds in the next state.
 NEXT_OPTION = ("next", "option")
 

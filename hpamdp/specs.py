@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeAlias
@@ -217,6 +217,18 @@ class PAMDPSpecs:
             initial_weight=weight,
             symmetries=None if symmetries is None else symmetries.with_option_observed(dim, self.num_options),
             geometry=None if geometry is None else geometry.with_option_observed(dim),
+        )
+
+    def with_option_lengths(self, lengths: Sequence[int]) -> PAMDPSpecs:
+        """Return the specs of a selector whose options are pairs of an option and its length in steps.
+
+        The pairs of an option are neighbours. What the problem declares of its options alone is left out.
+        """
+        return replace(
+            self,
+            option_names=tuple(f"{name}_{length}" for name in self.option_names for length in lengths),
+            option_actions=None,
+            symmetries=None,
         )
 
     def of_option(self, option: int) -> PAMDPSpecs:

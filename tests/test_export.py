@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import hpamdp
 from hpamdp import keys
 from hpamdp.api.agent import Agent
-from hpamdp.api.export import HELD_OPTION, GreedyStep
+from hpamdp.api.export import HELD_LENGTH, HELD_OPTION, GreedyStep
 from hpamdp.run.assemble import option_length
 from hpamdp.run.players import load_agent
 
@@ -61,11 +61,22 @@ CASES = {
         for name in ("hppo", "pdqn", "paddpg", "hsac", "hyar", "qpamdp")
     },
     "grouped": [*GROUPED, "high=meta_critic", "low=hppo", "agent.sharing=shared"],
+    "chosen": ["env=rooms", "high=actor", "low=hppo", "agent.termination=chosen", "agent.option_lengths=[1,2,4]"],
+    "grouped_chosen": [*GROUPED[:-2], "high=meta_critic", "low=hppo", "agent.termination=chosen"],
     "grouped_actor": [*GROUPED, "high=actor", "low=pdqn"],
     "grouped_value": [*GROUPED, "high=value", "low=hppo"],
 }
 # The others differ in their networks alone.
-QUICK = ["pdqn_that_searches", "hyar_nearest", "td3_bc", "exp3", "value_of_shared", "grouped"]
+QUICK = [
+    "pdqn_that_searches",
+    "hyar_nearest",
+    "td3_bc",
+    "exp3",
+    "value_of_shared",
+    "grouped",
+    "chosen",
+    "grouped_chosen",
+]
 
 
 class Own(gymnasium.Env):
@@ -129,6 +140,9 @@ def differences(agent: Agent, run, num_steps: int = 6, num_rows: int = 64) -> fl
     """
     width = np.array(agent.specs.parameter_high) - np.array(agent.specs.parameter_low)
     length = option_length(agent._config) or np.inf
+    is_chosen = length == "chosen"
+    if is_chosen:
+        length = np.ones(num_rows, np.int64)
     largest, held, age = 0.0, np.zeros(num_rows, np.int64), np.full(num_rows, np.inf)
     agent.reset()
     for vectors, info in steps(agent, num_steps, num_rows):
@@ -137,15 +151,20 @@ def differences(agent: Agent, run, num_steps: int = 6, num_rows: int = 64) -> fl
             vectors, info = vectors[0], {name: mask[0] for name, mask in info.items()}
         agent.act(vectors, info)
         acted = agent._last
-        is_due = age == np.inf if length == np.inf else age >= length
+        is_due = age == np.inf if length is np.inf else age >= length
         if agent.specs.num_options:
             inputs |= {HELD_OPTION: held, keys.IS_DECISION: is_due}
+        if is_chosen:
+            inputs |= {HELD_LENGTH: length}
         discrete, parameters, *option = run(inputs)
         np.testing.assert_array_equal(discrete, acted[keys.DISCRETE].numpy())
         if option:
             np.testing.assert_array_equal(option[0], acted[keys.OPTION].numpy())
             age = np.where(is_due | (option[0] != held), 1, age + 1)
             held = option[0]
+        if is_chosen:
+            np.testing.assert_array_equal(option[1], acted[keys.OPTION_LENGTH].numpy())
+            length = option[1]
         largest = max(largest, (np.abs(parameters - acted[keys.PARAMETERS].numpy()) / width).max())
     return largest
 

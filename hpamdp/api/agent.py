@@ -72,8 +72,7 @@ class Agent:
         self.action_space = self._form.action_space
         self._tracker: DecisionTracker = decision_tracker(env, option_length=option_length(config))
         # What must stay from step to step: the selector's choices, and the state of the learners' policies.
-        selector_keys = [] if agent.selector is None else agent.selector.out_keys
-        self._kept = [*selector_keys, *agent.router.state_keys]
+        self._kept = [*agent.choice_keys, *agent.router.state_keys]
         self._last: TensorDictBase | None = None
         self._starts = np.zeros(0, bool)
 

@@ -24,6 +24,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from hpamdp import __version__, keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.decisions import OptionLength
 from hpamdp.env.gymnasium_form import VectorScaling
 from hpamdp.files import replacing
 from hpamdp.policies.agent import HierarchicalAgent, OptionRouter, with_option
@@ -31,8 +32,8 @@ from hpamdp.policies.base import Level, Selector
 from hpamdp.specs import PAMDPSpecs
 
 # An ONNX graph has each name once, so the option that comes in is not called as the one that goes out.
-HELD_OPTION = "held_option"
-_OUTPUTS = ("discrete", "parameters", keys.OPTION)
+HELD_OPTION, HELD_LENGTH = "held_option", "held_length"
+_OUTPUTS = ("discrete", "parameters", keys.OPTION, keys.OPTION_LENGTH)
 _PACKAGES = ("onnx", "onnxscript")
 _EXAMPLE_ROWS = 4  # more than 1, which tracing would take for a constant
 
@@ -51,13 +52,14 @@ class GreedyStep(nn.Module):
         names: of the inputs, in order.
     """
 
-    def __init__(self, agent: HierarchicalAgent, scaling: VectorScaling | None, option_length: float | None) -> None:
+    def __init__(self, agent: HierarchicalAgent, scaling: VectorScaling | None, option_length: OptionLength) -> None:
         super().__init__()
         self.specs: PAMDPSpecs = agent.specs
         self.selector: Selector | None = agent.selector
         self.router: OptionRouter = agent.router
         self.device = agent.frames.device
         self.option_length = option_length
+        self.pairs = agent.pairs
         parts = {} if scaling is None else vars(scaling)
         self.scaling = {name: torch.as_tensor(part, device=self.device) for name, part in parts.items()}
         self.option_actions: Tensor | None = None
@@ -79,6 +81,8 @@ class GreedyStep(nn.Module):
         if self.selector is not None:
             inputs[HELD_OPTION] = torch.zeros(num, dtype=torch.long)
             inputs[keys.IS_DECISION] = torch.ones(num, dtype=torch.bool)
+        if self.pairs is not None:
+            inputs[HELD_LENGTH] = torch.ones(num, dtype=torch.long)
         return {name: value.to(self.device) for name, value in inputs.items()}
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
@@ -86,9 +90,12 @@ class GreedyStep(nn.Module):
 
         With one component the discrete actions are `[N]`, with several `[N, num_components]`.
 
+        The options' lengths `[N]` follow if the agent chooses them.
+
         Args:
             inputs: as `names` says: the observation as a vector `[N, observation_dim]`; the masks, if the problem has
-                any; the held option `[N]`, and whether a new one is due, bool `[N]`, if the agent chooses options.
+                any; the held option `[N]`, and whether a new one is due, bool `[N]`, if the agent chooses options; the
+                held length `[N]` if it chooses lengths.
         """
         given = dict(zip(self.names, inputs, strict=True))
         td = TensorDict({keys.OBSERVATION: self._scaled(given[keys.OBSERVATION])}, [inputs[0].shape[0]])
@@ -98,9 +105,11 @@ class GreedyStep(nn.Module):
         if self.option_actions is not None:
             td.set(keys.OPTION_MASK, (self.option_actions & given[keys.ACTION_MASK].unsqueeze(-2)).any(-1))
         if self.selector is not None:
-            td.set(keys.OPTION, self._option(td, given[HELD_OPTION], given[keys.IS_DECISION]))
-        discrete, parameters = self._action(td)
-        return (discrete, parameters) if self.selector is None else (discrete, parameters, td.get(keys.OPTION))
+            held = (given[HELD_OPTION], *([] if self.pairs is None else [given[HELD_LENGTH]]))
+            chosen = self._choice(td, held, given[keys.IS_DECISION])
+            td.set(keys.OPTION, chosen[0])
+            return (*self._action(td), *chosen)
+        return self._action(td)
 
     def _scaled(self, vectors: Tensor) -> Tensor:
         if not self.scaling:
@@ -110,15 +119,20 @@ class GreedyStep(nn.Module):
         scaled = (vectors - scaling["centre"]) / scaling["width"]
         return scaled.clamp(-scaling["limit"], scaling["limit"]).float()
 
-    def _option(self, td: TensorDictBase, held: Tensor, is_decision: Tensor) -> Tensor:
-        """Return the options `[N]`: new ones where a decision is due or the held option ends."""
+    def _choice(self, td: TensorDictBase, held: tuple[Tensor, ...], is_decision: Tensor) -> tuple[Tensor, ...]:
+        """Return the options `[N]`, and their lengths if these are chosen.
+
+        They are new where a decision is due or the held option ends.
+        """
         assert self.selector is not None and self.choice is not None
-        td.set(keys.IS_DECISION, is_decision.unsqueeze(-1)).set(keys.OPTION, held)
+        option = held[0]
+        td.set(keys.IS_DECISION, is_decision.unsqueeze(-1)).set(keys.OPTION, option)
         if self.option_actions is not None and self.option_length is not None:
-            is_decision = is_decision | ~td.get(keys.OPTION_MASK).gather(-1, held.unsqueeze(-1)).squeeze(-1)
+            is_decision = is_decision | ~td.get(keys.OPTION_MASK).gather(-1, option.unsqueeze(-1)).squeeze(-1)
         if self.selector.decides_ends:
             is_decision = is_decision | self.selector.ends(td)
-        return torch.where(is_decision, self.choice(td), held)
+        fresh = (self.choice(td),) if self.pairs is None else self.pairs.split(self.choice(self.pairs.with_pairs(td)))
+        return tuple(torch.where(is_decision, new, old) for new, old in zip(fresh, held, strict=True))
 
     def _action(self, td: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return the discrete actions and the parameters of each row's own learner."""
@@ -136,7 +150,7 @@ class GreedyStep(nn.Module):
 
 
 def export_onnx(
-    path: Path, agent: HierarchicalAgent, env: PAMDPEnv, option_length: float | None, about: Mapping[str, Any]
+    path: Path, agent: HierarchicalAgent, env: PAMDPEnv, option_length: OptionLength, about: Mapping[str, Any]
 ) -> None:
     """Write an agent's greedy policy to an ONNX file.
 
@@ -157,6 +171,8 @@ def export_onnx(
     _check_levels(agent)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad(), _quiet():
         step = GreedyStep(agent, env.gymnasium_form().scaling(), option_length)
+        if agent.option_lengths:
+            about = {"option_lengths": agent.option_lengths, **about}
         try:
             data = _traced(step, {**properties(agent.specs, env, option_length), **about})
         except RuntimeError as error:
@@ -166,7 +182,7 @@ def export_onnx(
         partial.write_bytes(data)
 
 
-def properties(specs: PAMDPSpecs, env: PAMDPEnv, option_length: float | None) -> dict[str, Any]:
+def properties(specs: PAMDPSpecs, env: PAMDPEnv, option_length: OptionLength) -> dict[str, Any]:
     """Return what a reader of the file needs to know of a problem, as values for JSON."""
     return {
         "discrete_names": [str(name) for name in env.discrete_names or range(specs.num_discrete)],
@@ -176,7 +192,7 @@ def properties(specs: PAMDPSpecs, env: PAMDPEnv, option_length: float | None) ->
         "parameter_high": specs.parameter_high,
         "component_sizes": specs.components.sizes,
         "integer_parameters": specs.integer_parameters,
-        "option_length": None if option_length in (None, math.inf) else option_length,
+        "option_length": None if option_length in (None, math.inf, "chosen") else option_length,
         "hpamdp_version": __version__,
     }
 
@@ -226,7 +242,8 @@ def _traced(step: GreedyStep, about: Mapping[str, Any]) -> bytes:
     for node in program.graph.nodes:
         if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
             raise ConfigError("export: the agent cannot be exported: it samples even if it acts greedily")
-    outputs = _OUTPUTS if step.selector is not None else _OUTPUTS[:2]
+    num_outputs = 2 if step.selector is None else 3 if step.pairs is None else 4
+    outputs = _OUTPUTS[:num_outputs]
     exported = torch.onnx.export(
         program,
         input_names=step.names,

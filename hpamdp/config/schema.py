@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
@@ -31,15 +32,26 @@ def _check_device(name: str) -> str:
     return name
 
 
+def _check_rising(lengths: tuple[int, ...]) -> tuple[int, ...]:
+    if not lengths or any(one >= two for one, two in pairwise(lengths)):
+        raise ValueError("must be a list of rising numbers")
+    return lengths
+
+
 class AgentConfig(Settings):
     """Settings of how selector and learners act together."""
 
     sharing: Literal["per_option", "shared"] = "per_option"
     """`per_option`: one learner for each option. `shared`: one learner for all options, which observes the option."""
-    termination: Literal["episode", "steps", "learned"] = "episode"
-    """When options end: with the episode, after `option_length` steps, or at any step if the selector decides so."""
+    termination: Literal["episode", "steps", "learned", "chosen"] = "episode"
+    """When options end: with the episode, after `option_length` steps, or at any step if the selector decides so.
+
+    `chosen`: the selector chooses an option and its length, of `option_lengths`.
+    """
     option_length: PositiveInt | None = None
     """Steps of an option, with `termination=steps` only."""
+    option_lengths: Annotated[tuple[PositiveInt, ...], FromList, AfterValidator(_check_rising)] | None = None
+    """Numbers of steps to choose from with `termination=chosen`, rising. If null, 1, 2, 4, 8, 16, 32, 64 and 128."""
     uniform_option_steps: NonNegativeInt = 0
     """Steps at the start of training in which options are chosen uniformly, so that each option's learner gets data.
 

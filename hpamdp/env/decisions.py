@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -12,6 +12,8 @@ from torchrl.envs import Transform, TransformedEnv
 
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv, ProblemError
+
+OptionLength: TypeAlias = float | Literal["chosen"] | None
 
 
 class DecisionTracker(Transform):
@@ -39,13 +41,14 @@ class DecisionTracker(Transform):
         gamma: discount of an environment step within the option.
         option_length: steps after which an option ends, unless its episode ends first. If None, an option lasts the
             episode. If `math.inf`, the selector ends it: it sets `is_decision` in the root of the step at which it
-            chooses again.
+            chooses again. If "chosen", the policy writes the number of steps of each option under `option_length`,
+            int64 `[*B]`.
         option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`, if options are sets of
             actions and some may be forbidden; else None.
     """
 
     def __init__(
-        self, gamma: float = 1.0, option_length: float | None = None, option_actions: Tensor | None = None
+        self, gamma: float = 1.0, option_length: OptionLength = None, option_actions: Tensor | None = None
     ) -> None:
         super().__init__()
         self.gamma = gamma
@@ -107,7 +110,10 @@ class DecisionTracker(Transform):
             option_return = _zero_where(is_first, option_return)
             option_steps = _zero_where(is_first, option_steps)
             decision_observation = torch.where(is_first, tensordict.get(keys.OBSERVATION), decision_observation)
-            option_ended = option_steps + 1 >= self.option_length
+            length = self.option_length
+            if length == "chosen":
+                length = tensordict[keys.OPTION_LENGTH].unsqueeze(-1)
+            option_ended = option_steps + 1 >= length
             if is_stuck is not None:
                 option_ended = option_ended | is_stuck
             is_decision = done | option_ended
@@ -136,7 +142,7 @@ class DecisionTracker(Transform):
             row = int(is_stuck.flatten().nonzero()[0])
             raise ProblemError(
                 f"environment {row}: option {option.flatten()[row].item()} has no allowed action left, and options "
-                "last as long as their episodes; use agent.termination=steps or learned"
+                "last as long as their episodes; use agent.termination=steps, learned or chosen"
             )
         return is_stuck
 
@@ -183,7 +189,7 @@ class DecisionEnv(TransformedEnv):
         return self.base_env
 
 
-def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: float | None = None) -> DecisionTracker:
+def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLength = None) -> DecisionTracker:
     """Return a tracker for this environment; arguments as for `DecisionTracker`."""
     option_actions = None
     if env.option_actions is not None and keys.ACTION_MASK in env.observation_spec.keys():
@@ -191,6 +197,6 @@ def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: float | N
     return DecisionTracker(gamma, option_length, option_actions)
 
 
-def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: float | None = None) -> DecisionEnv:
+def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLength = None) -> DecisionEnv:
     """Return the environment with its decisions tracked; arguments as for `DecisionTracker`."""
     return DecisionEnv(env, decision_tracker(env, gamma, option_length))

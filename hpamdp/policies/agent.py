@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from hpamdp import keys
 from hpamdp.policies.base import Learner, Level, Selector, is_greedy
 from hpamdp.policies.masks import allowed_or_first
+from hpamdp.policies.option_lengths import OptionLengths, PairSelector
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -162,17 +163,25 @@ def _value(
 
 
 class HeldOption(TensorDictModuleBase):
-    """The same option in every environment at every step, or the first allowed option if it is forbidden."""
+    """The same option in every environment at every step, or the first allowed option if it is forbidden.
 
-    def __init__(self, option: int) -> None:
+    Args:
+        option: its number.
+        length: the length to write with it; None if lengths are not chosen.
+    """
+
+    def __init__(self, option: int, length: int | None = None) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.OPTION]
+        self.out_keys = [keys.OPTION, *([] if length is None else [keys.OPTION_LENGTH])]
         self.option = option
+        self.length = length
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write `option` int64 `[*B]`."""
+        """Write `option` int64 `[*B]`, and `option_length` if there is one."""
         option = torch.full(td.batch_size, self.option, device=td.get(keys.OBSERVATION).device)
+        if self.length is not None:
+            td.set(keys.OPTION_LENGTH, torch.full_like(option, self.length))
         mask = td.get(keys.OPTION_MASK, None)
         return td.set(keys.OPTION, option if mask is None else allowed_or_first(option, mask))
 
@@ -183,14 +192,24 @@ class AgentNextOptions:
     Args:
         selector: chooses the options.
         learners: one for each option, or a single one that observes the option.
+        num_options: how many options there are.
         is_shared: whether the single learner observes the option.
+        pairs: the pairs of options and lengths, if the selector chooses lengths.
     """
 
-    def __init__(self, selector: Selector, learners: Iterable[Learner], is_shared: bool) -> None:
+    def __init__(
+        self,
+        selector: Selector,
+        learners: Iterable[Learner],
+        num_options: int,
+        is_shared: bool,
+        pairs: OptionLengths | None = None,
+    ) -> None:
         self.selector = selector
         self.learners = list(learners)
-        self.num_options = selector.specs.num_options
+        self.num_options = num_options
         self.is_shared = is_shared
+        self.pairs = pairs
         self.sees_observation_alone = {*selector.in_keys} <= {keys.OBSERVATION, keys.IS_DECISION}
 
     @torch.no_grad()
@@ -241,6 +260,8 @@ class AgentNextOptions:
         is_decision = torch.ones(len(td), 1, dtype=torch.bool, device=td.get(keys.OBSERVATION).device)
         td = td.copy().set(keys.IS_DECISION, is_decision).set(keys.OPTION, held)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
+            if self.pairs is not None:
+                return self.pairs.split(self.selector.choose(self.pairs.with_pairs(td))[keys.OPTION])[0]
             option = self.selector.choose(td)[keys.OPTION]
             return torch.where(self.selector.ends(td), option, held) if self.decides_ends else option
 
@@ -292,10 +313,17 @@ class HierarchicalAgent(nn.Module):
         uniform_option_steps: number of steps at the beginning with uniform exploring choices; of decisions, if the
             learners are frozen. The selector learns from them.
         selector_ends_options: whether the selector decides where options end.
+        option_lengths: the lengths that the selector chooses from together with an option, in steps. The selector's
+            `specs` then list the pairs as options (`PAMDPSpecs.with_option_lengths`). If empty, it chooses options
+            alone.
 
     Attributes:
         policy: writes `option`, if there is a selector, and the action leaves.
         router: the low level's part of `policy`.
+        pairs: the pairs of options and lengths; None if the selector chooses options alone.
+
+    Raises:
+        ValueError: the selector's `specs` list other options than the pairs.
         frames: how many steps (decisions) the agent has learned from.
     """
 
@@ -310,6 +338,7 @@ class HierarchicalAgent(nn.Module):
         is_frozen: bool = False,
         uniform_option_steps: int = 0,
         selector_ends_options: bool = False,
+        option_lengths: Sequence[int] = (),
     ) -> None:
         super().__init__()
         self.selector = selector
@@ -321,19 +350,36 @@ class HierarchicalAgent(nn.Module):
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self._set_is_uniform()
         self.router = OptionRouter(learners, specs, is_shared)
-        self.policy = self.router if selector is None else TensorDictSequential(selector, self.router)
+        self.option_lengths = tuple(option_lengths)
+        self.pairs = OptionLengths(option_lengths) if option_lengths and selector is not None else None
+        num_choices = specs.num_options * max(1, len(self.option_lengths))
+        if selector is not None and selector.specs.num_options != num_choices:
+            raise ValueError(f"the selector has {selector.specs.num_options} options, but must have {num_choices}")
+        if selector is None:
+            self.policy: TensorDictModuleBase = self.router
+        else:
+            high = selector if self.pairs is None else PairSelector(selector, self.pairs)
+            self.policy = TensorDictSequential(high, self.router)
         self.next_options: AgentNextOptions | None = None
         if selector is not None:
             selector.decides_ends = selector_ends_options
             if selector.asks_learners:
                 selector.option_values = OptionValues(learners, specs.num_options)
-            self.next_options = AgentNextOptions(selector, learners, is_shared)
+            self.next_options = AgentNextOptions(selector, learners, specs.num_options, is_shared, self.pairs)
             for learner in learners:
                 learner.next_options = self.next_options
 
     def policy_of(self, option: int) -> TensorDictModuleBase:
         """Return the policy that always holds one option and otherwise acts like this agent."""
-        return TensorDictSequential(HeldOption(option), self.router)
+        length = None if self.pairs is None else self.pairs.longest
+        return TensorDictSequential(HeldOption(option, length), self.router)
+
+    @property
+    def choice_keys(self) -> list[NestedKey]:
+        """The keys that the high level writes at a decision and holds until the next one; empty without a selector."""
+        if self.selector is None:
+            return []
+        return [*self.selector.out_keys, *([] if self.pairs is None else [keys.OPTION_LENGTH])]
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Let both levels learn from a collected batch `[*B, T]`; return scalars named `high/...` and `low/...`."""
@@ -343,10 +389,11 @@ class HierarchicalAgent(nn.Module):
             if self.selector.decides_ends and self.next_options is not None:
                 batch = self.next_options.with_ends(batch)
             self._set_is_uniform()
-            self._set_pending(self.selector, batch)
-            decisions = _finished_decisions(batch)
+            seen = self._seen_by_selector(batch)
+            self._set_pending(self.selector, seen)
+            decisions = _finished_decisions(seen)
             learned = self.selector.learn(decisions) if len(decisions) else {}
-            learned = {**learned, **self.selector.learn_from_steps(batch)}
+            learned = {**learned, **self.selector.learn_from_steps(seen), **self._mean_length(batch)}
             scalars.update({f"high/{name}": value for name, value in learned.items()})
         if self.is_frozen:
             return scalars
@@ -362,7 +409,7 @@ class HierarchicalAgent(nn.Module):
             batch: the transitions.
             decisions: `[*B, K]` for the selector. If None, the decisions in the batch.
         """
-        if self.selector is not None and "offline" in self.selector.modes:
+        if self.selector is not None and self.pairs is None and "offline" in self.selector.modes:
             self.selector.add_demonstrations(_finished_decisions(batch if decisions is None else decisions))
         for _, learner, rows, mask in self._batches_of_learners(batch):
             learner.add_demonstrations(rows, mask)
@@ -405,7 +452,7 @@ class HierarchicalAgent(nn.Module):
             batch = self.next_options.with_ends(batch)
         owner, _, part = name.partition("_")
         if owner == "selector":
-            return self._level(owner).replay_rows(batch).get(part)
+            return self._level(owner).replay_rows(self._seen_by_selector(batch)).get(part)
         for i, (_, learner, seen, _) in enumerate(self._batches_of_learners(batch)):
             if owner == f"learner{i}":
                 return learner.replay_rows(seen).get(part)
@@ -432,12 +479,16 @@ class HierarchicalAgent(nn.Module):
     def exported(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to act greedily; None if a part cannot be exported.
 
+        Agents that choose lengths cannot.
+
         `selector` is None if there is nothing to choose. `learners` has one entry for each option, or a single one.
         With `is_shared` that one observes the one-hot option at the end of the observation.
         """
         learners = [learner.exported() for learner in self._learners()]
         selector = None if self.selector is None else self.selector.exported()
         if any(learner is None for learner in learners) or (self.selector is not None and selector is None):
+            return None
+        if self.pairs is not None:
             return None
         return {"selector": selector, "learners": learners, "is_shared": self.is_shared}
 
@@ -464,11 +515,21 @@ class HierarchicalAgent(nn.Module):
         if self.selector is not None:
             self.selector.is_uniform.fill_(self.frames < self.uniform_option_steps)
 
+    def _seen_by_selector(self, batch: TensorDictBase) -> TensorDictBase:
+        return batch if self.pairs is None else self.pairs.with_pairs(batch)
+
+    def _mean_length(self, batch: TensorDictBase) -> dict[str, float]:
+        """Return the mean length chosen in a batch `[*B, T]` as a scalar to log, if any was."""
+        if self.pairs is None:
+            return {}
+        chosen = batch.get(keys.OPTION_LENGTH)[batch.get(keys.IS_DECISION).squeeze(-1)]
+        return {"length": chosen.float().mean().item()} if len(chosen) else {}
+
     def _set_pending(self, selector: Selector, batch: TensorDictBase) -> None:
         last = batch[..., -1]
         is_held = ~last.get(("next", keys.IS_DECISION)).squeeze(-1)
         held = last.get(keys.OPTION)[is_held]
-        selector.pending.copy_(torch.bincount(held, minlength=self.specs.num_options))
+        selector.pending.copy_(torch.bincount(held, minlength=selector.specs.num_options))
 
 
 def _finished_decisions(batch: TensorDictBase) -> TensorDictBase:

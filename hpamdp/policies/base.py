@@ -218,6 +218,9 @@ class Selector(Level, TensorDictModuleBase):
             the value of the next decision, see `next_discount`.
         ends_options: whether the selector can decide where options end, by `ends`.
         decides_ends: whether it does so in this run (`agent.termination=learned`). The agent sets it.
+        no_lengths: why the selector cannot choose pairs of an option and its length (`agent.termination=chosen`). If
+            None, it can: its `specs` then list the pairs as options. If it `needs` the environment's entries or
+            `asks_learners`, the run knows that it cannot.
         is_bandit: True if the selector uses an option's return as its full value, that is, does not bootstrap. Its
             options must last as long as their episodes; others are refused.
         modes: what the selector can learn from: its own choices (`train`), or a data set of other choices (`offline`).
@@ -231,6 +234,7 @@ class Selector(Level, TensorDictModuleBase):
     asks_learners: ClassVar[bool] = False
     is_bandit: ClassVar[bool] = False
     ends_options: ClassVar[bool] = False
+    no_lengths: ClassVar[str | None] = None
     decides_ends: bool = False
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     gamma: float = 1.0

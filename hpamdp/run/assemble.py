@@ -18,12 +18,13 @@ from hpamdp.config.schema import Config
 from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.errors import DataError
 from hpamdp.env.base import PAMDPEnv, checked_option_names
-from hpamdp.env.decisions import with_decisions
+from hpamdp.env.decisions import OptionLength, with_decisions
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.messages import first_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
+from hpamdp.policies.option_lengths import DEFAULT_LENGTHS
 from hpamdp.run import capacity, checkpoint, compatibility
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.specs import PAMDPSpecs
@@ -176,7 +177,9 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     Raises:
         ConfigError: a constructor refuses a setting.
     """
-    selector = config.high.build(specs=specs, device=device) if specs.num_options else None
+    lengths = option_lengths(config)
+    high_specs = specs.with_option_lengths(lengths) if lengths else specs
+    selector = config.high.build(specs=high_specs, device=device) if specs.num_options else None
     is_shared = config.run.agent.sharing == "shared" and specs.num_options > 0
     if is_shared:
         learner_specs = [specs.with_option_observed()]
@@ -192,6 +195,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         is_frozen=config.run.low.freeze,
         uniform_option_steps=config.run.agent.uniform_option_steps,
         selector_ends_options=config.run.agent.termination == "learned" and selector is not None,
+        option_lengths=lengths,
     )
     return agent.to(device)
 
@@ -300,9 +304,18 @@ def _gamma(agent: HierarchicalAgent) -> float:
     return 1.0 if agent.selector is None else agent.selector.gamma
 
 
-def option_length(config: Config) -> float | None:
-    """Return the steps of an option: None if it lasts its episode, infinite if the selector ends it."""
-    return math.inf if config.run.agent.termination == "learned" else config.run.agent.option_length
+def option_length(config: Config) -> OptionLength:
+    """Return the steps of an option, as in `DecisionTracker`."""
+    run = config.run.agent
+    if run.termination == "chosen":
+        return "chosen"
+    return math.inf if run.termination == "learned" else run.option_length
+
+
+def option_lengths(config: Config) -> tuple[int, ...]:
+    """Return the lengths that the selector chooses from; empty if it chooses options alone."""
+    run = config.run.agent
+    return (run.option_lengths or DEFAULT_LENGTHS) if run.termination == "chosen" else ()
 
 
 def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> TransformedEnv:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from hpamdp.config.components import Component, constructor_arguments, is_passed
-from hpamdp.config.errors import ConfigError
+from hpamdp.config.errors import ConfigError, as_json
 from hpamdp.config.schema import Config
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.pickling import why_unsendable
@@ -112,6 +112,22 @@ def option_length_goes_with_steps(config: Config) -> str | None:
         return "agent.option_length: missing; agent.termination=steps needs the number of steps of an option"
     if termination != "steps" and length is not None:
         return f"agent.option_length={length}: goes with agent.termination=steps only, not with {termination}"
+    return None
+
+
+def option_lengths_go_with_chosen(config: Config) -> str | None:
+    """Refuse `agent.option_lengths` without `agent.termination=chosen`, and data sets with it."""
+    termination, lengths = config.run.agent.termination, config.run.agent.option_lengths
+    if termination != "chosen":
+        if lengths is None:
+            return None
+        given = f"agent.option_lengths={as_json(lengths)}"
+        return f"{given}: goes with agent.termination=chosen only, not with {termination}"
+    if config.run.mode != "eval" and config.data.cls is not None:
+        return (
+            f"agent.termination=chosen: the decisions of {config.data} have no lengths to learn from; use data=none or "
+            "another agent.termination"
+        )
     return None
 
 
@@ -370,6 +386,19 @@ def options_end_where_they_may(config: Config, problem: ProblemFacts) -> str | N
     return None
 
 
+def selector_chooses_lengths(config: Config, problem: ProblemFacts) -> str | None:
+    """Require a selector that can choose lengths with `agent.termination=chosen`."""
+    if config.run.agent.termination != "chosen":
+        return None
+    why: str | None = getattr(config.high.cls, "no_lengths", None)
+    if getattr(config.high.cls, "asks_learners", False):
+        why = "compares the learners' values, which do not depend on an option's length"
+    elif _needs(config.high):
+        why = "chooses as the environment's entries say, which have no lengths"
+    others = "use high=meta_critic, high=actor or another agent.termination"
+    return None if why is None else f"agent.termination=chosen: {config.high} {why}; {others}"
+
+
 def per_option_names_options(config: Config, problem: ProblemFacts) -> str | None:
     """Require existing options with separate learners in `low.per_option`."""
     names = _option_names(config, problem) if _has_choice(config, problem) else ()
@@ -401,6 +430,7 @@ def _option_names(config: Config, problem: ProblemFacts) -> tuple[str, ...]:
 
 RULES: tuple[Rule, ...] = (
     option_length_goes_with_steps,
+    option_lengths_go_with_chosen,
     saved_runs_are_named,
     stop_score_needs_evaluations,
     callbacks_have_evaluations,
@@ -419,6 +449,7 @@ PROBLEM_RULES: tuple[ProblemRule, ...] = (
     selector_fits_the_choice,
     plans_fit_the_termination,
     options_end_where_they_may,
+    selector_chooses_lengths,
     per_option_names_options,
     workers_fit_the_problem,
 )

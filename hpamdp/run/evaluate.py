@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -63,6 +64,7 @@ class Evaluation:
             - `return`, `steps`, and `score`, which is the return if the environment has no score of its own;
             - `option`: the first option of each episode, if the agent chooses options;
             - `option_changes`: number of option changes in each episode, if options may end inside episodes;
+            - `option_length`: mean length of the options that were chosen in each episode, if the agent chooses them;
             - `path` `[N, T + 1, 2]`, NaN past an episode's end, if the environment has positions;
             - the entries of the environment's `describe` and `results`.
 
@@ -75,6 +77,7 @@ class Evaluation:
         steps = torch.zeros(td.batch_size, dtype=torch.long, device=device)
         changes = torch.zeros_like(steps)
         over, options, path = td.get(keys.DONE).squeeze(-1), [], [self.env.position]
+        lengths: list[Any] = []
         self._film(states)
         # A policy that samples even when greedy (a random one) must not move the run's generators.
         with (
@@ -85,6 +88,7 @@ class Evaluation:
             torch.manual_seed(self.seed)
             for _ in range(self.env.max_steps):
                 td = self.env.step(policy(td))
+                lengths.append(_chosen_length(td, over))
                 total += td.get(("next", keys.REWARD)).squeeze(-1)
                 steps += ~over
                 options.append(td.get(keys.OPTION, None))
@@ -107,6 +111,8 @@ class Evaluation:
             played["option"] = options[0]
             if keys.OPTION_ENDED in td.keys():
                 played["option_changes"] = changes
+        if lengths[0] is not None:
+            played["option_length"] = torch.stack(lengths).nanmean(0)
         if path[0] is not None:
             played["path"] = torch.stack(path, 1)
         played |= self.env.results(td)
@@ -137,7 +143,8 @@ class Evaluation:
         The further entries are:
 
         - `optimality_gap`: the environment's `ceiling` less the score;
-        - `option_changes`: number of option changes in an episode, if options may end inside episodes.
+        - `option_changes`: number of option changes in an episode, if options may end inside episodes;
+        - `option_length`: mean length of the options that were chosen in an episode, if the agent chooses lengths.
 
         If the agent chooses options:
 
@@ -146,8 +153,8 @@ class Evaluation:
         - `choice_gain`: the score less the score of the best single option;
         - `choice_entropy`: entropy of the options' frequencies (nats).
         """
-        names = [name for name in ("score", "success", "return", "steps", "option_changes") if name in played]
-        means = {name: float(played[name].mean()) for name in names} | self.env.measure(played)
+        names = ("score", "success", "return", "steps", "option_changes", "option_length")
+        means = {name: float(played[name].mean()) for name in names if name in played} | self.env.measure(played)
         if "ceiling" in means:
             means["optimality_gap"] = means["ceiling"] - means["score"]
         if "option_scores" not in played:
@@ -161,5 +168,13 @@ class Evaluation:
         return means | {f"score_{name}": float(mean) for name, mean in scores}
 
 
+def _chosen_length(td: TensorDictBase, over: Tensor) -> Tensor | None:
+    """Return the lengths chosen at a step, `[N]`: NaN where none was, or the episode is over; None without lengths."""
+    length = td.get(keys.OPTION_LENGTH, None)
+    return None if length is None else _unless(over | ~td.get(keys.IS_DECISION).squeeze(-1), length)
+
+
 def _unless(over: Tensor, position: Tensor | None) -> Tensor | None:
-    return None if position is None else torch.where(over.unsqueeze(-1), torch.nan, position)
+    if position is None:
+        return None
+    return torch.where(over.reshape(-1, *[1] * (position.ndim - 1)), torch.nan, position)

@@ -64,7 +64,7 @@ class Recorder:
         self._played: dict[str, np.ndarray] | None = None
         self._own: Mapping[str, float] = {}  # the last metrics of callbacks
         self._held: dict[str, float] = {}  # scores with each option held, at the last evaluation
-        random = random_agent(parts.agent.specs, parts.device)
+        random = random_agent(parts.agent.specs, parts.device, parts.agent.option_lengths)
         self._random = parts.evaluation.measure(parts.evaluation.run(random.policy))
 
     def resume_from(self, folder: Path, frames: int) -> None:

@@ -56,7 +56,7 @@ class BoatDockOptions(Settings):
     switch_cost: Annotated[float, Field(ge=0.0, le=TANK)] | None = None
     """Seconds of fuel for changing the controller at a press. If None, it is kept for the episode.
 
-    It goes with agent.termination=steps or learned.
+    It goes with agent.termination=steps, learned or chosen.
     """
     recording: str | None = None
     """A file of `hpamdp play`, whose figures replace people's in tables and curves. If None, people's."""

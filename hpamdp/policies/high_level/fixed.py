@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -30,6 +30,7 @@ class Fixed(Selector):
     """
 
     Options = FixedOptions
+    no_lengths: ClassVar[str | None] = "has a setting for the option, but none for its length"
 
     def __init__(self, specs: PAMDPSpecs, options: FixedOptions | None = None, **settings: Any) -> None:
         super().__init__(specs)

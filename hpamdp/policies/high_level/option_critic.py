@@ -68,6 +68,7 @@ class OptionCritic(Selector):
     Options = OptionCriticOptions
     ends_options: ClassVar[bool] = True
     modes: ClassVar[tuple[str, ...]] = ("train",)
+    no_lengths: ClassVar[str | None] = "learns from single steps, which do not tell how long their options still last"
 
     num_steps: Tensor
 
