@@ -392,6 +392,7 @@ class Learner(Level, nn.Module):
 
     Policy: `policy` reads its `in_keys`, usually `observation` `[*B, observation_dim]`. It writes its `out_keys`:
     `("action", "discrete")` int64 `[*B]` and `("action", "parameters")` `[*B, num_parameters]`, within their bounds.
+    With several components, see `hpamdp.components`, the discrete actions are `[*B, num_components]`.
     The parameters of all discrete actions lie side by side. Only the parameters of the chosen action have an effect.
     `specs.parameter_mask` says which action owns which parameter, and `specs.from_unit` maps [-1, 1] to the bounds.
     `is_greedy()` says whether to act greedily or to explore.
