@@ -20,6 +20,7 @@ from hpamdp.policies.low_level.paddpg import PADDPG
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.qpamdp import QPAMDP
+from hpamdp.policies.low_level.random import Random
 from hpamdp.policies.low_level.td3_bc import TD3BC
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -136,12 +137,13 @@ def test_a_pair_off_the_marginals_is_reached_by_autoregressive_policies_alone(le
     assert (reward > 0.95) if reaches else (0.4 < reward < 0.55)
 
 
-def test_autoregressive_heads_never_choose_a_pair_that_is_forbidden():
+def test_autoregressive_heads_and_random_agents_never_choose_a_pair_that_is_forbidden():
     torch.manual_seed(0)
     env = OneStep(200, forbids_pairs=True)
-    learner = HPPO(PAMDPSpecs.from_env(env), autoregressive=True, **FAST)
-    train(learner, env, 5)
-    assert env.violations == 0
+    specs = PAMDPSpecs.from_env(env)
+    for learner in (Random(specs), HPPO(specs, autoregressive=True, **FAST)):
+        train(learner, env, 5)
+        assert env.violations == 0
 
 
 def test_independent_heads_refuse_a_mask_of_pairs():

@@ -48,6 +48,22 @@ def test_the_command_of_crossing_runs(tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text())["finished"]
 
 
+@pytest.mark.parametrize("problem", ["Offer", "Delivery", "Warehouse", "Tour"])
+def test_the_commands_of_the_kinds_of_actions_run(problem, tmp_path):
+    folder = EXAMPLES / "spaces"
+    commands = re.findall(r"^python -m hpamdp\.cli (.*)$", (folder / "README.md").read_text(), re.MULTILINE)
+    (command,) = [each for each in commands if f"shop:{problem} " in each]
+    short = ["total_frames=1280", "eval.every=0", "eval.layouts=10", "film=false", f"hydra.run.dir={tmp_path}"]
+
+    def run() -> None:
+        os.chdir(folder)
+        sys.argv = ["hpamdp", *shlex.split(command), *short]
+        cli.main()
+
+    assert forked(run) == 0
+    assert json.loads((tmp_path / "summary.json").read_text())["finished"]
+
+
 def test_crossing_keeps_the_contract_and_its_best_values_are_those_by_hand():
     check_env_specs(Crossing(3, start=3.0))
     gamma = 0.9

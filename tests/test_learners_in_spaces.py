@@ -59,6 +59,10 @@ def test_actions_lie_in_their_space_before_and_after_updates(tree, name):
         with pytest.raises(SettingError, match="several components"):
             learner_class(specs, **settings)
         return
+    if learner_class is HyAR and specs.num_parameters == 0:
+        with pytest.raises(SettingError, match="no discrete action of the problem has one"):
+            HyAR(specs)
+        return
     learner = learner_class(specs, **settings)
     tracked = with_decisions(env)
     for _ in range(3):

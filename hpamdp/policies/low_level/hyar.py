@@ -75,7 +75,7 @@ from hpamdp.policies.shared.networks import (
 )
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.policies.shared.scales import scale_of
-from hpamdp.settings import LearningRate, PositiveFraction
+from hpamdp.settings import LearningRate, PositiveFraction, SettingError
 from hpamdp.specs import PAMDPSpecs
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random
@@ -396,6 +396,8 @@ class HyAR(ReplayLearner):
     ) -> None:
         options = HyAROptions.of(options, settings)
         super().__init__(specs, device, options)
+        if specs.num_parameters == 0:
+            raise SettingError("HyAR encodes parameters, but no discrete action of the problem has one; use low=pdqn")
         self.reward_scale = options.reward_scale
         self.policy_delay = options.policy_delay if options.twin else 1
         self.smoothing = options.target_smoothing if options.twin else 0.0, options.target_smoothing_clip

@@ -28,7 +28,7 @@ class RandomPolicy(TensorDictModuleBase):
             2.0 * torch.rand(*td.batch_size, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
         )
         allowed = self.specs.allowed(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
-        discrete = random_discrete(self.specs, td.batch_size, allowed, device)
+        discrete = random_discrete(self.specs, td.batch_size, allowed, device, td.get(keys.PAIR_MASK, None))
         parameters = self.specs.from_unit(unit_parameters, td)
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
 
@@ -36,7 +36,7 @@ class RandomPolicy(TensorDictModuleBase):
 class Random(Learner):
     """Acts at random and learns nothing."""
 
-    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
+    takes = frozenset(ActionFeature)
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hpamdp.components import Components
-from hpamdp.policies.masks import masked_logits
+from hpamdp.policies.masks import allowed_next, masked_logits
 from hpamdp.policies.shared.hybrid_actor import HybridActor, make_small
 from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution
 from hpamdp.specs import PAMDPSpecs
@@ -79,11 +79,13 @@ class AutoregressiveActor(HybridActor):
         is_chosen = hidden.new_zeros(*hidden.shape[:-1], sum(self.components.sizes))
         own = hidden.new_zeros(*hidden.shape[:-1], len(self.owner))
         first, first_parameter = 0, 0
-        choices, raws, distributions = [], [], []
+        choices: list[Tensor] = []
+        raws: list[Tensor] = []
+        distributions: list[HybridDistribution] = []
         for size, num, head, owner, part in zip(
             self.components.sizes, self.parameter_sizes, self.heads, self.owners, self.parts, strict=True
         ):
-            allowed = self._allowed(is_chosen, mask, pair_mask, first)
+            allowed = allowed_next(self.components, len(choices), is_chosen > 0.0, mask, pair_mask)
             output = head(torch.cat([hidden, is_chosen, own], -1))
             logits, mean, raw_scale, value_logits = output.split(
                 [size, num, num, output.shape[-1] - size - 2 * num], -1
@@ -112,29 +114,6 @@ class AutoregressiveActor(HybridActor):
 
     def _choices(self, discrete: Tensor) -> list[Tensor]:
         return [discrete] if self.components.is_single else list(discrete.unbind(-1))
-
-    def _allowed(self, is_chosen: Tensor, mask: Tensor | None, pair_mask: Tensor | None, first: int) -> Tensor | None:
-        """Return which discrete actions the component that begins at `first` may choose, bool `[*B, size]`.
-
-        An action is left out if it would leave nothing to a later component.
-
-        Args:
-            is_chosen: what the components before have chosen, `[*B, num_discrete]`.
-            mask: the discrete actions that may be taken.
-            pair_mask: the discrete actions that go together.
-            first: the place of the component's first discrete action.
-        """
-        sizes, number = self.components.sizes, self.components.starts.index(first)
-        if pair_mask is None:
-            return None if mask is None else mask[..., first : first + sizes[number]]
-        allowed = (pair_mask | (is_chosen == 0.0).unsqueeze(-1)).all(-2)
-        if mask is not None:
-            allowed = allowed & mask
-        own = allowed[..., first : first + sizes[number]]
-        follows = pair_mask[..., first : first + sizes[number], :] & allowed.unsqueeze(-2)
-        for start, size in zip(self.components.starts[number + 1 :], sizes[number + 1 :], strict=True):
-            own = own & follows[..., start : start + size].any(-1)
-        return own
 
     def _joined(self, parts: Sequence[HybridDistribution]) -> HybridDistribution:
         """Return the distributions of the components as one."""
