@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeAlias
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
 from hpamdp.components import Components
 from hpamdp.geometry import PlaneGeometry, Symmetries
+from hpamdp.observation_entries import ObservationEntry, observation_dtype
 
 # A step or a batch of steps, by name.
 Rows: TypeAlias = TensorDictBase | Mapping[str, Tensor]
@@ -48,6 +49,8 @@ class PAMDPSpecs:
         symmetries: maps under which neither dynamics nor reward change; None if the problem declares none.
         geometry: vectors of the plane in the observation and directions of the discrete actions; None if the problem
             declares none.
+        entries: the entries of the observation if any of them is a picture; empty if the observation is a vector.
+        encoder: makes the module that encodes an entry; None for the default. See `hpamdp.policies.encoders.base`.
     """
 
     observation_dim: int
@@ -67,6 +70,18 @@ class PAMDPSpecs:
     held_option: int | None = None
     symmetries: Symmetries | None = field(default=None, compare=False, repr=False)
     geometry: PlaneGeometry | None = field(default=None, compare=False, repr=False)
+    entries: tuple[ObservationEntry, ...] = ()
+    encoder: Callable[[ObservationEntry], nn.Module] | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def has_pictures(self) -> bool:
+        """Whether an entry of the observation is a picture."""
+        return any(entry.is_picture for entry in self.entries)
+
+    @property
+    def observation_dtype(self) -> torch.dtype:
+        """Dtype of the observation: uint8 if all entries are pictures, otherwise float32."""
+        return observation_dtype(self.entries)
 
     @property
     def num_options(self) -> int:
@@ -217,6 +232,7 @@ class PAMDPSpecs:
             initial_weight=weight,
             symmetries=None if symmetries is None else symmetries.with_option_observed(dim, self.num_options),
             geometry=None if geometry is None else geometry.with_option_observed(dim),
+            entries=(*self.entries, ObservationEntry(keys.OPTION, dim, (self.num_options,))) if self.entries else (),
         )
 
     def with_option_lengths(self, lengths: Sequence[int]) -> PAMDPSpecs:
@@ -312,4 +328,5 @@ class PAMDPSpecs:
             option_actions=env.option_actions,
             symmetries=symmetries,
             geometry=geometry,
+            entries=env.observation_entries,
         )

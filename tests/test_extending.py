@@ -35,7 +35,7 @@ def _main(words: list[str]) -> None:
 
 
 def test_the_readme_has_a_command_for_each_file():
-    assert len(COMMANDS) == 5
+    assert len(COMMANDS) == 6
     for file in FOLDER.glob("*.py"):
         assert any(file.stem in command for command in COMMANDS), file.name
 

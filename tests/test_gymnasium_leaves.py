@@ -27,8 +27,8 @@ PARTS = spaces.Dict(a=spaces.Box(-9, 9, (2,)), b=spaces.Dict(c=spaces.Box(-9, 9,
 
 def quickly(space: ObservationSpace, value) -> np.ndarray:
     """Return an observation as a vector, in the way of an environment with many copies."""
-    vectors = np.zeros((1, space.dim))
-    if space.writer(vectors[0])(value) and space.unsettled(vectors):
+    vectors, pixels = np.zeros((1, space.dim)), np.zeros(space.num_pixels, np.uint8)
+    if space.writer(vectors[0], pixels)(value) and space.unsettled(vectors):
         vectors[0] = space.settled(vectors[0])
     return space.rounded(vectors)[0]
 

@@ -211,6 +211,8 @@ def _check_levels(agent: HierarchicalAgent) -> None:
     Raises:
         ConfigError: there is one.
     """
+    if agent.specs.has_pictures:
+        raise ConfigError(f"export: {_names(agent)} cannot be exported: it observes pictures")
     for level in _levels(agent):
         refusal = level.export_refusal
         if refusal is None and level.needs:

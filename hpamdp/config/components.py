@@ -22,9 +22,10 @@ from hpamdp.settings import SettingError, Settings
 
 # Arguments that the run supplies to the constructor of a group's class. All others are settings.
 SUPPLIED_ARGUMENTS: dict[str, tuple[str, ...]] = {
-    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "human", "make"),
+    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "human", "make", "flatten_pictures"),
     "high": ("specs", "device"),
     "low": ("specs", "device"),
+    "encoder": ("entry",),
     "data": ("env",),
     "logger": ("output_dir", "config", "earlier"),
     "collector": ("config", "parts", "frames"),
@@ -45,6 +46,7 @@ _BASE_CLASSES = {
     "env": "hpamdp.env.base.PAMDPEnv",
     "high": "hpamdp.policies.base.Selector",
     "low": "hpamdp.policies.base.Learner",
+    "encoder": "hpamdp.policies.encoders.base.Encoder",
     "data": "hpamdp.data.demonstrations.Demonstrations",
     "logger": "hpamdp.run.loggers.Logger",
     "collector": "hpamdp.run.collection.base.Collection",
@@ -114,6 +116,10 @@ class Component:
             if not is_about_memory(error):
                 raise
             raise ConfigError(f"{self.largest_sizes()}: takes more memory than there is") from error
+
+    def build_for_entry(self, entry: Any) -> Any:
+        """Build an encoder for an entry of the observation; as `build`."""
+        return self.build(entry=entry)
 
     def largest_sizes(self) -> str:
         """Return the settings that may have made this component too large, as text."""

@@ -18,6 +18,8 @@ from hpamdp.settings import Settings
 _CHOICES = "choices"
 # Values of the run that earlier versions did not save, with the defaults of the time.
 _BEFORE = {"film": True, "callbacks": [], "save_best": False, "compile_updates": False, "update_precision": "float32"}
+# Groups that earlier versions did not have, with the choice that does what they did.
+_GROUPS_BEFORE = {"encoder": "auto"}
 _RUN_GROUPS: dict[str, type[Settings]] = {"agent": AgentConfig, "env": EnvConfig}
 
 
@@ -129,11 +131,15 @@ def upgraded(saved: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: `saved` is no config of this program.
     """
+    new_groups = {group: name for group, name in _GROUPS_BEFORE.items() if group not in saved}
+    saved = {**saved, **{group: {} if _CHOICES in saved else {"name": name} for group, name in new_groups.items()}}
     for group in GROUPS:
         if not isinstance(saved.get(group), Mapping):
             raise ConfigError(f"the saved config has no {group}; it is damaged, or another program wrote it")
     values = dict(saved) if _CHOICES in saved else _from_first_form(saved)
     choices = values[_CHOICES]
+    if isinstance(choices, Mapping):
+        choices = values[_CHOICES] = {**new_groups, **choices}
     for group in GROUPS:
         name = choices.get(group) if isinstance(choices, Mapping) else None
         if not is_name(name):

@@ -199,6 +199,7 @@ class Config:
     env: Component
     high: Component
     low: Component
+    encoder: Component
     data: Component
     logger: Component
     collector: Component

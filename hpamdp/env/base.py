@@ -19,6 +19,7 @@ from hpamdp.env.errors import ProblemError as ProblemError  # part of what a pro
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium_form import GymnasiumForm, VectorForm
 from hpamdp.geometry import PlaneGeometry, Symmetries
+from hpamdp.observation_entries import ObservationEntry
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,7 +50,7 @@ class PAMDPEnv(EnvBase):
     """`num_envs` copies of a problem with parameterised actions, in one batch dimension.
 
     A subclass has these specs:
-    - `observation` float32 `[N, observation_dim]`;
+    - `observation` float32 `[N, observation_dim]`; uint8 if all `observation_entries` are pictures;
     - the action leaves `("action", "discrete")` int64 `[N]` and `("action", "parameters")` float32
       `[N, num_parameters]`: the bounded parameters of all discrete actions side by side. Only those of the chosen
       action count;
@@ -69,6 +70,9 @@ class PAMDPEnv(EnvBase):
     figures show it. All of them have defaults.
     """
 
+    # The entries of the observation, in their order, if any of them is a picture. Pixels are whole numbers 0 to 255.
+    # If the constructor takes `flatten_pictures`, and gets true, there are none: pictures are part of the vector.
+    observation_entries: tuple[ObservationEntry, ...] = ()
     option_names: tuple[str, ...] = ()
     discrete_names: tuple[str, ...] = ()  # of the discrete actions, if they have names
     option_actions: tuple[tuple[bool, ...], ...] | None = None  # what `group_actions` has made of the options

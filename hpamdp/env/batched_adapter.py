@@ -23,6 +23,7 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.batched_env import GOING_ON, SUCCESS, BatchedEnv
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium_adapter import (
+    After,
     GymnasiumAdapter,
     GymnasiumVectorAdapter,
     NumpyRows,
@@ -154,15 +155,37 @@ class NumpyBatchedEnv(NumpyRows):
             raise ProblemError(f"{env.title}: the Gymnasium form of a BatchedEnv has one component of real parameters")
         super().__init__(rows_of(env), batch)
         self.action_space = _action_space(env)
-        low, high = (np.array(side, np.float32) for side in env.observation_bounds)
-        self.observation_space = spaces.Box(low, high, dtype=np.float32)
         self._env = env
+        self._picture = env.observation_entries[0].shape if env.observation_entries else None
+        if self._picture is None:
+            low, high = (np.array(side, np.float32) for side in env.observation_bounds)
+            self.observation_space = spaces.Box(low, high, dtype=np.float32)
+        else:
+            pixels: Any = np.uint8  # the annotation of Box knows float32 alone
+            self.observation_space = spaces.Box(0, 255, self._picture, pixels)
         self._outcome_names = np.array(env.outcomes, dtype=object)
 
     @property
     def state(self) -> Any:
         """The columns of the state."""
         return self._env.state
+
+    def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
+        """Start new episodes, in the rows of `mask` or in all, and return the observations `[N, ...]`."""
+        return self._shown(super().reset(seed, options, mask))
+
+    def step(self, action: Any, *, restarts: bool = False) -> After:
+        """Return what follows an action in every environment."""
+        after = super().step(action, restarts=restarts)
+        return after if self._picture is None else after._replace(observations=self._shown(after.observations))
+
+    def _shown(self, observations: np.ndarray) -> np.ndarray:
+        """Return the pictures `[N, *shape]` of vectors, if the problem shows pictures."""
+        if self._picture is None:
+            return observations
+        if self._env.rows is not None:  # the tensor functions have drawn them already
+            observations = self._env.shown(torch.from_numpy(observations)).numpy()
+        return observations.reshape(-1, *self._picture)
 
     def _invalid(self, row: int, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> ValueError:
         return self._env.invalid_action(row, option, discrete, parameters)

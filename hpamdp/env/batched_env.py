@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
@@ -351,7 +351,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         extras = {
             name: Bounded(0.0, 1.0, shape=(n, 1), device=device, dtype=torch.float32) for name in self.extra_names
         }
-        observation = Unbounded(shape=(n, len(self.observation_names)), device=device, dtype=self.float_type)
+        observation = self.observed_spec()
         outcome = Categorical(len(self.outcomes), shape=(n,), device=device)
         knowledge = self._knowledge_specs()
         self._has_knowledge = bool(knowledge)
@@ -362,6 +362,15 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         self.action_spec = self.make_action_spec(low, high, has_option=self._chooses)
         self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=self.float_type)
         self.done_spec = self.make_done_spec()
+
+    def observed_spec(self) -> TensorSpec:
+        """Return the spec of the observations; override it together with `shown`."""
+        shape = (self.num_envs, len(self.observation_names))
+        return Unbounded(shape=shape, device=self.device, dtype=self.float_type)
+
+    def shown(self, vectors: Tensor) -> Tensor:
+        """Return the observations for the vectors `[N, D]` that `observe` returns: the vectors themselves."""
+        return vectors
 
     def _knowledge_specs(self) -> dict[str, Composite]:
         """Return the specs of what is known beside the observation, such as the action of a scripted player."""
@@ -556,7 +565,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         done = (outcome != GOING_ON).unsqueeze(-1)
         truncated = (outcome == len(self.outcomes) - 1).unsqueeze(-1)
         leaves = {
-            keys.OBSERVATION: self._pure_observe(state),
+            keys.OBSERVATION: self.shown(self._pure_observe(state)),
             keys.OUTCOME: outcome,
             **{name: extra.unsqueeze(-1) for name, extra in zip(self.extra_names, self.extras(state), strict=True)},
             **self._flags(done, done & ~truncated, truncated),
@@ -570,7 +579,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         flags = torch.from_numpy(results.flags[number]).unsqueeze(-1)
         leaves: dict[str, Any] = {
             **(kept or {}),
-            keys.OBSERVATION: torch.from_numpy(results.observations[number]),
+            keys.OBSERVATION: self.shown(torch.from_numpy(results.observations[number])),
             keys.OUTCOME: torch.from_numpy(results.outcomes[number]),
             **self._flags(*flags.unbind(0)),
         }

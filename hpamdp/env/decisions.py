@@ -45,15 +45,23 @@ class DecisionTracker(Transform):
             int64 `[*B]`.
         option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`, if options are sets of
             actions and some may be forbidden; else None.
+        keeps_observation: whether to write `decision_observation`. Pictures are large, so they are kept only if there
+            are options to choose.
     """
 
     def __init__(
-        self, gamma: float = 1.0, option_length: OptionLength = None, option_actions: Tensor | None = None
+        self,
+        gamma: float = 1.0,
+        option_length: OptionLength = None,
+        option_actions: Tensor | None = None,
+        *,
+        keeps_observation: bool = True,
     ) -> None:
         super().__init__()
         self.gamma = gamma
         self.option_length = option_length
         self.option_actions = option_actions
+        self.keeps_observation = keeps_observation
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Declare the keys that the tracker writes."""
@@ -66,7 +74,8 @@ class DecisionTracker(Transform):
             observation_spec[name] = Unbounded(shape=shape, device=device, dtype=torch.float32)
         for name in (keys.OPTION_STEPS, keys.EPISODE_STEPS):
             observation_spec[name] = Unbounded(shape=shape, dtype=torch.long, device=device)
-        observation_spec[keys.DECISION_OBSERVATION] = observation_spec[keys.OBSERVATION].clone()
+        if self.keeps_observation:
+            observation_spec[keys.DECISION_OBSERVATION] = observation_spec[keys.OBSERVATION].clone()
         if self.option_actions is not None:
             num_options = len(self.option_actions)
             mask_shape = (*observation_spec.shape, num_options)
@@ -82,12 +91,13 @@ class DecisionTracker(Transform):
             tensordict_reset.set(keys.OPTION_ENDED, torch.zeros_like(is_decision))
         if self.option_actions is not None:
             tensordict_reset.set(keys.OPTION_MASK, self._possible_options(tensordict_reset, self.option_actions))
+        if self.keeps_observation:
+            tensordict_reset.set(keys.DECISION_OBSERVATION, observation)
         return tensordict_reset.update(
             {
                 keys.IS_DECISION: is_decision,
                 keys.OPTION_RETURN: zeros,
                 keys.OPTION_STEPS: zeros.long(),
-                keys.DECISION_OBSERVATION: observation,
                 keys.EPISODE_RETURN: zeros.clone(),
                 keys.EPISODE_STEPS: zeros.long(),
             }
@@ -99,17 +109,14 @@ class DecisionTracker(Transform):
         done = next_tensordict.get(keys.DONE)
         option_return = tensordict.get(keys.OPTION_RETURN)
         option_steps = tensordict.get(keys.OPTION_STEPS)
-        decision_observation = tensordict.get(keys.DECISION_OBSERVATION)
         is_stuck = self._set_option_mask(tensordict, next_tensordict)
         if self.option_length is None:
             is_decision = done.clone()
-            decision_observation = decision_observation.clone()
         else:
             # Only a reset writes zeros: an option that begins inside an episode restarts its sums here.
             is_first = tensordict.get(keys.IS_DECISION)
             option_return = _zero_where(is_first, option_return)
             option_steps = _zero_where(is_first, option_steps)
-            decision_observation = torch.where(is_first, tensordict.get(keys.OBSERVATION), decision_observation)
             length = self.option_length
             if length == "chosen":
                 length = tensordict[keys.OPTION_LENGTH].unsqueeze(-1)
@@ -121,10 +128,18 @@ class DecisionTracker(Transform):
         next_tensordict.set(keys.IS_DECISION, is_decision)
         next_tensordict.set(keys.OPTION_RETURN, option_return + self.gamma ** option_steps.float() * reward)
         next_tensordict.set(keys.OPTION_STEPS, option_steps + 1)
-        next_tensordict.set(keys.DECISION_OBSERVATION, decision_observation)
+        if self.keeps_observation:
+            next_tensordict.set(keys.DECISION_OBSERVATION, self._decision_observation(tensordict))
         next_tensordict.set(keys.EPISODE_RETURN, tensordict.get(keys.EPISODE_RETURN) + reward)
         next_tensordict.set(keys.EPISODE_STEPS, tensordict.get(keys.EPISODE_STEPS) + 1)
         return next_tensordict
+
+    def _decision_observation(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the observation at which the option of this step was chosen, `[*B, observation_dim]`."""
+        decision_observation: Tensor = tensordict.get(keys.DECISION_OBSERVATION)
+        if self.option_length is None:
+            return decision_observation.clone()
+        return torch.where(tensordict.get(keys.IS_DECISION), tensordict.get(keys.OBSERVATION), decision_observation)
 
     def _set_option_mask(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor | None:
         """Write which options are possible next; return where the held one is not, `[*B, 1]`, if any may be forbidden.
@@ -194,7 +209,8 @@ def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLen
     option_actions = None
     if env.option_actions is not None and keys.ACTION_MASK in env.observation_spec.keys():
         option_actions = torch.tensor(env.option_actions, device=env.device)
-    return DecisionTracker(gamma, option_length, option_actions)
+    keeps_observation = env.has_choice or not env.observation_entries
+    return DecisionTracker(gamma, option_length, option_actions, keeps_observation=keeps_observation)
 
 
 def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLength = None) -> DecisionEnv:

@@ -21,6 +21,7 @@ class ProblemFacts:
         default_options: options to begin with, as for `PAMDPEnv.group_actions`; empty if the problem suggests none.
         has_oracle: whether the constructor takes `oracle`.
         has_human: whether the constructor takes `human`.
+        has_pictures: whether an entry of the observation is a picture, unless pictures are flattened.
     """
 
     title: str
@@ -33,3 +34,4 @@ class ProblemFacts:
     default_options: Mapping[str, Sequence[int | str]] = field(default_factory=dict)
     has_oracle: bool = False
     has_human: bool = False
+    has_pictures: bool = False

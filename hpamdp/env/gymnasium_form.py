@@ -73,10 +73,11 @@ class GymnasiumForm(ABC):
 class VectorForm(GymnasiumForm):
     """The form of a problem that Gymnasium sees as this package does.
 
-    An observation is a vector. An action is `(discrete, (parameters of action 0, ..., of action K - 1))`. If the agent
-    chooses an option of the problem, the option comes first. If there are several components, the action is a tuple of
-    these forms, one for each component; a box, which is a component of one discrete action, is its parameters alone.
-    Parameters are float32, or int64 if all of a discrete action's parameters are whole.
+    An observation is a vector, or a picture if there is nothing else. An action is
+    `(discrete, (parameters of action 0, ..., of action K - 1))`. If the agent chooses an option of the problem, the
+    option comes first. If there are several components, the action is a tuple of these forms, one for each component. A
+    box, which is a component of one discrete action, is its parameters alone. Parameters are float32, or int64 if all
+    of a discrete action's parameters are whole.
 
     Args:
         env: the problem, of any number of environments.
@@ -96,7 +97,12 @@ class VectorForm(GymnasiumForm):
         self._bounds = [name for name in (keys.PARAMETER_LOW, keys.PARAMETER_HIGH) if name in observed.keys()]
         self._num_parameters = sum(env.parameter_dims)
         self.num_entries = observed[keys.OBSERVATION].shape[-1]
-        self.observation_space = spaces.Box(-np.inf, np.inf, (self.num_entries,), np.float32)
+        entries = env.observation_entries
+        self._picture = entries[0].shape if len(entries) == 1 and entries[0].is_picture else None
+        self._dtype = observed[keys.OBSERVATION].dtype
+        self.observation_space: spaces.Space = spaces.Box(-np.inf, np.inf, (self.num_entries,), np.float32)
+        if self._dtype == torch.uint8:
+            self.observation_space = spaces.Box(0, 255, self._picture or (self.num_entries,), np.uint8)
         bounds = env.full_action_spec_unbatched[keys.PARAMETERS].space
         lows, highs = (np.split(side.cpu().numpy().reshape(-1), self._ends) for side in (bounds.low, bounds.high))
         is_whole = np.array(env.integer_parameters or (False,) * self._num_parameters, bool)
@@ -150,15 +156,22 @@ class VectorForm(GymnasiumForm):
             if given.dtype.kind not in "biuf":
                 raise TypeError("not made of real numbers")
             vectors = np.array(given, np.float32)
+            if self._picture is not None and vectors.shape[-len(self._picture) :] == self._picture:
+                vectors = vectors.reshape(*vectors.shape[: -len(self._picture)], -1)
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"the observation must hold {self.num_entries} numbers, but is {observation!r:.80}"
             ) from error
         if vectors.ndim not in (1, 2) or vectors.shape[-1] != self.num_entries or not vectors.size:
-            expected = f"[{self.num_entries}] or [N, {self.num_entries}]"
+            one = ", ".join(map(str, self._picture or (self.num_entries,)))
+            expected = f"[{one}] or [N, {one}]"
             raise ValueError(f"the observation has shape {list(vectors.shape)}, but must have {expected}")
         if not np.isfinite(vectors).all():
             raise ValueError(f"entry {int(np.argwhere(~np.isfinite(vectors))[0][-1])} of the observation is not finite")
+        if self._dtype == torch.uint8:
+            if ((vectors < 0) | (vectors > 255) | (vectors != np.floor(vectors))).any():
+                raise ValueError("pixels of the observation must be whole numbers from 0 to 255")
+            vectors = vectors.astype(np.uint8)
         return vectors.reshape(-1, self.num_entries), vectors.ndim == 2
 
     def _entry(self, name: str, why: str, info: Mapping[str, Any] | None, shape: tuple[int, ...]) -> np.ndarray:

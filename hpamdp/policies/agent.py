@@ -143,7 +143,7 @@ class OptionValues(nn.Module):
 def _exploring_value(learner: Learner, observation: Tensor, *masks: Tensor) -> Tensor:
     """Return a learner's values `[N]` of observations `[N, *]`; infinite if exploring before its first update."""
     if not is_greedy() and learner.is_untrained():
-        return torch.full_like(observation[:, 0], torch.inf)
+        return torch.full_like(observation[:, 0], torch.inf, dtype=torch.float32)
     return learner.value(observation, *masks)
 
 
@@ -224,10 +224,10 @@ class AgentNextOptions:
     ) -> Tensor:
         """Return the values `[N]` of states under the options chosen there, see `NextOptions.value`."""
         if self.is_shared:
-            one_hot = F.one_hot(option, self.num_options).to(observation)
+            one_hot = F.one_hot(option, self.num_options).to(torch.float32)
             seen = torch.cat([self._without_option(observation), one_hot], -1)
             return _value(self.learners[0], seen, action_mask, memory, has_seen)
-        value = observation.new_zeros(len(observation))
+        value = torch.zeros(len(observation), device=observation.device, dtype=torch.float32)
         for i, learner in enumerate(self.learners):
             rows = option == i
             if rows.any():

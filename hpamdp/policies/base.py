@@ -106,13 +106,25 @@ class Level:
         guarded_settings: settings that can run code, read files or reach servers.
         may_be_nan: the columns of the replay buffer that may hold NaN.
         export_refusal: why its greedy policy cannot be exported to ONNX, if it cannot.
+        takes_pictures: whether observations may have pictures: they go through `policies.shared.perception`, or nothing
+            reads observations. Others are refused, since a picture is flattened only if the user asks for it.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
     guarded_settings: ClassVar[tuple[str, ...]] = ()
     may_be_nan: ClassVar[frozenset[str]] = frozenset()
     export_refusal: str | None = None
+    takes_pictures: ClassVar[bool] = False
     specs: PAMDPSpecs
+
+    def check_observation(self, specs: PAMDPSpecs) -> None:
+        """Refuse pictures, unless the level `takes_pictures`.
+
+        Raises:
+            SettingError: an entry of the observation is a picture.
+        """
+        if specs.has_pictures and not self.takes_pictures:
+            raise SettingError(f"{type(self).__name__}: has no encoder for pictures; encoder=mlp flattens them")
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, by name.
@@ -247,6 +259,7 @@ class Selector(Level, TensorDictModuleBase):
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
+        self.check_observation(specs)
         self.in_keys = [keys.OBSERVATION, keys.IS_DECISION]
         if specs.has_option_mask:
             self.in_keys.append(keys.OPTION_MASK)
@@ -436,6 +449,7 @@ class Learner(Level, nn.Module):
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
+        self.check_observation(specs)
         self.specs = specs
         present = {
             ActionFeature.COMPONENTS: not specs.components.is_single,

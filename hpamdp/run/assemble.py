@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -114,7 +114,13 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
         seed = int(np.random.SeedSequence((seed, first_env)).generate_state(1)[0])
     levels = (config.high, *config.learners)
     needs = {need: True for level in levels for need in getattr(level.cls, "needs", ())}
-    env: PAMDPEnv = config.env.build(num_envs=num_envs, device=device, seed=seed, first_env=first_env, **needs)
+    flattens = bool(getattr(config.encoder.cls, "flattens", False))
+    env: PAMDPEnv = config.env.build(
+        num_envs=num_envs, device=device, seed=seed, first_env=first_env, flatten_pictures=flattens, **needs
+    )
+    if flattens and env.observation_entries:
+        env.close()
+        raise ConfigError(f"{config.encoder}: {config.env} cannot flatten its pictures; use encoder=cnn")
     env.option_names = checked_option_names(env.option_names)
     grouping = config.run.env.grouping
     if grouping is not None:
@@ -150,6 +156,7 @@ def _facts_of_built(env: PAMDPEnv) -> ProblemFacts:
         is_shardable=env.is_shardable,
         has_statistics=bool(env.statistics()),
         default_options=env.default_options,
+        has_pictures=any(entry.is_picture for entry in env.observation_entries),
     )
 
 
@@ -177,6 +184,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     Raises:
         ConfigError: a constructor refuses a setting.
     """
+    specs = replace(specs, encoder=config.encoder.build_for_entry)
     lengths = option_lengths(config)
     high_specs = specs.with_option_lengths(lengths) if lengths else specs
     selector = config.high.build(specs=high_specs, device=device) if specs.num_options else None

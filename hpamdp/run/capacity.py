@@ -66,8 +66,10 @@ def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component]
     Raises:
         ConfigError: memory does not suffice; the message names the least number of bytes.
     """
-    # Two observations, the action, reward and flags.
-    row = 4 * (2 * specs.observation_dim + specs.num_parameters + 2)
+    # Two observations, the action, reward and flags. A pixel takes one byte.
+    observation = sum(entry.size if entry.is_picture else 4 * entry.size for entry in specs.entries)
+    observation = observation if specs.entries else 4 * specs.observation_dim
+    row = 2 * observation + 4 * (specs.num_parameters + 2)
     needs = {}
     for component, num in ((config.high, 1), *((low, learners.count(low)) for low in learners)):
         for name, value in component.settings.items():
@@ -77,7 +79,8 @@ def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component]
             elif name in ("batch_size", "minibatch_size"):
                 needs[setting] = value * row
             elif name.endswith("hidden_dims"):
-                sizes = [specs.observation_dim, *value]
+                # Behind pictures is an encoder, whose few features are not counted here.
+                sizes = [0 if specs.has_pictures else specs.observation_dim, *value]
                 weights = sum(a * b for a, b in zip(sizes, value, strict=False))
                 needs[setting] = num * weights * _BYTES_A_WEIGHT
     _check_memory(needs, device)

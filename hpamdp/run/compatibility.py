@@ -20,6 +20,9 @@ from hpamdp.pickling import why_unsendable
 # The choice that picks a selector automatically, and the selector that it picks if there are options.
 AUTO_SELECTOR, DEFAULT_SELECTOR = "auto", "ucb"
 
+# The encoder that encodes pictures if there are any.
+AUTO_ENCODER = "auto"
+
 Rule: TypeAlias = Callable[[Config], "str | None"]
 ProblemRule: TypeAlias = Callable[[Config, ProblemFacts], "str | None"]
 
@@ -330,6 +333,34 @@ def grouping_fits_levels(config: Config, problem: ProblemFacts) -> str | None:
     return None
 
 
+def levels_take_pictures(config: Config, problem: ProblemFacts) -> str | None:
+    """Refuse pictures with a level that cannot encode them: they are flattened only if the user asks for it."""
+    if getattr(config.encoder.cls, "flattens", False) or not problem.has_pictures:
+        return None
+    for level in _levels(config):
+        if level.cls is not None and not getattr(level.cls, "takes_pictures", False):
+            return (
+                f"{level}: {config.env} observes pictures, which it has no encoder for; use another {level.group}, or "
+                "encoder=mlp to flatten them"
+            )
+    return None
+
+
+def data_sets_have_no_pictures(config: Config, problem: ProblemFacts) -> str | None:
+    """Refuse data sets with pictures: their observations are vectors."""
+    if config.data.cls is None or not problem.has_pictures or getattr(config.encoder.cls, "flattens", False):
+        return None
+    return f"{config.data}: {config.env} observes pictures, which data sets do not hold; use data=none"
+
+
+def encoder_has_pictures(config: Config, problem: ProblemFacts) -> str | None:
+    """Refuse an encoder of pictures if the problem has none, unless it was chosen automatically."""
+    encoder = config.encoder
+    if encoder.name != AUTO_ENCODER and not getattr(encoder.cls, "flattens", False) and not problem.has_pictures:
+        return f"{encoder}: {config.env} observes no pictures; use encoder={AUTO_ENCODER}"
+    return None
+
+
 def selector_fits_the_choice(config: Config, problem: ProblemFacts) -> str | None:
     """Require a selector if the agent chooses options, and refuse one otherwise."""
     has_selector, has_choice = config.high.cls is not None, _has_choice(config, problem)
@@ -452,4 +483,7 @@ PROBLEM_RULES: tuple[ProblemRule, ...] = (
     selector_chooses_lengths,
     per_option_names_options,
     workers_fit_the_problem,
+    levels_take_pictures,
+    data_sets_have_no_pictures,
+    encoder_has_pictures,
 )

@@ -6,20 +6,26 @@ Source: Fan et al. 2019, arXiv:1903.01344, in the version of Li et al. 2022, arX
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from pydantic import PositiveInt
 from torch import Tensor
+from torchrl.data import Bounded, TensorSpec
 
 from hpamdp.env import point_agent
 from hpamdp.env.batched_env import Action
-from hpamdp.env.catch_point import kernel, rules
+from hpamdp.env.catch_point import kernel, picture, rules
 from hpamdp.env.catch_point.rules import CatchPointState
 from hpamdp.env.counter_rng import RngKey
+from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
+from hpamdp.observation_entries import ObservationEntry
 from hpamdp.settings import Settings
 
 _TURNS = 8  # of all the turns, so many are declared
@@ -37,6 +43,8 @@ class CatchPointOptions(Settings):
     """Whether an episode without catches ends one step late, with reward 0, as in the published code."""
     progress: bool = False
     """Whether the agent observes its misses and the time, `[N, 6]` instead of `[N, 4]`, as in DLPA's code."""
+    observation: Literal["vector", "picture"] = "vector"
+    """Whether the agent observes a vector, or the same drawn as a picture, uint8 `[N, 12288]` (`[3, 64, 64]`)."""
     compile_rules: bool = False
     """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
@@ -51,7 +59,8 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     The reward is minus the squared distance after each step, plus 20 for a catch within 0.2 of the target, which ends
     the episode. A catch elsewhere is a miss.
 
-    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `BatchedEnv`.
+    Only the start is random. If `flatten_pictures` is true, a picture is float32 with numbers in [0, 1], a vector like
+    any other. For the constructor's other arguments and errors see `PointEnv` and `BatchedEnv`.
     """
 
     Options = CatchPointOptions
@@ -64,8 +73,51 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     row_kernel = staticmethod(kernel.advance)
     target_radius = point_agent.HIT_RADIUS
 
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        options: CatchPointOptions | None = None,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+        oracle: bool = False,
+        flatten_pictures: bool = False,
+        **settings: Any,
+    ) -> None:
+        self._flattens = flatten_pictures
+        super().__init__(
+            num_envs, options=options, device=device, seed=seed, first_env=first_env, oracle=oracle, **settings
+        )
+
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return the facts about the problem under these settings."""
+        return replace(super().facts(options), has_pictures=options.observation == "picture")
+
     def _prepare(self) -> None:
         self.observation_names = point_agent.OBSERVATION_NAMES + (rules.PROGRESS_NAMES if self.options.progress else ())
+        self._shows_picture = self.options.observation == "picture"
+        if self._shows_picture and not self._flattens:
+            self.observation_entries = (ObservationEntry("picture", 0, picture.SHAPE, is_picture=True),)
+
+    def observed_spec(self) -> TensorSpec:
+        """Return the spec of vectors, of pictures, or of flattened pictures."""
+        if not self._shows_picture:
+            return super().observed_spec()
+        shape = (self.num_envs, math.prod(picture.SHAPE))
+        dtype = torch.float32 if self._flattens else torch.uint8
+        return Bounded(0, 1 if self._flattens else 255, shape=shape, device=self.device, dtype=dtype)
+
+    def shown(self, vectors: Tensor) -> Tensor:
+        """Return the vectors, or pictures of them, drawn by the CPU."""
+        if not self._shows_picture:
+            return vectors
+        pixels = np.empty((len(vectors), *picture.SHAPE), np.uint8)
+        longest_time, most_misses = self.max_steps / 12.0 - 1.0, rules.PUBLISHED_CATCHES / 6.0 - 1.0
+        picture.draw(vectors.detach().numpy(force=True), longest_time, most_misses, pixels)
+        pictures = torch.from_numpy(pixels).flatten(1).to(vectors.device)
+        return pictures.float() / 255.0 if self._flattens else pictures
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the rules of catches, and whether progress is observed."""
@@ -80,8 +132,13 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         return [*low, -1.0, -1.0], [*high, 1.0, self.max_steps / 12.0 - 0.99]
 
     @property
-    def symmetries(self) -> Symmetries:
-        """Turns of the plane by multiples of 45 degrees and their mirrors; any other turn would do as well."""
+    def symmetries(self) -> Symmetries | None:
+        """Turns of the plane by multiples of 45 degrees and their mirrors; any other turn would do as well.
+
+        None with pictures, since a symmetry maps vectors linearly.
+        """
+        if self._shows_picture:
+            return None
         plane = plane_maps(_TURNS)
         weight, offset = on_observations(plane, len(self.observation_names), point_agent.VECTORS)
         # A direction runs from +y to +x, so a turn by a, from +x to +y, makes p into p - a; the mirror x -> -x before
@@ -99,9 +156,9 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         )
 
     @property
-    def geometry(self) -> PlaneGeometry:
-        """The speed and the way to the target; where a move points is its parameter."""
-        return PlaneGeometry(vectors=point_agent.VECTORS)
+    def geometry(self) -> PlaneGeometry | None:
+        """The speed and the way to the target; where a move points is its parameter. None with pictures."""
+        return None if self._shows_picture else PlaneGeometry(vectors=point_agent.VECTORS)
 
     def start(self, episode: Tensor, rng: RngKey) -> CatchPointState:
         """Return states with agent and target anywhere in the square."""

@@ -36,6 +36,7 @@ class Reading:
     Attributes:
         max_steps, action_form, parameter_dims, option_key, action_mask, pair_mask, parameter_bounds, observation_keys,
             out_of_bounds: see the settings.
+        flattens_pictures: whether pictures are part of the vectors.
     """
 
     max_steps: int | None = None
@@ -47,6 +48,7 @@ class Reading:
     parameter_bounds: MaskSource | None = None
     observation_keys: tuple[int | str, ...] | None = None
     out_of_bounds: OutOfBounds = "refuse"
+    flattens_pictures: bool = False
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Results:
     """What the copies have last returned, float64, a row for each copy.
 
     Attributes:
-        observation: `[N, dim]`, flattened but not scaled.
+        observation: `[N, dim]`, flattened but not scaled, without pictures.
         reward, terminated, truncated, success, has_success: `[N]`. `has_success` is 1 if the last info had a success.
         flags: the four of these that are flags, one after another, `[4, N]`.
         masks: by name, `[N, K]`.
@@ -78,14 +80,16 @@ class Layout:
     """Where things are in a table of results, which has a row for each copy.
 
     Attributes:
-        dim: length of the observation.
+        dim: length of the observation without pictures.
         mask_sizes: lengths of the masks, by name.
         num_bounded: number of parameters whose bounds depend on the state.
+        num_pixels: number of pixels of all pictures, which have a table of their own.
     """
 
     dim: int
     mask_sizes: dict[str, int]
     num_bounded: int
+    num_pixels: int = 0
 
     @property
     def num_result_columns(self) -> int:
@@ -123,6 +127,7 @@ class Copies:
         pictures_per_second: `render_fps` of the environment's metadata, or 4.
         option_names: what the environment calls its options, unchecked.
         results: what they have last returned.
+        pixels: the pictures that they have last returned, uint8 `[N, num_pixels]`.
 
     Raises:
         SettingError: the spaces are not accepted, or differ between copies.
@@ -150,7 +155,9 @@ class Copies:
             apart = {*self._masks.in_observation, *(self._bounds.names if self._bounds.in_observation else ())}
             if apart and entries is None:
                 entries = [entry for entry in getattr(space, "spaces", {}) if entry not in apart]
-            self.observations = ObservationSpace(space, entries, reading.out_of_bounds)
+            self.observations = ObservationSpace(
+                space, entries, reading.out_of_bounds, flattens_pictures=reading.flattens_pictures
+            )
         except ValueError as error:
             raise SettingError(f"{name}: {error}") from error
         self.option_names = getattr(self.envs[0].unwrapped, "option_names", ())
@@ -158,11 +165,13 @@ class Copies:
         self.pictures_per_second = _rate_of(self.envs[0])
         mask_sizes = {mask: rows.shape[1] for mask, rows in self._masks.rows.items()}
         num_bounded = sum(self.actions.parameter_dims) if self._bounds.names else 0
-        self.layout = Layout(self.observations.dim, mask_sizes, num_bounded)
+        self.layout = Layout(self.observations.dim, mask_sizes, num_bounded, self.observations.num_pixels)
         self.table = np.zeros((num, self.layout.num_result_columns))
+        self.pixels = np.zeros((num, self.layout.num_pixels), np.uint8)
         self.results = self.layout.results(self.table)
         # What each step needs, looked up once.
-        self._write = [self.observations.writer(row) for row in self.results.observation]
+        rows = zip(self.results.observation, self.pixels, strict=True)
+        self._write = [self.observations.writer(*row) for row in rows]
         # Without the outer check, whose work `step` does in its loop.
         self._unchecked = [env.env if isinstance(env, ContractCheck) else env for env in self.envs]
         self._num_steps = [0] * num

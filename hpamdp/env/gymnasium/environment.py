@@ -15,14 +15,14 @@ from PIL import Image, ImageOps
 from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from hpamdp import keys
 from hpamdp.env.actions import check_action_values, invalid_action
 from hpamdp.env.base import PAMDPEnv, ProblemError, checked_option_names
 from hpamdp.env.gymnasium.action_spaces import ActionForm
 from hpamdp.env.gymnasium.copies import Copies, Reading
-from hpamdp.env.gymnasium.form import OwnForm
+from hpamdp.env.gymnasium.form import OwnForm, joined
 from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.masks import MaskSource
@@ -30,6 +30,7 @@ from hpamdp.env.gymnasium.parameter_bounds import of_agent
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics, Scaling
 from hpamdp.env.registration import register
+from hpamdp.observation_entries import observation_dtype
 from hpamdp.pickling import why_unsendable
 from hpamdp.settings import PositiveFraction, SettingError, Settings
 
@@ -86,7 +87,10 @@ class GymnasiumOptions(Settings):
     observation_keys: list[int | str] | None = None
     """Entries of a `Tuple` or `Dict` to observe, as in [0] or [position, speed]. If None, all but masks and bounds."""
     observation_scaling: Scaling = "bounds"
-    """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not."""
+    """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not.
+
+    Pictures stay as they are; an encoder divides them by 255.
+    """
     raw_observations: list[int | str] | None = None
     """Entries that stay unscaled: names in a `Dict`, numbers in a `Tuple` or of the vector. If None, all are scaled."""
     reward_scaling: PositiveFraction | None = None
@@ -118,6 +122,7 @@ class GymnasiumEnv(PAMDPEnv):
         device: of the tensors.
         seed: of the episodes, see above.
         first_env: number of the first copy, if other processes have those before it.
+        flatten_pictures: whether pictures are numbers of the vector, scaled like others.
         settings: single settings by name, in place of those in `options`.
 
     Raises:
@@ -138,8 +143,10 @@ class GymnasiumEnv(PAMDPEnv):
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
+        flatten_pictures: bool = False,
         **settings: Any,
     ) -> None:
+        self._flattens_pictures = flatten_pictures
         options = self.options = GymnasiumOptions.of(options, settings)
         # Not a check of the model: the command that resumes a run need not repeat them.
         if make is None and (options.id is None) == (options.entry_point is None):
@@ -166,6 +173,7 @@ class GymnasiumEnv(PAMDPEnv):
         except ValueError as error:
             raise SettingError(f"{self._name}: {error}") from error
         self.option_names = self._names_of_options()
+        self.observation_entries = self._copies.observations.entries(2 * self._copies.layout.num_bounded)
         self._make_specs()
         gamma = options.reward_scaling
         self._reward_scaling = None if gamma is None else RewardScaling(num_envs, gamma)
@@ -207,6 +215,7 @@ class GymnasiumEnv(PAMDPEnv):
             given.parameter_bounds,
             None if given.observation_keys is None else tuple(given.observation_keys),
             given.out_of_bounds,
+            self._flattens_pictures,
         )
 
     @property
@@ -328,10 +337,9 @@ class GymnasiumEnv(PAMDPEnv):
         n = self.num_envs
         device = self.device
         layout, num_discrete = self._copies.layout, len(self.parameter_dims)
-        dim = layout.dim + 2 * layout.num_bounded
         self.observation_spec = Composite(
             {
-                keys.OBSERVATION: Unbounded(shape=(n, dim), device=device, dtype=torch.float32),
+                keys.OBSERVATION: self._observation_spec(),
                 _SUCCESS: Categorical(2, shape=(n,), dtype=torch.bool, device=device),
             },
             shape=(n,),
@@ -347,6 +355,13 @@ class GymnasiumEnv(PAMDPEnv):
         self.action_spec = self.make_action_spec(low, high, has_option=self._copies.options.num_options > 0)
         self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=torch.float32)
         self.done_spec = self.make_done_spec()
+
+    def _observation_spec(self) -> TensorSpec:
+        layout, dtype = self._copies.layout, observation_dtype(self.observation_entries)
+        shape = (self.num_envs, layout.dim + 2 * layout.num_bounded + layout.num_pixels)
+        if dtype == torch.uint8:
+            return Bounded(0, 255, shape=shape, device=self.device, dtype=dtype)
+        return Unbounded(shape=shape, device=self.device, dtype=dtype)
 
     def _set_seed(self, seed: int | None) -> None:
         # Of each copy's next reset; None after its first one.
@@ -445,14 +460,14 @@ class GymnasiumEnv(PAMDPEnv):
             np.logical_or(flags[0], flags[1], out=flags[3])
         self._is_over[:] = flags[3]
         columns = flags[..., None]
-        observation = self._observation.copy()
+        observation = self._observation
         bounds = {}
         if results.bounds is not None:
             low, high, seen = of_agent(self._copies.actions, *results.bounds)
             observation = np.concatenate([observation, seen], axis=-1)
             bounds = {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
         leaves = {
-            keys.OBSERVATION: torch.from_numpy(observation),
+            keys.OBSERVATION: torch.from_numpy(joined(observation, self._copies.pixels)),
             _SUCCESS: torch.from_numpy(flags[2]),
             keys.TERMINATED: torch.from_numpy(columns[0]),
             keys.TRUNCATED: torch.from_numpy(columns[1]),

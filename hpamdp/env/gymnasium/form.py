@@ -64,7 +64,8 @@ class OwnForm(GymnasiumForm):
             low, high, seen = of_agent(actions, bounds.low, bounds.high)
             observed = np.concatenate([observed, seen], axis=-1)
             rows |= {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
-        rows[keys.OBSERVATION] = torch.from_numpy(observed)
+        pixels = np.stack([self._observations.pixels(single) for single in singles])
+        rows[keys.OBSERVATION] = torch.from_numpy(joined(observed, pixels))
         return TensorDict(rows, batch_size=[len(singles)]), num is not None
 
     def scaling(self) -> VectorScaling:
@@ -90,6 +91,13 @@ def _of_row(batch: Any, row: int) -> Any:
     if isinstance(batch, tuple):
         return tuple(_of_row(part, row) for part in batch)
     return None if batch is None else batch[row]
+
+
+def joined(vectors: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return new observations of vectors float32 `[N, dim]` and pictures uint8 `[N, num_pixels]`, if there are any."""
+    if not pixels.shape[1]:
+        return vectors.copy()
+    return np.concatenate([vectors, pixels], 1) if vectors.shape[1] else pixels.copy()
 
 
 def num_in_batch(space: spaces.Space, observation: Any) -> int | None:

@@ -103,6 +103,23 @@ class Leaf:
 
         return write
 
+    def pixel_writer(self, pixels: np.ndarray) -> Callable[[Any], bool]:
+        """Return a function that writes a picture into pixels, uint8 `[size]`, as `writer` does for numbers.
+
+        It writes only uint8, since bytes cannot hold what is outside the space.
+        """
+        shape = self.space.shape
+        shaped = pixels.reshape(shape or ())
+
+        def write(observation: Any) -> bool:
+            value = self._find(observation)
+            if type(value) is not np.ndarray or value.dtype != np.uint8 or value.shape != shape:
+                return False
+            shaped[...] = value
+            return True
+
+        return write
+
     def _write_discrete(self, value: Any, vector: np.ndarray) -> bool:
         index = int(value) - self._first if type(value) in _INTEGERS else -1
         if not 0 <= index < self.size:

@@ -1,7 +1,11 @@
-"""Gymnasium's observation spaces as vectors.
+"""Gymnasium's observation spaces as vectors and pictures.
 
 Accepted are `Box`, `Discrete`, `MultiDiscrete`, `MultiBinary` and `Tuple` and `Dict` of these. They are flattened by
 `gymnasium.spaces.utils.flatten`, which makes discrete values one-hot. Entries of a `Tuple` or `Dict` can be left out.
+
+A `Box` of uint8 from 0 to 255 is a picture if it has 2 or 3 dimensions and at least 16 px a side. Channels may come
+first or last, see `hpamdp.observation_entries.channels_axis`. Pictures stay uint8 and are never scaled. They follow the
+vector of all other numbers.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from gymnasium.spaces.utils import flatdim, flatten_space
 
 from hpamdp.env.gymnasium.action_spaces import written
 from hpamdp.env.gymnasium.leaves import Leaf, OutOfBounds, children, leaves
+from hpamdp.observation_entries import ObservationEntry, is_picture_shape
 from hpamdp.settings import SettingError
 
 
@@ -25,16 +30,23 @@ class ObservationSpace:
         space: see the module's docstring.
         entries: of a `Tuple` (numbers from 0) or `Dict` (names), the entries to keep, in this order. If None, all.
         out_of_bounds: what happens to numbers of a `Box` outside its bounds: `refuse`, `clip` or `allow`; see `Leaf`.
+        flattens_pictures: whether pictures are part of the vectors.
 
     Attributes:
         dim: length of the vectors.
+        num_pixels: number of pixels of all pictures, each channel counted.
 
     Raises:
         ValueError: the space or `out_of_bounds` is not accepted, or the space has no such entry.
     """
 
     def __init__(
-        self, space: spaces.Space, entries: Sequence[int | str] | None = None, out_of_bounds: OutOfBounds = "refuse"
+        self,
+        space: spaces.Space,
+        entries: Sequence[int | str] | None = None,
+        out_of_bounds: OutOfBounds = "refuse",
+        *,
+        flattens_pictures: bool = False,
     ) -> None:
         if not _is_flat(space):
             accepted = "Box, Discrete, MultiDiscrete, MultiBinary and Tuple and Dict of these"
@@ -44,16 +56,39 @@ class ObservationSpace:
         if entries is not None:
             _check_entries(space, entries)
             self.leaves = [leaf for entry in entries for leaf in self.leaves if leaf.path[0] == entry]
+        self._pictures = [] if flattens_pictures else [leaf for leaf in self.leaves if _is_picture(leaf.space)]
+        self.leaves = [leaf for leaf in self.leaves if leaf not in self._pictures]
         self._cures = [self._cure(leaf) for leaf in self.leaves]
         self._space = spaces.Tuple([leaf.space for leaf in self.leaves])
         self.dim = flatdim(self._space)
-        ends = np.cumsum([leaf.size for leaf in self.leaves])
-        self.slices = [slice(end - leaf.size, end) for end, leaf in zip(ends, self.leaves, strict=True)]
-        self._lowest = np.concatenate([leaf.lowest for leaf in self.leaves])
-        self._highest = np.concatenate([leaf.highest for leaf in self.leaves])
-        self._clip_low = np.concatenate([leaf.clip_low for leaf in self.leaves])
-        self._clip_high = np.concatenate([leaf.clip_high for leaf in self.leaves])
+        self.slices = _slices(self.leaves)
+        self.num_pixels = sum(leaf.size for leaf in self._pictures)
+        self._picture_slices = _slices(self._pictures)
+        self._lowest = _joined([leaf.lowest for leaf in self.leaves])
+        self._highest = _joined([leaf.highest for leaf in self.leaves])
+        self._clip_low = _joined([leaf.clip_low for leaf in self.leaves])
+        self._clip_high = _joined([leaf.clip_high for leaf in self.leaves])
         self._is_clipped = out_of_bounds == "clip"
+
+    def entries(self, num_bounds: int = 0) -> tuple[ObservationEntry, ...]:
+        """Return the entries of observations in which the pictures follow the vector; none without a picture.
+
+        Args:
+            num_bounds: how many bounds of parameters stand between the two.
+        """
+        if not self._pictures:
+            return ()
+        vectors = [
+            ObservationEntry(_name(leaf), own.start, (leaf.size,))
+            for leaf, own in zip(self.leaves, self.slices, strict=True)
+        ]
+        if num_bounds:
+            vectors.append(ObservationEntry("parameter_bounds", self.dim, (num_bounds,)))
+        pictures = [
+            ObservationEntry(_name(leaf), self.dim + num_bounds + own.start, leaf.space.shape or (), is_picture=True)
+            for leaf, own in zip(self._pictures, self._picture_slices, strict=True)
+        ]
+        return (*vectors, *pictures)
 
     def places(self, entries: Sequence[int | str]) -> np.ndarray:
         """Return which numbers of the vectors belong to these entries, bool `[dim]`.
@@ -64,10 +99,11 @@ class ObservationSpace:
         Raises:
             ValueError: there is no such entry.
         """
-        allowed = list(dict.fromkeys(leaf.path[0] for leaf in self.leaves)) if self._names else [*range(self.dim)]
+        observed = [*self.leaves, *self._pictures]
+        allowed = list(dict.fromkeys(leaf.path[0] for leaf in observed)) if self._names else [*range(self.dim)]
         wrong = [entry for entry in entries if entry not in allowed]
         if wrong:
-            named = str(allowed) if self._names else f"0 to {self.dim - 1}"
+            named = str(allowed) if self._names else f"0 to {self.dim - 1}" if self.dim else "none of a picture"
             raise SettingError(f"raw_observations={list(entries)}: must name observed entries, which are {named}")
         is_place = np.zeros(self.dim, bool)
         if not self._names:
@@ -78,30 +114,44 @@ class ObservationSpace:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds of the vectors, float64 `[dim]` each."""
+        if not self.leaves:
+            return np.zeros(0), np.zeros(0)
         box = flatten_space(self._space)
         assert isinstance(box, spaces.Box)  # as are all spaces that `_is_flat` lets pass
         return box.low.astype(np.float64), box.high.astype(np.float64)
 
     def flat(self, observation: Any) -> np.ndarray:
-        """Return an observation as a vector, float64 `[dim]`.
+        """Return the vector of an observation, float64 `[dim]`.
 
         Raises:
             ProblemError: an entry is missing or not in its space: see `Leaf`.
         """
-        return np.concatenate(
-            [leaf.flat(observation, cure) for leaf, cure in zip(self.leaves, self._cures, strict=True)]
-        )
+        return _joined([leaf.flat(observation, cure) for leaf, cure in zip(self.leaves, self._cures, strict=True)])
 
-    def writer(self, vector: np.ndarray) -> Callable[[Any], bool]:
-        """Return a function that writes an observation into a vector, float64 `[dim]`.
+    def pixels(self, observation: Any) -> np.ndarray:
+        """Return the pixels of an observation, uint8 `[num_pixels]`.
+
+        Raises:
+            ProblemError: a picture is missing or not in its space: see `Leaf`.
+        """
+        pixels = np.empty(self.num_pixels, np.uint8)
+        for leaf, own in zip(self._pictures, self._picture_slices, strict=True):
+            if not leaf.pixel_writer(pixels[own])(observation):
+                pixels[own] = leaf.flat(observation)
+        return pixels
+
+    def writer(self, vector: np.ndarray, pixels: np.ndarray) -> Callable[[Any], bool]:
+        """Return a function that writes an observation into a vector, float64 `[dim]`, and pixels uint8 `[num_pixels]`.
 
         The function returns whether the numbers are still to be checked, by `unsettled` and `settled`. It raises a
         ProblemError if an entry is missing, or if a value that is not plain is not in its space.
         """
         writers = [leaf.writer(vector[own]) for leaf, own in zip(self.leaves, self.slices, strict=True)]
+        for leaf, own in zip(self._pictures, self._picture_slices, strict=True):
+            writers.append(leaf.pixel_writer(pixels[own]))
 
         def write_any(observation: Any) -> bool:
-            vector[:] = self.flat(observation)
+            vector[:], pixels[:] = self.flat(observation), self.pixels(observation)
             return False
 
         if len(writers) == 1:  # saves a call
@@ -121,7 +171,7 @@ class ObservationSpace:
             ProblemError: a number is not in its space.
         """
         parts = zip(self.leaves, self.slices, self._cures, strict=True)
-        return np.concatenate([leaf.settled(vector[own], cure) for leaf, own, cure in parts])
+        return _joined([leaf.settled(vector[own], cure) for leaf, own, cure in parts])
 
     def rounded(self, vectors: np.ndarray) -> np.ndarray:
         """Return checked vectors `[M, dim]`, moved to their bounds if asked, in the precision of their spaces."""
@@ -142,6 +192,25 @@ class ObservationSpace:
         """Return how to leave out the leaf's entry, as the end of a message; empty if there is no other entry."""
         others = [name for name in self._names if leaf.path and name != leaf.path[0]]
         return f"; env.observation_keys={others} leaves the entry out" if others else ""
+
+
+def _slices(parts: Sequence[Leaf]) -> list[slice]:
+    ends = np.cumsum([leaf.size for leaf in parts], dtype=np.int64).tolist()
+    return [slice(end - leaf.size, end) for end, leaf in zip(ends, parts, strict=True)]
+
+
+def _joined(vectors: Sequence[np.ndarray]) -> np.ndarray:
+    return np.concatenate(vectors) if vectors else np.zeros(0)
+
+
+def _name(leaf: Leaf) -> str:
+    return ".".join(map(str, leaf.path)) or "observation"
+
+
+def _is_picture(space: spaces.Space) -> bool:
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or not is_picture_shape(space.shape):
+        return False
+    return bool((space.low == 0).all() and (space.high == 255).all())
 
 
 def _check_entries(space: spaces.Space, entries: Sequence[int | str]) -> None:

@@ -7,7 +7,7 @@ of all copies in it. So a step sends one message to each worker, and the copies 
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -40,7 +40,7 @@ class _Block:
         first: number of the first copy.
         num: number of copies.
         num_rows: number of rows of the tables, the same in all workers.
-        num_columns: of the tables of actions and of results.
+        num_columns: of the tables of actions, of results and of pixels.
     """
 
     make: Callable[[], gymnasium.Env]
@@ -49,7 +49,7 @@ class _Block:
     first: int
     num: int
     num_rows: int
-    num_columns: tuple[int, int]
+    num_columns: tuple[int, int, int]
 
     def __call__(self) -> gymnasium.Env:
         return _BlockEnv(self)
@@ -61,12 +61,16 @@ class _BlockEnv(gymnasium.Env):
     def __init__(self, block: _Block) -> None:
         self._block = block
         self._copies: Copies | None = None
-        of_actions, of_results = block.num_columns
+        of_actions, of_results, of_pixels = block.num_columns
         self.action_space = spaces.Box(-np.inf, np.inf, (block.num_rows, of_actions), np.float64)
-        self.observation_space = spaces.Box(-np.inf, np.inf, (block.num_rows, of_results), np.float64)
+        tables: list[spaces.Space] = [spaces.Box(-np.inf, np.inf, (block.num_rows, of_results), np.float64)]
+        if of_pixels:
+            tables.append(spaces.Box(0, 255, (block.num_rows, of_pixels), np.uint8))
+        self.observation_space = spaces.Tuple(tables)
         self._table = np.zeros((block.num_rows, of_results))
+        self._pixels = np.zeros((block.num_rows, of_pixels), np.uint8)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         """Begin episodes of the copies whose `seeds` are in the options."""
         block = self._block
         if self._copies is None:
@@ -77,7 +81,7 @@ class _BlockEnv(gymnasium.Env):
         self._copies.reset({row: seed for row, seed in seeds.items() if 0 <= row < block.num})
         return self._results(), {}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict]:
         """Take the steps of a table of actions."""
         assert self._copies is not None
         actions = action[: self._block.num]
@@ -102,10 +106,13 @@ class _BlockEnv(gymnasium.Env):
         assert self._copies is not None
         return self._copies.pictures(max(0, num - self._block.first))
 
-    def _results(self) -> np.ndarray:
+    def _results(self) -> tuple[np.ndarray, ...]:
         assert self._copies is not None
         self._table[: self._block.num] = self._copies.table
-        return self._table
+        if not self._pixels.size:
+            return (self._table,)
+        self._pixels[: self._block.num] = self._copies.pixels
+        return self._table, self._pixels
 
 
 class ProcessCopies:
@@ -122,7 +129,7 @@ class ProcessCopies:
 
     Attributes:
         max_steps, option_names, has_pictures, pictures_per_second: as those of `Copies`.
-        options, actions, observations, layout, table, results: as those of `Copies`.
+        options, actions, observations, layout, table, results, pixels: as those of `Copies`.
         envs: empty, since the copies live elsewhere.
         example: a closed copy, to read its spaces.
 
@@ -145,9 +152,11 @@ class ProcessCopies:
         self.options, self.actions, self.observations = probe.options, probe.actions, probe.observations
         self.table = np.zeros((num, self.layout.num_result_columns))
         self.results = self.layout.results(self.table)
+        self.pixels = np.zeros((num, self.layout.num_pixels), np.uint8)
         rows = -(-num // num_workers)
         self._first_parameter = _DISCRETE + self.actions.num_components
-        columns = (self._first_parameter + sum(self.actions.parameter_dims), self.layout.num_result_columns)
+        of_actions = self._first_parameter + sum(self.actions.parameter_dims)
+        columns = (of_actions, self.layout.num_result_columns, self.layout.num_pixels)
         blocks = [
             _Block(make, reading, name, first, min(rows, num - first), rows, columns) for first in range(0, num, rows)
         ]
@@ -160,8 +169,8 @@ class ProcessCopies:
     def reset(self, seeds: Mapping[int, int | None]) -> None:
         """Begin episodes; see `Copies.reset`."""
         with self._explained():
-            table, _ = self._vector.reset(options={"seeds": dict(seeds)})
-        self._keep(table)
+            tables, _ = self._vector.reset(options={"seeds": dict(seeds)})
+        self._keep(tables)
 
     def step(self, rows: list[int], option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> None:
         """Take a step with some copies; see `Copies.step`."""
@@ -174,8 +183,8 @@ class ProcessCopies:
         actions[:num, _DISCRETE : self._first_parameter] = discrete.reshape(num, -1)
         actions[:num, self._first_parameter :] = parameters
         with self._explained():
-            table = self._vector.step(actions.reshape(self._shape_of_actions))[0]
-        self._keep(table)
+            tables = self._vector.step(actions.reshape(self._shape_of_actions))[0]
+        self._keep(tables)
 
     def pictures(self, num: int) -> list[np.ndarray]:
         """Return pictures of the first `num` copies; see `Copies.pictures`."""
@@ -183,8 +192,10 @@ class ProcessCopies:
             pictures = self._vector.call("pictures", num)
         return [picture for of_worker in pictures for picture in of_worker]
 
-    def _keep(self, table: np.ndarray) -> None:
-        self.table[:] = table.reshape(-1, table.shape[-1])[: len(self.table)]
+    def _keep(self, tables: Sequence[np.ndarray]) -> None:
+        owns: tuple[np.ndarray, ...] = (self.table, self.pixels)
+        for own, table in zip(owns, tables, strict=False):
+            own[:] = table.reshape(-1, table.shape[-1])[: len(own)]
 
     @contextmanager
     def _explained(self) -> Iterator[None]:

@@ -32,6 +32,7 @@ from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.policies.shared.networks import mlp
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.settings import PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
@@ -60,6 +61,7 @@ class Actor(OnPolicy, Selector):
     """Sample the option from a softmax over the outputs of a network."""
 
     Options = ActorOptions
+    takes_pictures = True
     modes: ClassVar[tuple[str, ...]] = ("train",)
 
     def __init__(
@@ -74,8 +76,10 @@ class Actor(OnPolicy, Selector):
         self.options: ActorOptions = ActorOptions.of(options, settings)
         self.out_keys = [*self.out_keys, LOG_PROB, WEIGHT, *([ALLOWED] if specs.has_option_mask else [])]
         self.gamma = self.options.gamma
-        self.logits = mlp(specs.observation_dim, self.options.hidden_dims, specs.num_options)
-        self.critic = mlp(specs.observation_dim, self.options.hidden_dims, 1)
+        self.perception = Perception(specs)
+        num_inputs = self.perception.specs.observation_dim
+        self.logits = mlp(num_inputs, self.options.hidden_dims, specs.num_options)
+        self.critic = mlp(num_inputs, self.options.hidden_dims, 1)
         self.to(device)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=self.options.lr, eps=1e-5, fused=True)
 
@@ -103,8 +107,13 @@ class Actor(OnPolicy, Selector):
 
     def _log_probs(self, td: TensorDictBase) -> Tensor:
         """Return the policy's log-probabilities `[*B, num_options]`."""
-        logits = masked_logits(self.logits(td.get(keys.OBSERVATION)), td.get(keys.OPTION_MASK, None))
+        logits = masked_logits(self.logits(self.perception(td.get(keys.OBSERVATION))), td.get(keys.OPTION_MASK, None))
         return logits.log_softmax(-1)
+
+    def _value(self, observation: Tensor) -> Tensor:
+        """Return the critic's values `[N]` of observations `[N, observation_dim]`."""
+        value: Tensor = self.critic(self.perception(observation)).squeeze(-1)
+        return value
 
     def _allowed(self, td: TensorDictBase) -> dict[str, Tensor]:
         return {ALLOWED: td.get(keys.OPTION_MASK).clone()} if self.specs.has_option_mask else {}
@@ -118,7 +127,7 @@ class Actor(OnPolicy, Selector):
         rows = self.gather(self.rows(decisions))
         if rows is None:
             return {}
-        rows["advantage"] = rows["target"] - self.critic(rows["state"]).squeeze(-1).detach()
+        rows["advantage"] = rows["target"] - self._value(rows["state"]).detach()
         rows["advantage"] = normalised(rows["advantage"])
         return mean_scalars([self.gradient_step(self.loss, minibatch) for minibatch in self.minibatches(rows)])
 
@@ -126,7 +135,7 @@ class Actor(OnPolicy, Selector):
     def rows(self, decisions: TensorDictBase) -> TensorDict:
         """Return what an update needs of decisions `[N]`; `target` is that of the value."""
         after = decisions.get("next")
-        next_value = self.critic(after.get(keys.OBSERVATION)).squeeze(-1)
+        next_value = self._value(after.get(keys.OBSERVATION))
         rows = {
             "state": after.get(keys.DECISION_OBSERVATION),
             "option": decisions.get(keys.OPTION),
@@ -141,7 +150,8 @@ class Actor(OnPolicy, Selector):
     def empty_rows(self) -> dict[str, Tensor]:
         """Return the columns of `rows`."""
         number = torch.zeros(0, dtype=torch.float32)
-        columns = {"state": torch.zeros(0, self.specs.observation_dim, dtype=torch.float32), "option": number.long()}
+        state = torch.zeros(0, self.specs.observation_dim, dtype=self.specs.observation_dtype)
+        columns = {"state": state, "option": number.long()}
         columns |= dict.fromkeys(("log_prob", "weight", "target"), number)
         if self.specs.has_option_mask:
             columns["allowed"] = torch.zeros(0, self.specs.num_options, dtype=torch.bool)
@@ -149,10 +159,11 @@ class Actor(OnPolicy, Selector):
 
     def loss(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of policy and critic on decisions `[B]`, and scalars to log."""
-        log_probs = masked_logits(self.logits(rows["state"]), rows.get("allowed", None)).log_softmax(-1)
+        features = self.perception(rows["state"])
+        log_probs = masked_logits(self.logits(features), rows.get("allowed", None)).log_softmax(-1)
         log_prob = log_probs.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
         surrogate = (rows["weight"] * self.surrogate(log_prob - rows["log_prob"], rows["advantage"])).mean()
         entropy = -(log_probs.exp() * log_probs).sum(-1).mean()
-        critic_loss = (rows["weight"] * (self.critic(rows["state"]).squeeze(-1) - rows["target"]).square()).mean()
+        critic_loss = (rows["weight"] * (self.critic(features).squeeze(-1) - rows["target"]).square()).mean()
         loss = 0.5 * critic_loss - surrogate - self.options.entropy * entropy
         return loss, {"critic": critic_loss, "entropy": entropy}

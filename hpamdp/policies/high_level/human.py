@@ -16,6 +16,7 @@ class Human(Selector):
     """Choose each option with the probability that humans choose it in the same situation, greedy or not."""
 
     needs: ClassVar[tuple[str, ...]] = ("human",)
+    takes_pictures = True
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

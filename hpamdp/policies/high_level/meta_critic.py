@@ -31,6 +31,7 @@ from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.option_values import OptionValueOptions
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import first_multiple
 from hpamdp.specs import PAMDPSpecs
 
@@ -56,6 +57,7 @@ class MetaCritic(Selector):
     """Choose the option with the highest mean Q of an ensemble."""
 
     Options = MetaCriticOptions
+    takes_pictures = True
     ends_options: ClassVar[bool] = True
     num_decisions: Tensor
 
@@ -70,13 +72,15 @@ class MetaCritic(Selector):
         super().__init__(specs)
         self.options: MetaCriticOptions = MetaCriticOptions.of(options, settings)
         self.gamma = self.options.gamma
-        self.critics = EnsembleMLP(
-            self.options.num_members, specs.observation_dim, self.options.hidden_dims, specs.num_options
-        )
+        self.perception = Perception(specs)
+        num_inputs = self.perception.specs.observation_dim
+        self.critics = EnsembleMLP(self.options.num_members, num_inputs, self.options.hidden_dims, specs.num_options)
+        self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
         self.to(device)
-        self.optimizer = torch.optim.Adam(self.critics.parameters(), lr=self.options.lr, fused=True)
+        learned = [*self.critics.parameters(), *self.perception.parameters()]
+        self.optimizer = torch.optim.Adam(learned, lr=self.options.lr, fused=True)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(self.options.buffer_size, device=device))
 
     def stateful(self) -> dict[str, Any]:
@@ -87,9 +91,9 @@ class MetaCritic(Selector):
         """Return the rows that the buffer would store if every step of a batch `[*B, T]` ended an option."""
         return {"buffer": self._rows(batch.flatten())}
 
-    def exported(self) -> dict[str, Any]:
-        """Return the critics, see `hpamdp.policies.shared.exported_policy`."""
-        return exported_ensemble(self.critics)
+    def exported(self) -> dict[str, Any] | None:
+        """Return the critics, unless they see features: see `hpamdp.policies.shared.exported_policy`."""
+        return exported_ensemble(self.critics) if self.perception.is_plain else None
 
     @property
     def epsilon(self) -> float:
@@ -106,7 +110,7 @@ class MetaCritic(Selector):
         """Return the choices `[*B]`: the highest mean Q if the policy is greedy, else exploring."""
         observation = td.get(keys.OBSERVATION)
         mask = td.get(keys.OPTION_MASK, None)
-        q = self.critics(observation.flatten(0, -2))
+        q = self.critics(self.perception(observation.flatten(0, -2)))
         value = q.mean(0)
         if not is_greedy():
             if self.options.exploration == "ucb":
@@ -122,7 +126,8 @@ class MetaCritic(Selector):
 
         If the option with the highest Q never ended, the other options would collect no data.
         """
-        value = self.critics(td.get(keys.OBSERVATION).flatten(0, -2)).mean(0).reshape(*td.batch_size, -1)
+        observation = td.get(keys.OBSERVATION).flatten(0, -2)
+        value = self.critics(self.perception(observation)).mean(0).reshape(*td.batch_size, -1)
         is_worse = masked_values(value, td.get(keys.OPTION_MASK, None)).argmax(-1) != td.get(keys.OPTION)
         if is_greedy():
             return is_worse
@@ -170,9 +175,9 @@ class MetaCritic(Selector):
 
     def update_critics(self, rows: TensorDictBase) -> Tensor:
         """Make one update of the critics from decisions `[batch_size]`; return the loss."""
-        q = self.critics(rows["state"])
+        q = self.critics(self.perception(rows["state"]))
         with torch.no_grad():
-            next_q = self.target_critics(rows["next_state"]).mean(0)
+            next_q = self.target_critics(self.target_perception(rows["next_state"])).mean(0)
             next_value = masked_values(next_q, rows.get("next_option_mask", None)).amax(-1)
             target = (rows["return"] + rows["discount"] * next_value).unsqueeze(-1)
             is_chosen = torch.zeros_like(q[0]).scatter(-1, rows["option"].unsqueeze(-1), 1.0)
@@ -183,4 +188,5 @@ class MetaCritic(Selector):
         loss.backward()
         self.optimizer.step()
         polyak_update(self.target_critics, self.critics, self.options.tau)
+        polyak_update(self.target_perception, self.perception, self.options.tau)
         return loss.detach()

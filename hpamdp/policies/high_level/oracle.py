@@ -16,6 +16,7 @@ class Oracle(Selector):
     """Choose the option whose best plan has the highest score."""
 
     needs: ClassVar[tuple[str, ...]] = ("oracle",)
+    takes_pictures = True
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

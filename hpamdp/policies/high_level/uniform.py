@@ -13,6 +13,8 @@ from hpamdp.policies.masks import random_choice
 class Uniform(Selector):
     """Choose each allowed option with the same probability."""
 
+    takes_pictures = True
+
     def select(self, td: TensorDictBase) -> Tensor:
         """Return a random option for every environment, int64 `[*B]`."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)

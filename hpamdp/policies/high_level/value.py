@@ -38,6 +38,7 @@ class Value(Selector):
 
     Options = ValueOptions
     asks_learners = True
+    takes_pictures = True
 
     def __init__(self, specs: PAMDPSpecs, options: ValueOptions | None = None, **settings: Any) -> None:
         super().__init__(specs)

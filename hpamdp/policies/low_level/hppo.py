@@ -129,6 +129,7 @@ class HPPO(OnPolicy, Learner):
 
     Options = HPPOOptions
     takes = frozenset(ActionFeature)
+    takes_pictures = True
 
     frames: Tensor
 
@@ -266,7 +267,7 @@ class HPPO(OnPolicy, Learner):
         """Return the columns of `rows`."""
         number = torch.zeros(0, dtype=torch.float32)
         choice = torch.zeros(0, *self.specs.components.shape, dtype=torch.float32)
-        columns = {keys.OBSERVATION: torch.zeros(0, self.specs.observation_dim, dtype=torch.float32)}
+        columns = {keys.OBSERVATION: torch.zeros(0, self.specs.observation_dim, dtype=self.specs.observation_dtype)}
         columns[RAW] = torch.zeros(0, self.specs.num_parameters, dtype=torch.float32)
         columns |= {"discrete": choice.long(), "advantage": number, "target": number}
         columns |= {"discrete_log_prob": choice, "parameter_log_prob": choice}

@@ -166,6 +166,7 @@ class HSAC(ReplayLearner):
 
     Options = HSACOptions
     takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
+    takes_pictures = True
     stores_own_parameters = True
 
     options: HSACOptions

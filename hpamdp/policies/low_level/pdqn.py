@@ -234,6 +234,7 @@ class PDQN(ReplayLearner):
 
     Options = PDQNOptions
     takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
+    takes_pictures = True
 
     options: PDQNOptions
     policy: PDQNPolicy

@@ -46,6 +46,7 @@ class Planner(Learner):
 
     needs: ClassVar[tuple[str, ...]] = ("oracle",)
     export_refusal = "plans at every step"
+    takes_pictures = True
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

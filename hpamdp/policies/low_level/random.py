@@ -37,6 +37,7 @@ class Random(Learner):
     """Acts at random and learns nothing."""
 
     takes = frozenset(ActionFeature)
+    takes_pictures = True
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

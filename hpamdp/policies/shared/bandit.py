@@ -125,6 +125,7 @@ class Bandit(Selector):
     """
 
     is_bandit: ClassVar[bool] = True
+    takes_pictures = True
     Options: ClassVar[type[BanditOptions]] = BanditOptions
     options: BanditOptions
 

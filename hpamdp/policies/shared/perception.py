@@ -9,14 +9,17 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
 from hpamdp import keys
+from hpamdp.policies.encoders.base import JoinedEncoders
 from hpamdp.policies.shared.memory import GRU, MemoryOptions, Stack
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 
 class Perception(nn.Module):
     """Stands between a learner's observations and its networks, which are built from `specs` and see `forward`.
 
-    Without further parts features are the observations themselves, and nothing is computed. The end of the features is
+    If the observation has pictures, an encoder makes features of them, which a memory sees in their place. Without
+    pictures and memory, features are the observations themselves, and nothing is computed. The end of the features is
     the end of the observation, so that a shared learner's one-hot option stays in its place.
 
     An on-policy learner trains it with its whole loss. A learner with a replay buffer trains it with the critics' loss
@@ -33,6 +36,7 @@ class Perception(nn.Module):
     Attributes:
         specs: of the features; the networks behind are built from them.
         is_plain: whether features are the observations themselves.
+        encoder: what encodes pictures; None if there are none.
         memory: what remembers earlier observations; None if there is none.
         memory_key: of the memory's state in a step; None if there is none.
         in_keys: what `see` reads of a step.
@@ -43,20 +47,26 @@ class Perception(nn.Module):
         super().__init__()
         self.memory: Stack | GRU | None = None
         self.memory_key: str | None = None
-        self.specs = specs
+        self.encoder = JoinedEncoders(specs) if specs.has_pictures else None
+        self.specs = specs if self.encoder is None else self.encoder.feature_specs
         self.in_keys: list[NestedKey] = [keys.OBSERVATION]
         self.out_keys: list[NestedKey] = []
         is_shared = specs.num_options > 0 and specs.held_option is None
         self._begins_key = keys.EPISODE_STEPS if is_shared else keys.IS_DECISION
         if options is not None and options.memory != "none":
-            num = specs.observation_dim
+            num = self.specs.observation_dim
             is_stack = options.memory == "stack"
+            if is_stack and self.encoder is not None:
+                raise SettingError(
+                    "memory=stack: does not go with pictures, whose encoder changes in training; use memory=gru, or "
+                    "stack pictures in the environment (gymnasium.wrappers.FrameStackObservation)"
+                )
             self.memory = Stack(num, options.stack_steps) if is_stack else GRU(num, options.memory_size)
             self.memory_key = self.memory.name
             self.in_keys += [self._begins_key, self.memory_key]
             self.out_keys += [self.memory_key]
-            self.specs = _of_features(specs, self.memory.num_features)
-        self.is_plain = self.memory is None
+            self.specs = _of_features(self.specs, self.memory.num_features)
+        self.is_plain = self.memory is None and self.encoder is None
 
     @property
     def lasts_an_episode(self) -> bool:
@@ -79,16 +89,22 @@ class Perception(nn.Module):
 
     def see(self, td: TensorDictBase) -> Tensor:
         """Return the features of a step `[*B]`, `[*B, specs.observation_dim]`; write the memory's state after it."""
-        observation = td.get(keys.OBSERVATION)
+        encoded = self.encoded(td.get(keys.OBSERVATION))
         if self.memory is None or self.memory_key is None:
-            features: Tensor = self(observation)
-            return features
+            return encoded
         held = td.get(self.memory_key, None)
         if held is not None and self._begins_key in td.keys():
             held = torch.where(self.begins(td).unsqueeze(-1), 0.0, held)
-        state = self.after(observation, held)
+        state = self._after(encoded, held)
         td.set(self.memory_key, state)
-        return self.memory.features(observation, state)
+        return self.memory.features(encoded, state)
+
+    def encoded(self, observation: Tensor) -> Tensor:
+        """Return what the memory sees of observations `[*B, *]`: the encoder's features, or the observations."""
+        if self.encoder is None:
+            return observation
+        features: Tensor = self.encoder(observation)
+        return features
 
     def begins(self, td: TensorDictBase) -> Tensor:
         """Return where a history begins, bool `[*B]`."""
@@ -103,18 +119,19 @@ class Perception(nn.Module):
             memory: the memory's states `[*B, size]`. If None, fresh.
             has_seen: whether these states are after the observations. Otherwise they are before them.
         """
+        encoded = self.encoded(observation)
         if self.memory is None:
-            return observation
-        state = memory if has_seen and memory is not None else self.after(observation, memory)
-        return self.memory.features(observation, state)
+            return encoded
+        state = memory if has_seen and memory is not None else self._after(encoded, memory)
+        return self.memory.features(encoded, state)
 
-    def after(self, observation: Tensor, memory: Tensor | None = None) -> Tensor:
-        """Return the memory's states `[*B, size]` after observations `[*B, *]`, given those before; if None, fresh."""
+    def _after(self, encoded: Tensor, memory: Tensor | None = None) -> Tensor:
+        """Return the memory's states `[*B, size]` after what it sees `[*B, *]`, given those before; if None, fresh."""
         assert self.memory is not None
         if memory is None:
-            memory = observation.new_zeros(*observation.shape[:-1], self.memory.size, dtype=torch.float32)
-        shape = observation.shape[:-1]
-        state = self.memory.step(observation.reshape(-1, observation.shape[-1]), memory.reshape(-1, self.memory.size))
+            memory = encoded.new_zeros(*encoded.shape[:-1], self.memory.size, dtype=torch.float32)
+        shape = encoded.shape[:-1]
+        state = self.memory.step(encoded.reshape(-1, encoded.shape[-1]), memory.reshape(-1, self.memory.size))
         return state.reshape(*shape, self.memory.size)
 
     def states(self, observations: Tensor, memory: Tensor, has_seen: Tensor) -> Tensor:
@@ -125,12 +142,15 @@ class Perception(nn.Module):
             memory: the states to begin with, `[N, size]`.
             has_seen: where these are after the first observation, and not before it, bool `[N]`.
         """
+        return self._states(self.encoded(observations), memory, has_seen)
+
+    def _states(self, encoded: Tensor, memory: Tensor, has_seen: Tensor) -> Tensor:
         assert isinstance(self.memory, GRU)
-        first = self.memory.step(observations[:, 0], memory)
+        first = self.memory.step(encoded[:, 0], memory)
         first = torch.where(has_seen.unsqueeze(-1), memory, first)
-        if observations.shape[1] == 1:
+        if encoded.shape[1] == 1:
             return first.unsqueeze(1)
-        return torch.cat([first.unsqueeze(1), self.memory.unrolled(observations[:, 1:], first)], 1)
+        return torch.cat([first.unsqueeze(1), self.memory.unrolled(encoded[:, 1:], first)], 1)
 
     def of_sequences(self, observation: Tensor, memory: Tensor, begins: Tensor, starts: Tensor) -> Tensor:
         """Return the features `[N, specs.observation_dim]` of rows that are sequences, one after another.
@@ -148,12 +168,13 @@ class Perception(nn.Module):
         lengths = sequence.bincount()
         ends = lengths.cumsum(0)
         place = torch.arange(len(sequence), device=sequence.device) - (ends - lengths)[sequence]
-        padded = observation.new_zeros(len(lengths), int(lengths.max()), observation.shape[-1])
-        padded[sequence, place] = observation
+        encoded = self.encoded(observation)
+        padded = encoded.new_zeros(len(lengths), int(lengths.max()), encoded.shape[-1])
+        padded[sequence, place] = encoded
         first = ends - lengths
         is_fresh = begins[first]
-        states = self.states(padded, torch.where(is_fresh.unsqueeze(-1), 0.0, memory[first]), ~is_fresh)
-        return self.memory.features(observation, states[sequence, place])
+        states = self._states(padded, torch.where(is_fresh.unsqueeze(-1), 0.0, memory[first]), ~is_fresh)
+        return self.memory.features(encoded, states[sequence, place])
 
 
 def _of_features(specs: PAMDPSpecs, num_features: int) -> PAMDPSpecs:

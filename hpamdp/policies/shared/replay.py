@@ -16,6 +16,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from typing_extensions import Self
 
 from hpamdp import keys
+from hpamdp.observation_entries import packed, unpacked
 from hpamdp.policies.base import Learner
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
 from hpamdp.policies.shared.memory import HistoryLinks, MemoryOptions, ReplayMemoryOptions, ancestors
@@ -23,6 +24,8 @@ from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.symmetry import RandomSymmetry
 from hpamdp.settings import PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
+
+_STATES = ("state", "next_state")
 
 
 class BufferOptions(Settings):
@@ -121,6 +124,8 @@ class ReplayLearner(Learner):
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(options.buffer_size, device=device))
         self.descent = Descent()
         self.links = None
+        # Pictures among vectors come as float32, and take a quarter of the memory as bytes.
+        self._packs = specs.has_pictures and specs.observation_dtype == torch.float32
 
     def set_perception(self, options: ReplayMemoryOptions) -> None:
         """Make the perception and its target copy; call it before the networks, which are built from its specs."""
@@ -229,6 +234,9 @@ class ReplayLearner(Learner):
             rows["begins"] = begins
             rows["previous"] = self.links(begins, mask, self.buffer.write_count)
         rows = rows[mask]
+        if self._packs:
+            for name in _STATES:
+                rows[name] = packed(rows[name], self.specs.entries)
         if self.stores_own_parameters:
             rows["unit"] = rows["unit"].gather(-1, self.slots[rows["discrete"]])
         self.buffer.extend(rows)
@@ -251,6 +259,8 @@ class ReplayLearner(Learner):
         num = num_batches * self.options.batch_size
         drawn = self.buffer.sample(num) if self.links is None else self._sample_with_past(num)
         for sample in drawn.split(self.options.batch_size):
+            if self._packs:
+                sample = self._unpacked(sample)
             if self.stores_own_parameters:
                 sample = sample.set("unit", self._all_parameters(sample["discrete"], sample["unit"]))
             yield self.augmented(sample)
@@ -271,6 +281,17 @@ class ReplayLearner(Learner):
         for name in ("memory", "begins"):
             sample.set(f"first_{name}", stored[name][first])
         return sample.set("past", stored["state"][places]).set("num_past", num_found)
+
+    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
+        """Refuse invalid saved rows `[N]`; see `Level.check_rows`."""
+        super().check_rows(self._unpacked(rows.copy()) if self._packs else rows, example)
+
+    def _unpacked(self, rows: TensorDictBase) -> TensorDictBase:
+        """Return stored rows with their states as float32."""
+        for name in (*_STATES, "past"):
+            if name in rows.keys():
+                rows.set(name, unpacked(rows[name], self.specs.entries))
+        return rows
 
     def augmented(self, sample: TensorDictBase) -> TensorDictBase:
         """Return a sample `[N, *]` with each row mapped by a random symmetry of the problem, if `augment` is set."""
