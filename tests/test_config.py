@@ -251,6 +251,11 @@ def test_a_yaml_and_its_class_have_the_same_options(group, name):
 
 
 EXPERIMENTS = [*choices("experiment"), *(f"domains/{name}" for name in choices("experiment/domains"))]
+EXPERIMENTS += [
+    f"lengths/{problem}_{ends}"
+    for problem in ("rooms", "crossing")
+    for ends in ("steps", "learned", "chosen", "chosen_actor")
+]
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)

@@ -306,3 +306,22 @@ def test_domains_names_learners_that_differ_from_the_best_by_chance():
     )
     cells = domains.best_table(results, []).splitlines()[-1].split("|")
     assert [cell.strip() for cell in cells[5:9]] == ["0.552 to 1.048", "pdqn (3)", "0.61", "pdqn; one seed: dlpa"]
+
+
+def test_a_share_on_crossing_is_of_the_best_return_from_the_same_places(tmp_path):
+    lengths = study("lengths")
+    env = lengths.Crossing(50, start=3.0)
+    env.seed_evaluation(7)
+    env.reset()
+    best = lengths.best_values(lengths.GAMMA, 1)
+    steps = [1.0 + math.log(best[cell]) / math.log(lengths.GAMMA) for cell in lengths.cell_of(env.place).tolist()]
+    np.savez(tmp_path / "evaluation.npz", score=np.ones(50), success=np.ones(50), steps=np.array(steps))
+    config = {"env": {"start": 3.0}, "eval": {"seed": 7}}
+    assert lengths.share_on_crossing(Run(tmp_path, {}, config)) == pytest.approx(1.0)
+    np.savez(tmp_path / "evaluation.npz", score=np.ones(50), success=np.ones(50), steps=np.array(steps) + 1.0)
+    assert lengths.share_on_crossing(Run(tmp_path, {}, config)) == pytest.approx(lengths.GAMMA)
+
+
+def test_the_page_of_lengths_has_the_table_of_its_stored_runs(capsys):
+    study("lengths").main([])
+    assert capsys.readouterr().out in (EXPERIMENTS / "lengths" / "README.md").read_text()

@@ -1,0 +1,104 @@
+"""Compare options whose length the selector chooses with learned terminations and with a fixed length.
+
+python experiments/lengths/study.py FOLDER...    gathers the runs of experiment=lengths/... in these folders into
+                                                 results.csv, then tabulates
+python experiments/lengths/study.py              tabulates the stored results.csv
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hpamdp.analysis.study import Rows, Run, finished, mean_interval, read_csv, spread, write_tables
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent.parent / "examples" / "crossing"))
+from crossing import Crossing, best_values, cell_of  # noqa: E402
+
+GAMMA = 0.9  # of the score on Crossing, where all arrivals have the same reward
+ENDS = {
+    ("steps", "meta_critic"): "`steps`, 3 each",
+    ("learned", "option_critic"): "`learned`",
+    ("chosen", "meta_critic"): "`chosen`",
+    ("chosen", "actor"): "`chosen`",
+}
+PROBLEMS = {"crossing": "Crossing", "rooms": "Rooms"}
+
+
+def gather(runs: Sequence[Run]) -> Rows:
+    """Return a row for each run."""
+    rows: Rows = []
+    for run in runs:
+        summary, agent = run.summary, run.config["agent"]
+        share = share_on_crossing(run) if summary["env"] == "crossing" else summary["score"] / summary["ceiling"]
+        rows.append(
+            {
+                "env": summary["env"],
+                "termination": agent["termination"],
+                "high": summary["high"],
+                "low": summary["low"],
+                "seed": summary["seed"],
+                "frames": summary["frames"],
+                "share": round(share, 4),
+                "success": round(summary["success"], 4),
+                "steps": round(summary["steps"], 3),
+                "changes": round(summary["option_changes"], 3),
+                "length": round(summary.get("option_length", float("nan")), 3),
+                "cpu_s": round(summary["cpu_s"], 1),
+            }
+        )
+    return sorted(rows, key=lambda row: (row["env"], row["termination"], row["high"], row["seed"]))
+
+
+def share_on_crossing(run: Run) -> float:
+    """Return the mean discounted return of the run's last evaluation over the best one from the same places."""
+    played = run.played()
+    env = Crossing(len(played["score"]), start=run.config["env"]["start"])
+    env.seed_evaluation(run.config["eval"]["seed"])
+    env.reset()
+    best = torch.tensor(best_values(GAMMA, 1))[cell_of(env.place)].mean().item()
+    return float((played["success"] * GAMMA ** (played["steps"] - 1.0)).mean()) / best
+
+
+def tabulate(rows: Rows) -> None:
+    """Print a row for each problem and each way to end options."""
+    print("| problem | `agent.termination` | `high` | n | share | 95 % | worst | success | steps | length | CPU |")
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    for (env, title), (ends, how) in ((problem, end) for problem in PROBLEMS.items() for end in ENDS.items()):
+        of_ends = [row for row in rows if (row["env"], row["termination"], row["high"]) == (env, *ends)]
+        if not of_ends:
+            continue
+        shares = [100.0 * row["share"] for row in of_ends]
+        low, high = mean_interval(shares)
+        interval = f"{low:.1f} to {high:.1f} %" if len(shares) > 2 else ""
+        length = "" if ends[0] != "chosen" else spread([row["length"] for row in of_ends], 1)
+        cells = [
+            title,
+            how,
+            f"`{ends[1]}`",
+            len(of_ends),
+            f"{spread(shares, 1)} %",
+            interval,
+            f"{min(shares):.1f} %",
+            f"{100.0 * np.mean([row['success'] for row in of_ends]):.1f} %",
+            f"{np.mean([row['steps'] for row in of_ends]):.1f}",
+            length,
+            f"{np.mean([row['cpu_s'] for row in of_ends]):.0f} s",
+        ]
+        print("| " + " | ".join(map(str, cells)) + " |")
+
+
+def main(folders: Sequence[str]) -> None:
+    """Gather the runs in the folders, if any are given, and tabulate."""
+    if folders:
+        write_tables(HERE, {"results": gather(finished(folders))})
+    tabulate(read_csv(HERE / "results.csv"))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
