@@ -1,5 +1,6 @@
 """Memory: what policies remember, where it begins anew, and how learners are trained on sequences of it."""
 
+import itertools
 import shutil
 import signal
 
@@ -9,21 +10,30 @@ from conftest import compose_config, make_config
 from tensordict import TensorDict
 from test_grid import SHORT
 from test_resume import stop_and_resume, words_of
-from toy_memory import Cue
-from toy_options import Crossing
+from toy_memory import Cue, CueOfOptions
+from toy_options import Crossing, steppers
 
 import hpamdp
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.decisions import with_decisions
-from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.policies.base import Learner
+from hpamdp.policies.agent import AgentNextOptions, HierarchicalAgent
+from hpamdp.policies.base import Learner, Selector
+from hpamdp.policies.high_level.actor import Actor
+from hpamdp.policies.high_level.meta_critic import MetaCritic
+from hpamdp.policies.high_level.option_critic import OptionCritic
 from hpamdp.policies.high_level.uniform import Uniform
-from hpamdp.policies.low_level.hppo import HPPO, sequence_starts
+from hpamdp.policies.low_level.hppo import HPPO
 from hpamdp.policies.low_level.hsac import HSAC
 from hpamdp.policies.low_level.pdqn import PDQN
-from hpamdp.policies.shared.memory import HistoryLinks, ancestors
 from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.sequences import (
+    HistoryLinks,
+    ancestors,
+    sample_with_past,
+    sequence_starts,
+    states_of_past,
+)
 from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
 from hpamdp.specs import PAMDPSpecs
@@ -112,10 +122,9 @@ def test_the_ratios_of_sequences_are_one_before_the_first_update(length):
 
 
 def test_sequences_start_where_histories_begin_or_go_on_and_are_never_longer_than_their_length():
-    begins = torch.tensor([[1, 0, 0, 0, 0, 0, 1, 0], [0, 0, 0, 1, 0, 0, 0, 0]]).bool()
-    mask = torch.tensor([[1, 1, 1, 1, 1, 1, 1, 1], [1, 1, 0, 0, 0, 0, 1, 1]]).bool()
-    expected = torch.tensor([[1, 0, 0, 1, 0, 0, 1, 0], [1, 0, 0, 0, 0, 0, 1, 0]]).bool()
-    assert torch.equal(sequence_starts(begins, mask, 3), expected)
+    begins = torch.tensor([[1, 0, 0, 0, 0, 0, 1, 0], [0, 0, 0, 1, 0, 0, 0, 1]]).bool()
+    mask = torch.tensor([[1, 1, 1, 1, 1, 1, 1, 1], [1, 1, 0, 0, 0, 1, 0, 1]]).bool()
+    assert sequence_starts(begins, mask, 3).long().tolist() == [1, 0, 0, 1, 0, 0, 1, 0, 1, 0, 0, 1]
 
 
 def test_minibatches_hand_over_whole_sequences_and_each_row_once_a_pass():
@@ -171,7 +180,7 @@ def stored(low: str, num_batches: int, **changes) -> tuple[ReplayLearner, Tensor
 @pytest.mark.parametrize("buffer_size", [1000, 70])
 def test_a_sequence_is_the_history_of_its_last_step_across_batches_and_never_of_another_environment(buffer_size):
     learner, rolled = stored("pdqn", 9, buffer_size=buffer_size, burn_in=1, sequence_length=2)
-    sample = learner._sample_with_past(500)
+    sample = sample_with_past(learner.buffer, 500, learner.num_past)
     # The reward of a step and its observation after it tell nothing of the environment, but the stored state does.
     where = {tuple(row.tolist()): i for i, row in enumerate(rolled["gru_8"].flatten(0, 1))}
     lengths = set()
@@ -192,7 +201,7 @@ def test_a_sequence_is_the_history_of_its_last_step_across_batches_and_never_of_
 @pytest.mark.parametrize(("burn_in", "length"), [(0, 4), (2, 2), (3, 1), (0, 1), (0, 9)])
 def test_sampled_states_are_those_of_the_policy_that_stored_them(burn_in, length):
     learner, _ = stored("hsac", 6, burn_in=burn_in, sequence_length=length)
-    sample = learner._sample_with_past(200)
+    sample = sample_with_past(learner.buffer, 200, learner.num_past)
     for perception in (learner.perception, learner.target_perception):
         torch.testing.assert_close(learner.memory_of(sample, perception), sample["memory"])
     held = learner.last_memory(sample)
@@ -204,7 +213,8 @@ def test_sampled_states_are_those_of_the_policy_that_stored_them(burn_in, length
 
 def test_gradients_flow_back_over_the_sequence_and_not_into_the_burn_in():
     learner, _ = stored("pdqn", 8, burn_in=2, sequence_length=2)
-    sample = next(row for row in learner._sample_with_past(100) if int(row["num_past"]) == 4).unsqueeze(0)
+    sample = sample_with_past(learner.buffer, 100, learner.num_past)
+    sample = sample[sample["num_past"] == 4][:1]
     sample.set("past", sample["past"].requires_grad_())
     gradient = torch.autograd.grad(learner.features(sample).sum(), sample["past"])[0][0].abs().sum(-1)
     assert (gradient[:2] == 0.0).all() and (gradient[2:] > 0.0).all()
@@ -232,7 +242,7 @@ def test_histories_go_on_across_batches_and_not_into_a_buffer_that_was_given_up(
     assert links(never, always, 4).tolist() == [[1, 4], [3, 6]]
     masked = torch.tensor([[True, True], [False, False]])
     assert links(never, masked, 8)[0].tolist() == [5, 8]
-    assert links(never, always, 10).tolist() == [[9, 10], [-1, 12]]
+    assert links(never, always, 10).tolist() == [[9, 10], [7, 12]]
     assert links(never, always, 0).tolist() == [[-1, 0], [-1, 2]], "an empty buffer"
     assert links(never[:1], always[:1], 4).tolist() == [[-1, 4]], "another number of environments"
 
@@ -257,6 +267,98 @@ def test_n_step_returns_with_a_stack_go_on_with_the_state_after_their_last_step(
     rows = learner.transitions(rolled)
     assert torch.equal(rows["last_memory"][:, 0], rolled["stack_8"][:, 2])
     assert torch.equal(rows["last_memory"][:, 2], rolled["stack_8"][:, 3]), "the episode ends there"
+
+
+# Selectors.
+
+SELECTORS = {"actor": Actor, "meta_critic": MetaCritic, "option_critic": OptionCritic}
+LEARNS_NOTHING = {"actor": {"minibatch_size": 1000}, "meta_critic": {"warmup_decisions": 10_000}}
+
+
+def decided(high: str, memory: str, num_batches: int = 4, **changes) -> tuple[Selector, list[TensorDict]]:
+    """Return a selector that has learned from Crossing, and the steps in batches of six. Options last two steps."""
+    torch.manual_seed(0)
+    env = Crossing(8, start=3.0)
+    env.max_steps = 9
+    specs = PAMDPSpecs.from_env(env)
+    size = {"memory_size": 8} if memory == "gru" else {"stack_steps": 3}
+    selector = SELECTORS[high](specs, memory=memory, hidden_dims=[16], **size, **changes)
+    agent = steppers(selector, specs)
+    with torch.no_grad():
+        rolled = with_decisions(env, option_length=2).rollout(
+            6 * num_batches, agent.policy, break_when_any_done=False, auto_cast_to_device=False
+        )
+    batches = [batch.clone() for batch in rolled.split(6, 1)]
+    for batch in batches:
+        agent.learn(batch)
+    return selector, batches
+
+
+@pytest.mark.parametrize(
+    ("high", "memory"), [*itertools.product(SELECTORS, ["stack"]), ("actor", "gru"), ("meta_critic", "gru")]
+)
+def test_a_selector_remembers_the_observations_at_the_decisions_of_an_episode(high, memory):
+    selector, batches = decided(high, memory, **LEARNS_NOTHING.get(high, {}))
+    rolled = torch.cat(batches, 1)
+    num = 0
+    for row in rolled:
+        state = None
+        for step in row:
+            if step[keys.IS_DECISION]:
+                before = None if step[keys.EPISODE_STEPS] == 0 else state
+                state = selector.perception.after(step[keys.OBSERVATION], before)
+                num += 1
+            torch.testing.assert_close(step[selector.memory_key], state)
+    assert num < rolled.numel() * 0.7
+
+
+def test_the_sequences_of_a_selector_are_the_decisions_of_an_episode_across_batches():
+    selector, batches = decided("meta_critic", "gru", burn_in=1, sequence_length=3, warmup_decisions=10_000)
+    rolled = torch.cat(batches, 1)
+    sample = sample_with_past(selector.buffer, 200, 4)
+    where = {tuple(row.tolist()): i for i, row in enumerate(rolled[selector.memory_key].flatten(0, 1))}
+    lengths = set()
+    for row in sample:
+        env, step = divmod(where[tuple(row["memory"].tolist())], rolled.shape[1])
+        begin = step - int(rolled[keys.EPISODE_STEPS][env, step])
+        is_decision = rolled[keys.IS_DECISION][env, begin : step + 1, 0]
+        expected = rolled[keys.OBSERVATION][env, begin : step + 1][is_decision][-4:]
+        num = int(row["num_past"])
+        assert torch.equal(row["past"][:num], expected)
+        lengths.add(num)
+    assert lengths == {1, 2, 3, 4}
+    torch.testing.assert_close(states_of_past(sample, selector.perception, 1), sample["memory"])
+
+
+def test_the_ratios_of_an_actors_sequences_are_one_before_an_update():
+    selector, _ = decided("actor", "gru", minibatch_size=1000, sequence_length=2)
+    rows = torch.cat(selector.waiting)
+    assert rows["starts"].sum() > rows["begins"].sum() > 0
+    selector.check_state(selector.state_dict())
+    log_probs = selector.logits(selector.features(rows)).log_softmax(-1)
+    now = log_probs.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(now, rows["log_prob"])
+
+
+def test_the_option_after_a_batch_is_chosen_with_what_the_selector_remembers():
+    selector, batches = decided("actor", "gru", minibatch_size=1000)
+    batch = batches[0]
+    seen = []
+    selector.choose = lambda td: seen.append(td) or {keys.OPTION: td[keys.OPTION]}
+    options = AgentNextOptions(selector, [], 2, is_shared=False)
+    options.with_next_option(batch)
+    is_missing = (batch["next", keys.OPTION_ENDED] & batch["next", keys.DONE]).squeeze(-1)
+    is_missing[:, -1] |= batch["next", keys.OPTION_ENDED][:, -1, 0]
+    assert torch.equal(seen[0][selector.memory_key], batch[selector.memory_key][is_missing])
+
+
+@pytest.mark.parametrize("high", ["actor", "meta_critic"])
+def test_a_run_of_a_selector_with_a_recurrent_memory_resumes_to_the_last_bit(high, tmp_path, monkeypatch):
+    words = [
+        *words_of(high, "random"), "env=rooms", "agent.termination=steps", "agent.option_length=2", "high.memory=gru",
+        "high.memory_size=8",
+    ]  # fmt: skip
+    stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)
 
 
 # In runs.
@@ -327,6 +429,8 @@ def test_an_agent_remembers_until_its_episode_ends(memory):
         (["low=hsac", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=hsac: memory=gru"),
         (["low=pdqn", "low.memory=gru", "data=human"], "low.memory=gru: .*lacks what a policy remembered"),
         (["low=hsac", "low.memory=gru", "agent.sharing=shared", "high=value"], "agent.sharing=shared with low.memory"),
+        (["low=hppo", "high=actor", "high.memory=gru"], "high.memory=gru: agent.termination=episode has one decision"),
+        (["low=hppo", "high=option_critic", "high.memory=gru"], "must be 'none' or 'stack'"),
     ],
 )
 def test_what_does_not_go_with_a_memory_is_refused_in_one_line(words, message, tmp_path):
@@ -346,3 +450,47 @@ def test_learners_without_a_memory_have_no_such_setting():
 def test_updates_with_a_stack_can_be_compiled(low, tmp_path):
     words = [*words_of("ucb", low), "low.memory=stack", "compile_updates=true"]
     assert run(compose_config(words), tmp_path, words) == 0
+
+
+# A problem that cannot be solved without memory: the best return is 1, the best one without memory 0 on average.
+
+
+def score(low: str, memory: str, seed: int = 0, **settings) -> float:
+    quiet = {"eval.every": 0, "eval.layouts": 4, "progress": False}
+    agent = hpamdp.train(Cue, low=low, seed=seed, **{"low.memory": memory, **quiet, **settings})
+    return agent.evaluate(episodes=500)["score"]
+
+
+@pytest.mark.parametrize("memory", ["none", "stack"])
+def test_a_stack_solves_what_cannot_be_solved_without_memory(memory):
+    found = score("hppo", memory, total_frames=8192, num_envs=32, steps_per_batch=32)
+    assert found >= 0.9 if memory == "stack" else abs(found) < 0.15
+
+
+BUDGETS = {
+    "hppo": {"total_frames": 20_480},
+    "pdqn": {"total_frames": 6000, "low.warmup_steps": 1000, "low.epsilon_steps": 3000},
+    "hsac": {"total_frames": 6000, "low.warmup_steps": 1000},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", ["none", "stack", "gru"])
+@pytest.mark.parametrize("low", LEARNERS)
+def test_learners_with_a_memory_reach_the_optimum_and_without_one_chance(low, memory):
+    found = score(low, memory, **BUDGETS[low])
+    assert found >= 0.95 if memory != "none" else abs(found) < 0.15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("high", "memory"),
+    [*itertools.product(["actor", "meta_critic"], ["none", "stack", "gru"]), ("option_critic", "stack")],
+)
+def test_selectors_with_a_memory_reach_the_optimum_and_without_one_chance(high, memory):
+    settings = {"high.memory": memory, "high.gamma": 0.9, "agent.termination": "steps", "agent.option_length": 1}
+    settings |= {"high.epsilon_steps": 5000} if high == "option_critic" else {}
+    sizes = {"total_frames": 12_288, "num_envs": 16, "steps_per_batch": 16, "eval.every": 0, "progress": False}
+    agent = hpamdp.train(CueOfOptions, high=high, low="random", **settings, **sizes)
+    found = agent.evaluate(episodes=500)["score"]
+    assert found >= 0.95 if memory != "none" else abs(found) < 0.15

@@ -293,7 +293,10 @@ class AgentNextOptions:
         is_missing[..., -1] = is_ended[..., -1]
         next_option = torch.where(is_ended, option.roll(-1, -1), option)
         if is_missing.any():
-            next_option[is_missing] = self.greedy(batch.get("next")[is_missing], option[is_missing])
+            states = batch.get("next")[is_missing]
+            if self.selector.memory_key is not None:
+                states = states.copy().set(self.selector.memory_key, batch.get(self.selector.memory_key)[is_missing])
+            next_option[is_missing] = self.greedy(states, option[is_missing])
         return batch.copy().set(keys.NEXT_OPTION, next_option)
 
     def _without_option(self, observation: Tensor) -> Tensor:

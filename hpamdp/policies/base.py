@@ -237,6 +237,7 @@ class Selector(Level, TensorDictModuleBase):
             options must last as long as their episodes; others are refused.
         modes: what the selector can learn from: its own choices (`train`), or a data set of other choices (`offline`).
             A data set lacks keys that a selector adds to `out_keys`, so such a selector usually has `train` alone.
+        memory_key: under which the selector's memory of earlier decisions lies in a step, if it has one.
         is_uniform: bool scalar, a buffer that the agent sets. It is true for the first `agent.uniform_option_steps`
             steps of a run. Exploring choices then come from `choose_uniformly`, so that every learner gets data.
         pending: how many decisions for each option have not yet reached `learn`, int64 `[num_options]`. The agent sets
@@ -250,6 +251,7 @@ class Selector(Level, TensorDictModuleBase):
     decides_ends: bool = False
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     gamma: float = 1.0
+    memory_key: str | None = None
     is_uniform: Tensor
     pending: Tensor
     option_values: nn.Module

@@ -233,6 +233,17 @@ def memories_have_own_steps(config: Config) -> str | None:
     return None
 
 
+def selectors_remember_several_decisions(config: Config) -> str | None:
+    """Refuse a selector with a memory if its episodes have a single decision."""
+    memory = _memory(config.high)
+    if memory is None or config.run.agent.termination != "episode":
+        return None
+    return (
+        f"high.memory={memory}: agent.termination=episode has one decision in an episode, and nothing to remember; use "
+        "agent.termination=steps, chosen or learned"
+    )
+
+
 def memories_have_values(config: Config) -> str | None:
     """Refuse to value options without the memory on which the value depends."""
     low, run = config.low, config.run.agent
@@ -469,6 +480,7 @@ RULES: tuple[Rule, ...] = (
     levels_support_the_mode,
     n_step_fits_a_batch,
     memories_have_own_steps,
+    selectors_remember_several_decisions,
     memories_have_values,
     compared_learners_have_values,
     collector_fits_the_run,

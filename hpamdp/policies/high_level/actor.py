@@ -9,6 +9,7 @@ Differs from the sources:
 - decisions with uniform options are weighted by the ratio of the policy's probability to the uniform one. The clip is
   around the policy at the time of the decision (the decoupled objective of Hilton, Cobbe and Schulman 2021, *Batch
   size-invariance for policy optimization*, arXiv 2110.00641);
+- with `memory` policy and value also see the observations at earlier decisions of the episode;
 - the advantage is the option's return minus a learned value of the state. It bootstraps if the episode goes on, but not
   past a time limit.
 
@@ -28,11 +29,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.base import Selector, is_greedy
+from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.policies.shared.networks import mlp
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised
-from hpamdp.policies.shared.perception import Perception
+from hpamdp.policies.shared.selector_memory import RemembersDecisions, SelectorMemoryOptions
+from hpamdp.policies.shared.sequences import sequence_starts
 from hpamdp.settings import PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
@@ -42,7 +44,7 @@ WEIGHT = "option_weight"  # ratio of its probability by the policy to the probab
 ALLOWED = "option_allowed"  # the options that were allowed, bool [*B, num_options], if the problem has an option mask
 
 
-class ActorOptions(OnPolicyOptions):
+class ActorOptions(SelectorMemoryOptions, OnPolicyOptions):
     """Settings of `Actor`; the rows of an update are decisions."""
 
     hidden_dims: Widths = (128, 128)
@@ -57,7 +59,7 @@ class ActorOptions(OnPolicyOptions):
     """Weight of the entropy bonus. With 0.02 the policy settles on the option whose learner improves first."""
 
 
-class Actor(OnPolicy, Selector):
+class Actor(OnPolicy, RemembersDecisions):
     """Sample the option from a softmax over the outputs of a network."""
 
     Options = ActorOptions
@@ -76,7 +78,7 @@ class Actor(OnPolicy, Selector):
         self.options: ActorOptions = ActorOptions.of(options, settings)
         self.out_keys = [*self.out_keys, LOG_PROB, WEIGHT, *([ALLOWED] if specs.has_option_mask else [])]
         self.gamma = self.options.gamma
-        self.perception = Perception(specs)
+        self.set_perception(self.options)
         num_inputs = self.perception.specs.observation_dim
         self.logits = mlp(num_inputs, self.options.hidden_dims, specs.num_options)
         self.critic = mlp(num_inputs, self.options.hidden_dims, 1)
@@ -93,7 +95,7 @@ class Actor(OnPolicy, Selector):
         option = log_probs.argmax(-1) if is_greedy() else sample_index(log_probs)
         log_prob = log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)
         chosen = {keys.OPTION: option, LOG_PROB: log_prob, WEIGHT: torch.ones_like(log_prob)}
-        return {**chosen, **self._allowed(td)}
+        return {**chosen, **self._allowed(td), **self.remembered(td)}
 
     @torch.no_grad()
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
@@ -107,13 +109,8 @@ class Actor(OnPolicy, Selector):
 
     def _log_probs(self, td: TensorDictBase) -> Tensor:
         """Return the policy's log-probabilities `[*B, num_options]`."""
-        logits = masked_logits(self.logits(self.perception(td.get(keys.OBSERVATION))), td.get(keys.OPTION_MASK, None))
+        logits = masked_logits(self.logits(self.seen(td)), td.get(keys.OPTION_MASK, None))
         return logits.log_softmax(-1)
-
-    def _value(self, observation: Tensor) -> Tensor:
-        """Return the critic's values `[N]` of observations `[N, observation_dim]`."""
-        value: Tensor = self.critic(self.perception(observation)).squeeze(-1)
-        return value
 
     def _allowed(self, td: TensorDictBase) -> dict[str, Tensor]:
         return {ALLOWED: td.get(keys.OPTION_MASK).clone()} if self.specs.has_option_mask else {}
@@ -124,10 +121,25 @@ class Actor(OnPolicy, Selector):
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Gather decisions; as soon as there is a minibatch of them, make `epochs` passes over them."""
-        rows = self.gather(self.rows(decisions))
+        return {} if self.perception.is_recurrent else self._learn(self.rows(decisions))
+
+    def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
+        """Do as `learn` does if the memory is recurrent, since sequences need the decisions of each environment."""
+        is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
+        if not self.perception.is_recurrent or not is_end.any():
+            return {}
+        decisions = batch[is_end]
+        rows = self.rows(decisions)
+        rows["memory"] = self.held(decisions)
+        rows["begins"] = self.begins(decisions)
+        rows["starts"] = sequence_starts(self.begins(batch), is_end, self.options.sequence_length)
+        return self._learn(rows)
+
+    def _learn(self, new: TensorDict) -> dict[str, float]:
+        rows = self.gather(new)
         if rows is None:
             return {}
-        rows["advantage"] = rows["target"] - self._value(rows["state"]).detach()
+        rows["advantage"] = rows["target"] - self.critic(self.features(rows)).squeeze(-1).detach()
         rows["advantage"] = normalised(rows["advantage"])
         return mean_scalars([self.gradient_step(self.loss, minibatch) for minibatch in self.minibatches(rows)])
 
@@ -135,9 +147,10 @@ class Actor(OnPolicy, Selector):
     def rows(self, decisions: TensorDictBase) -> TensorDict:
         """Return what an update needs of decisions `[N]`; `target` is that of the value."""
         after = decisions.get("next")
-        next_value = self._value(after.get(keys.OBSERVATION))
+        held = self.held(decisions)
+        next_value = self.critic(self.perception(after.get(keys.OBSERVATION), held)).squeeze(-1)
         rows = {
-            "state": after.get(keys.DECISION_OBSERVATION),
+            "state": self.stored_state(decisions),
             "option": decisions.get(keys.OPTION),
             "log_prob": decisions.get(LOG_PROB),
             "weight": decisions.get(WEIGHT),
@@ -150,16 +163,28 @@ class Actor(OnPolicy, Selector):
     def empty_rows(self) -> dict[str, Tensor]:
         """Return the columns of `rows`."""
         number = torch.zeros(0, dtype=torch.float32)
-        state = torch.zeros(0, self.specs.observation_dim, dtype=self.specs.observation_dtype)
+        if self.stores_features:
+            state = torch.zeros(0, self.perception.specs.observation_dim, dtype=torch.float32)
+        else:
+            state = torch.zeros(0, self.specs.observation_dim, dtype=self.specs.observation_dtype)
         columns = {"state": state, "option": number.long()}
         columns |= dict.fromkeys(("log_prob", "weight", "target"), number)
         if self.specs.has_option_mask:
             columns["allowed"] = torch.zeros(0, self.specs.num_options, dtype=torch.bool)
+        if self.perception.is_recurrent and self.perception.memory is not None:
+            columns["memory"] = torch.zeros(0, self.perception.memory.size, dtype=torch.float32)
+            columns |= dict.fromkeys(("begins", "starts"), number.bool())
         return columns
+
+    def features(self, rows: Mapping[str, Tensor]) -> Tensor:
+        """Return what policy and critic see of rows `[N]`, `[N, perception.specs.observation_dim]`."""
+        if self.perception.is_recurrent:
+            return self.perception.of_sequences(*(rows[name] for name in ("state", "memory", "begins", "starts")))
+        return self.of_stored(rows["state"])
 
     def loss(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of policy and critic on decisions `[B]`, and scalars to log."""
-        features = self.perception(rows["state"])
+        features = self.features(rows)
         log_probs = masked_logits(self.logits(features), rows.get("allowed", None)).log_softmax(-1)
         log_prob = log_probs.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
         surrogate = (rows["weight"] * self.surrogate(log_prob - rows["log_prob"], rows["advantage"])).mean()

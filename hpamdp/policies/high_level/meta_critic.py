@@ -10,7 +10,8 @@ Differs from the sources:
 - values do not bootstrap past the end of an episode, also if a time limit ended it;
 - while exploring, options are also interrupted at random, with the probability of a random option;
 - which decisions a member of the ensemble learns from is drawn again at every update, not once for each decision;
-- all members share one target, the mean of the target members.
+- all members share one target, the mean of the target members;
+- with `memory` the critics also see the observations at earlier decisions of the episode.
 """
 
 from __future__ import annotations
@@ -25,18 +26,19 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
-from hpamdp.policies.base import Selector, is_greedy
+from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.option_values import OptionValueOptions
-from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import first_multiple
+from hpamdp.policies.shared.selector_memory import RemembersDecisions, SelectorReplayMemoryOptions
+from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
 from hpamdp.specs import PAMDPSpecs
 
 
-class MetaCriticOptions(OptionValueOptions):
+class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
     """Settings of `MetaCritic`; an update learns from stored decisions."""
 
     num_members: PositiveInt = 3
@@ -53,7 +55,7 @@ class MetaCriticOptions(OptionValueOptions):
     """Decisions with random options before the first update, without those of a data set."""
 
 
-class MetaCritic(Selector):
+class MetaCritic(RemembersDecisions):
     """Choose the option with the highest mean Q of an ensemble."""
 
     Options = MetaCriticOptions
@@ -72,15 +74,17 @@ class MetaCritic(Selector):
         super().__init__(specs)
         self.options: MetaCriticOptions = MetaCriticOptions.of(options, settings)
         self.gamma = self.options.gamma
-        self.perception = Perception(specs)
+        self.set_perception(self.options)
         num_inputs = self.perception.specs.observation_dim
         self.critics = EnsembleMLP(self.options.num_members, num_inputs, self.options.hidden_dims, specs.num_options)
         self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
+        self.links = HistoryLinks() if self.perception.is_recurrent else None
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
         self.to(device)
-        learned = [*self.critics.parameters(), *self.perception.parameters()]
-        self.optimizer = torch.optim.Adam(learned, lr=self.options.lr, fused=True)
+        self.optimizer = torch.optim.Adam(
+            [*self.critics.parameters(), *self.perception.parameters()], lr=self.options.lr, fused=True
+        )
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(self.options.buffer_size, device=device))
 
     def stateful(self) -> dict[str, Any]:
@@ -89,7 +93,11 @@ class MetaCritic(Selector):
 
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
         """Return the rows that the buffer would store if every step of a batch `[*B, T]` ended an option."""
-        return {"buffer": self._rows(batch.flatten())}
+        rows = self._rows(batch)
+        if self.links is not None:
+            rows["begins"] = self.begins(batch)
+            rows["previous"] = torch.zeros_like(rows["option"])
+        return {"buffer": rows.flatten()}
 
     def exported(self) -> dict[str, Any] | None:
         """Return the critics, unless they see features: see `hpamdp.policies.shared.exported_policy`."""
@@ -110,7 +118,7 @@ class MetaCritic(Selector):
         """Return the choices `[*B]`: the highest mean Q if the policy is greedy, else exploring."""
         observation = td.get(keys.OBSERVATION)
         mask = td.get(keys.OPTION_MASK, None)
-        q = self.critics(self.perception(observation.flatten(0, -2)))
+        q = self.critics(self.seen(td).flatten(0, -2))
         value = q.mean(0)
         if not is_greedy():
             if self.options.exploration == "ucb":
@@ -126,8 +134,7 @@ class MetaCritic(Selector):
 
         If the option with the highest Q never ended, the other options would collect no data.
         """
-        observation = td.get(keys.OBSERVATION).flatten(0, -2)
-        value = self.critics(self.perception(observation)).mean(0).reshape(*td.batch_size, -1)
+        value = self.critics(self.seen(td).flatten(0, -2)).mean(0).reshape(*td.batch_size, -1)
         is_worse = masked_values(value, td.get(keys.OPTION_MASK, None)).argmax(-1) != td.get(keys.OPTION)
         if is_greedy():
             return is_worse
@@ -141,10 +148,24 @@ class MetaCritic(Selector):
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Store finished decisions and, after the warm-up, make the updates that are due."""
-        self.buffer.extend(self._rows(decisions))
+        return {} if self.links is not None else self._learn(self._rows(decisions))
+
+    def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
+        """Do as `learn` does if the memory is recurrent, since sequences need the decisions of each environment."""
+        is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
+        if self.links is None or not is_end.any():
+            return {}
+        begins = self.begins(batch)
+        previous = self.links(begins, is_end, self.buffer.write_count)
+        rows = self._rows(batch[is_end])
+        rows["begins"], rows["previous"] = begins[is_end], previous[is_end]
+        return self._learn(rows)
+
+    def _learn(self, rows: TensorDict) -> dict[str, float]:
+        self.buffer.extend(rows)
         before = int(self.num_decisions)
-        now = before + len(decisions)
-        self.num_decisions = self.num_decisions + len(decisions)
+        now = before + len(rows)
+        self.num_decisions = self.num_decisions + len(rows)
         if now < self.options.warmup_decisions:
             return {}
         due = int(now * self.options.updates_per_decision) - int(before * self.options.updates_per_decision)
@@ -156,11 +177,17 @@ class MetaCritic(Selector):
 
     def update(self, num_updates: int) -> dict[str, float]:
         """Make updates from the stored decisions."""
-        losses = [self.update_critics(self.buffer.sample(self.options.batch_size)) for _ in range(num_updates)]
+        losses = [self.update_critics(self._sample()) for _ in range(num_updates)]
         return {"critic": torch.stack(losses).mean().item()} if losses else {}
 
+    def _sample(self) -> TensorDictBase:
+        size = self.options.batch_size
+        if self.links is None:
+            return self.buffer.sample(size)
+        return sample_with_past(self.buffer, size, self.options.burn_in + self.options.sequence_length)
+
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
-        """Return what is stored of decisions `[N]`."""
+        """Return what is stored of decisions `[*B]`: states as the critics see them, unless the memory is recurrent."""
         after = decisions.get("next")
         rows = {
             "state": after.get(keys.DECISION_OBSERVATION),
@@ -171,13 +198,34 @@ class MetaCritic(Selector):
         }
         if self.specs.has_option_mask:
             rows["next_option_mask"] = after.get(keys.OPTION_MASK)
+        held = self.held(decisions)
+        if held is not None and self.links is not None:
+            rows["memory"] = held
+        elif self.stores_features:
+            rows |= {"state": self.stored_state(decisions), "next_state": self.perception(rows["next_state"], held)}
         return TensorDict(rows, batch_size=decisions.shape)
+
+    def features(self, rows: TensorDictBase) -> Tensor:
+        """Return what the critics see of the states of sampled decisions, `[B, perception.specs.observation_dim]`."""
+        if self.links is None:
+            return self.of_stored(rows["state"])
+        memory = states_of_past(rows, self.perception, self.options.burn_in)
+        features: Tensor = self.perception(rows["state"], memory, has_seen=True)
+        return features
+
+    def next_features(self, rows: TensorDictBase) -> Tensor:
+        """Return what the target critics see of the next states, `[B, perception.specs.observation_dim]`."""
+        if self.links is None:
+            return rows["next_state"] if self.stores_features else self.target_perception(rows["next_state"])
+        memory = states_of_past(rows, self.target_perception, self.options.burn_in)
+        features: Tensor = self.target_perception(rows["next_state"], memory)
+        return features
 
     def update_critics(self, rows: TensorDictBase) -> Tensor:
         """Make one update of the critics from decisions `[batch_size]`; return the loss."""
-        q = self.critics(self.perception(rows["state"]))
+        q = self.critics(self.features(rows))
         with torch.no_grad():
-            next_q = self.target_critics(self.target_perception(rows["next_state"])).mean(0)
+            next_q = self.target_critics(self.next_features(rows)).mean(0)
             next_value = masked_values(next_q, rows.get("next_option_mask", None)).amax(-1)
             target = (rows["return"] + rows["discount"] * next_value).unsqueeze(-1)
             is_chosen = torch.zeros_like(q[0]).scatter(-1, rows["option"].unsqueeze(-1), 1.0)

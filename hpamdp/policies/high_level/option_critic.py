@@ -31,17 +31,18 @@ from torch.nn import functional as F
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
-from hpamdp.policies.base import Selector, is_greedy
+from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.networks import mlp, polyak_update
 from hpamdp.policies.shared.option_values import OptionValueOptions
 from hpamdp.policies.shared.replay import first_multiple
+from hpamdp.policies.shared.selector_memory import RemembersDecisions, SelectorStackOptions
 from hpamdp.settings import LearningRate
 from hpamdp.specs import PAMDPSpecs
 
 
-class OptionCriticOptions(OptionValueOptions):
+class OptionCriticOptions(SelectorStackOptions, OptionValueOptions):
     """Settings of `OptionCritic`; an update learns from stored steps."""
 
     batch_size: PositiveInt = 512
@@ -62,7 +63,7 @@ class OptionCriticOptions(OptionValueOptions):
     """Learning rate of Adam for the terminations."""
 
 
-class OptionCritic(Selector):
+class OptionCritic(RemembersDecisions):
     """Choose the option with the highest Q, and learn where it ends."""
 
     Options = OptionCriticOptions
@@ -83,9 +84,11 @@ class OptionCritic(Selector):
         super().__init__(specs)
         self.options: OptionCriticOptions = OptionCriticOptions.of(options, settings)
         self.gamma = self.options.gamma
-        self.critic = mlp(specs.observation_dim, self.options.hidden_dims, specs.num_options)
+        self.set_perception(self.options)
+        num_inputs = self.perception.specs.observation_dim
+        self.critic = mlp(num_inputs, self.options.hidden_dims, specs.num_options)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
-        self.termination = mlp(specs.observation_dim, self.options.hidden_dims, specs.num_options)
+        self.termination = mlp(num_inputs, self.options.hidden_dims, specs.num_options)
         last = self.termination[-1]
         assert isinstance(last, nn.Linear)
         with torch.no_grad():
@@ -119,7 +122,7 @@ class OptionCritic(Selector):
     def select(self, td: TensorDictBase) -> Tensor:
         """Return the options with the highest Q, `[*B]`; while exploring, some are random."""
         mask = td.get(keys.OPTION_MASK, None)
-        best = masked_values(self.critic(td.get(keys.OBSERVATION)), mask).argmax(-1)
+        best = masked_values(self.critic(self.seen(td)), mask).argmax(-1)
         if is_greedy():
             return best
         is_random = torch.rand(best.shape, device=best.device, dtype=torch.float32) < self.epsilon
@@ -134,9 +137,7 @@ class OptionCritic(Selector):
         # If one option never terminated, the others would collect no data. Their values would stay wrong, and so would
         # the terminations learned from them. Therefore beta counts only as much as Q does in the choice.
         random_probability = 0.0 if is_greedy() else 1.0 if self.is_uniform else self.epsilon
-        beta = self.beta(
-            td.get(keys.OBSERVATION), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None), random_probability
-        )
+        beta = self.beta(self.seen(td), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None), random_probability)
         return beta > 0.5 if is_greedy() else torch.rand_like(beta) < beta
 
     def decisions_to_update(self) -> dict[str, int]:
@@ -166,14 +167,19 @@ class OptionCritic(Selector):
         return {**scalars, "epsilon": self.epsilon}
 
     def _rows(self, batch: TensorDictBase) -> TensorDict:
-        """Return what is stored of a batch `[*B, T]`; `discount` is 0 where the episode ended."""
+        """Return what is stored of a batch `[*B, T]`, states as the networks see them; `discount` is 0 at its ends."""
         after = batch.get("next")
         done = after.get(keys.DONE).squeeze(-1)
+        held = self.held(batch)
+        state = self.perception(batch.get(keys.OBSERVATION), held)
+        if held is not None:  # which has seen the observation of a decision already
+            at_decision = self.perception(batch.get(keys.OBSERVATION), held, has_seen=True)
+            state = torch.where(batch.get(keys.IS_DECISION), at_decision, state)
         rows = {
-            "state": batch.get(keys.OBSERVATION),
+            "state": state,
             "option": batch.get(keys.OPTION),
             "reward": after.get(keys.REWARD).squeeze(-1),
-            "next_state": after.get(keys.OBSERVATION),
+            "next_state": self.perception(after.get(keys.OBSERVATION), held),
             "discount": self.gamma * (~done).float(),
             "is_ended": after.get(keys.OPTION_ENDED).squeeze(-1) if keys.OPTION_ENDED in after.keys() else done,
         }
@@ -185,7 +191,7 @@ class OptionCritic(Selector):
         """Return the probabilities `[*B]` that options end in states; 1 for forbidden options.
 
         Args:
-            state: the observations, `[*B, observation_dim]`.
+            state: what the networks see, `[*B, perception.specs.observation_dim]`.
             option: the held options, `[*B]`.
             mask: the options that may be chosen, bool `[*B, num_options]`. If None, all may.
             random_probability: weight of `initial_termination` in the mixture, in [0, 1].

@@ -22,7 +22,7 @@ product.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import torch
@@ -45,6 +45,7 @@ from hpamdp.policies.shared.memory import MemoryOptions
 from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised
 from hpamdp.policies.shared.perception import Perception
+from hpamdp.policies.shared.sequences import sequence_starts
 from hpamdp.settings import Fraction, LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
 
@@ -252,7 +253,7 @@ class HPPO(OnPolicy, Learner):
             rows["memory"] = batch.get(self.memory_key)[mask]
         if self.perception.is_recurrent:
             rows["begins"] = self.perception.begins(batch)[mask]
-            rows["starts"] = sequence_starts(self.perception.begins(batch), mask, self.options.sequence_length)[mask]
+            rows["starts"] = sequence_starts(self.perception.begins(batch), mask, self.options.sequence_length)
         features = self.features(rows)
         distribution = self._distribution(features, rows)
         log_probs = distribution.log_prob(rows["discrete"], rows[RAW])
@@ -282,21 +283,6 @@ class HPPO(OnPolicy, Learner):
         if self.perception.is_recurrent:
             columns |= dict.fromkeys(("begins", "starts"), number.bool())
         return columns
-
-    def minibatches(self, rows: TensorDict) -> Iterator[dict[str, Tensor]]:
-        """Yield random minibatches of the gathered rows `[M]`, of whole sequences if the memory is recurrent."""
-        if not self.perception.is_recurrent:
-            yield from super().minibatches(rows)
-            return
-        columns = dict(rows.items())
-        sequence = rows["starts"].long().cumsum(0) - 1
-        num = int(sequence[-1]) + 1
-        for _ in range(self.options.epochs):
-            order = torch.randperm(num, device=rows.device)
-            for chosen in order.tensor_split(min(num, len(rows) // self.options.minibatch_size)):
-                is_chosen = torch.zeros(num, dtype=torch.bool, device=rows.device).index_fill(0, chosen, True)
-                indices = is_chosen[sequence].nonzero().squeeze(-1)
-                yield {name: column.index_select(0, indices) for name, column in columns.items()}
 
     @torch.no_grad()
     def advantages(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -422,20 +408,6 @@ class HPPO(OnPolicy, Learner):
     def steps_to_update(self) -> dict[str, int]:
         """Return the size of a minibatch."""
         return {"minibatch_size": self.options.minibatch_size}
-
-
-def sequence_starts(begins: Tensor, mask: Tensor, length: int) -> Tensor:
-    """Return where sequences start, bool `[*B, T]`: where a history begins, or goes on, and then every `length` rows.
-
-    Args:
-        begins: where a history begins, bool `[*B, T]`.
-        mask: the learner's own rows, bool `[*B, T]`.
-        length: the most rows of a sequence.
-    """
-    time = torch.arange(mask.shape[-1], device=mask.device).expand_as(mask)
-    follows = torch.cat([torch.zeros_like(mask[..., :1]), mask[..., :-1]], -1) & ~begins
-    first = torch.where(follows, 0, time).cummax(-1).values
-    return mask & ((time - first) % length == 0)
 
 
 def kl_estimate(log_ratio: Tensor) -> Tensor:

@@ -22,23 +22,18 @@ from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from hpamdp.policies.shared.sized_by_data import SizedByData
 from hpamdp.settings import Settings
 
 MemoryKind = Literal["none", "stack", "gru"]
 
 
-class MemoryOptions(Settings):
-    """Settings of a memory."""
+class StackOptions(Settings):
+    """Settings of a memory of the last observations."""
 
     memory: MemoryKind = "none"
-    """What the networks see beside the observation: nothing, the observations before it, or the state of a GRU."""
-    memory_size: PositiveInt = 64
-    """With `memory=gru`: numbers in its state."""
+    """What the networks see beside the observation: nothing, or the observations before it."""
     stack_steps: Annotated[int, Field(ge=2, le=1000)] = 4
     """With `memory=stack`: observations that the networks see, with the present one; zeros before the first."""
-    sequence_length: PositiveInt = 16
-    """With `memory=gru`: steps through which gradients flow back in time."""
 
     @model_validator(mode="after")
     def _check_memory(self) -> Self:
@@ -46,6 +41,17 @@ class MemoryOptions(Settings):
             if self.memory != "none" and getattr(self, name, False) is True:
                 raise ValueError(f"{name}=true: does not go with memory={self.memory}; use {name}=false or memory=none")
         return self
+
+
+class MemoryOptions(StackOptions):
+    """Settings of a memory."""
+
+    memory: MemoryKind = "none"
+    """What the networks see beside the observation: nothing, the observations before it, or the state of a GRU."""
+    memory_size: PositiveInt = 64
+    """With `memory=gru`: numbers in its state."""
+    sequence_length: PositiveInt = 16
+    """With `memory=gru`: steps through which gradients flow back in time."""
 
 
 class ReplayMemoryOptions(MemoryOptions):
@@ -121,65 +127,3 @@ class GRU(nn.Module):
         with torch.autocast(seen.device.type, enabled=False):
             states: Tensor = self.net(seen.float(), held.unsqueeze(0).contiguous())[0]
         return states
-
-
-class HistoryLinks(SizedByData):
-    """Says which stored row precedes each row in the same history, so that sequences can be followed backwards.
-
-    Rows are numbered as they are stored, from 0. A history may span several batches, and never leaves its environment.
-
-    Attributes:
-        last_rows: number of the row that each environment stored last, if its history may go on, else -1.
-    """
-
-    last_rows: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("last_rows", torch.zeros(0, dtype=torch.long))
-
-    def forward(self, begins: Tensor, mask: Tensor, num_stored: int) -> Tensor:
-        """Return the numbers `[*B, T]` of the rows before the rows of a batch; -1 if there is none.
-
-        Args:
-            begins: where a history begins, bool `[*B, T]`.
-            mask: the rows that are now stored, in this order, bool `[*B, T]`.
-            num_stored: how many rows were stored before, now forgotten ones included.
-        """
-        own = mask.flatten(0, -2)
-        numbers = (num_stored - 1 + own.flatten().cumsum(0)).reshape(own.shape)
-        numbers = torch.where(own, numbers, -1)
-        if self.last_rows.shape != numbers.shape[:1] or num_stored == 0:
-            self.last_rows = torch.full_like(numbers[:, 0], -1)
-        # A row that is yet to be stored is of a buffer that was given up.
-        first = torch.where(self.last_rows < num_stored, self.last_rows, -1)
-        previous = torch.cat([first.unsqueeze(-1), numbers[:, :-1]], -1)
-        self.last_rows = numbers[:, -1].clone()
-        return torch.where(begins, -1, previous.reshape(mask.shape))
-
-
-def ancestors(newest: Tensor, previous: Tensor, num_stored: int, num_steps: int) -> tuple[Tensor, Tensor]:
-    """Follow histories backwards from rows of a ring buffer.
-
-    Args:
-        newest: numbers of the rows to begin with, `[N]`.
-        previous: `HistoryLinks` of the rows in the buffer, by their places, `[len(buffer)]`.
-        num_stored: how many rows were stored in all; a full buffer holds the last `len(previous)` of them.
-        num_steps: the most rows to find, with the first.
-
-    Returns:
-        The places of the rows in the buffer, int64 `[N, num_steps]`, the oldest first and padded behind, and how many
-        there are, `[N]`.
-    """
-    capacity = len(previous)
-    oldest = num_stored - capacity
-    numbers = [newest]
-    for _ in range(num_steps - 1):
-        number = numbers[-1]
-        before = previous[number.clamp(min=0) % capacity]
-        is_there = (number >= 0) & (before >= oldest) & (before < number)
-        numbers.append(torch.where(is_there, before, -1))
-    backwards = torch.stack(numbers, -1)
-    length = (backwards >= 0).sum(-1)
-    order = length.unsqueeze(-1) - 1 - torch.arange(num_steps, device=newest.device)
-    return backwards.gather(-1, order.clamp(min=0)) % capacity, length

@@ -100,11 +100,20 @@ class OnPolicy(nn.Module):
         return gathered
 
     def minibatches(self, rows: TensorDict) -> Iterator[dict[str, Tensor]]:
-        """Yield random minibatches of the gathered rows `[M]`, in `epochs` passes over them."""
+        """Yield random minibatches of the gathered rows `[M]`, in `epochs` passes over them.
+
+        If the rows are sequences, one after another, with a column `starts`, minibatches have whole ones.
+        """
         columns = dict(rows.items())
+        starts = columns.get("starts")
+        sequence = None if starts is None else starts.long().cumsum(0) - 1
+        num = len(rows) if sequence is None else int(sequence[-1]) + 1
         for _ in range(self.options.epochs):
-            order = torch.randperm(len(rows), device=rows.device)
-            for indices in order.tensor_split(len(rows) // self.options.minibatch_size):
+            order = torch.randperm(num, device=rows.device)
+            for indices in order.tensor_split(min(num, len(rows) // self.options.minibatch_size)):
+                if sequence is not None:
+                    is_chosen = torch.zeros(num, dtype=torch.bool, device=rows.device).index_fill(0, indices, True)
+                    indices = is_chosen[sequence].nonzero().squeeze(-1)
                 yield {name: column.index_select(0, indices) for name, column in columns.items()}
 
     def surrogate(self, log_ratio: Tensor, advantage: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.encoders.base import JoinedEncoders
-from hpamdp.policies.shared.memory import GRU, MemoryOptions, Stack
+from hpamdp.policies.shared.memory import GRU, MemoryOptions, Stack, StackOptions
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
@@ -32,6 +32,7 @@ class Perception(nn.Module):
     Args:
         specs: of the problem, as the learner sees it.
         options: settings of the memory; None if there is none.
+        prefix: of the name of the memory's state in a step.
 
     Attributes:
         specs: of the features; the networks behind are built from them.
@@ -43,7 +44,7 @@ class Perception(nn.Module):
         out_keys: what `see` writes.
     """
 
-    def __init__(self, specs: PAMDPSpecs, options: MemoryOptions | None = None) -> None:
+    def __init__(self, specs: PAMDPSpecs, options: StackOptions | None = None, prefix: str = "") -> None:
         super().__init__()
         self.memory: Stack | GRU | None = None
         self.memory_key: str | None = None
@@ -55,14 +56,16 @@ class Perception(nn.Module):
         self._begins_key = keys.EPISODE_STEPS if is_shared else keys.IS_DECISION
         if options is not None and options.memory != "none":
             num = self.specs.observation_dim
-            is_stack = options.memory == "stack"
-            if is_stack and self.encoder is not None:
+            if options.memory == "stack" and self.encoder is not None:
                 raise SettingError(
                     "memory=stack: does not go with pictures, whose encoder changes in training; use memory=gru, or "
                     "stack pictures in the environment (gymnasium.wrappers.FrameStackObservation)"
                 )
-            self.memory = Stack(num, options.stack_steps) if is_stack else GRU(num, options.memory_size)
-            self.memory_key = self.memory.name
+            if isinstance(options, MemoryOptions) and options.memory == "gru":
+                self.memory = GRU(num, options.memory_size)
+            else:
+                self.memory = Stack(num, options.stack_steps)
+            self.memory_key = prefix + self.memory.name
             self.in_keys += [self._begins_key, self.memory_key]
             self.out_keys += [self.memory_key]
             self.specs = _of_features(self.specs, self.memory.num_features)
@@ -89,15 +92,20 @@ class Perception(nn.Module):
 
     def see(self, td: TensorDictBase) -> Tensor:
         """Return the features of a step `[*B]`, `[*B, specs.observation_dim]`; write the memory's state after it."""
+        features, states = self.look(td)
+        td.update(states)
+        return features
+
+    def look(self, td: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the features of a step as `see` does, and the memory's state after it under its key."""
         encoded = self.encoded(td.get(keys.OBSERVATION))
         if self.memory is None or self.memory_key is None:
-            return encoded
+            return encoded, {}
         held = td.get(self.memory_key, None)
         if held is not None and self._begins_key in td.keys():
             held = torch.where(self.begins(td).unsqueeze(-1), 0.0, held)
         state = self._after(encoded, held)
-        td.set(self.memory_key, state)
-        return self.memory.features(encoded, state)
+        return self.memory.features(encoded, state), {self.memory_key: state}
 
     def encoded(self, observation: Tensor) -> Tensor:
         """Return what the memory sees of observations `[*B, *]`: the encoder's features, or the observations."""
@@ -124,6 +132,10 @@ class Perception(nn.Module):
             return encoded
         state = memory if has_seen and memory is not None else self._after(encoded, memory)
         return self.memory.features(encoded, state)
+
+    def after(self, observation: Tensor, memory: Tensor | None = None) -> Tensor:
+        """Return the memory's states `[*B, size]` after observations `[*B, *]`, given those before; if None, fresh."""
+        return self._after(self.encoded(observation), memory)
 
     def _after(self, encoded: Tensor, memory: Tensor | None = None) -> Tensor:
         """Return the memory's states `[*B, size]` after what it sees `[*B, *]`, given those before; if None, fresh."""

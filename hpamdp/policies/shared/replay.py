@@ -19,8 +19,9 @@ from hpamdp import keys
 from hpamdp.observation_entries import packed, unpacked
 from hpamdp.policies.base import Learner
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
-from hpamdp.policies.shared.memory import HistoryLinks, MemoryOptions, ReplayMemoryOptions, ancestors
+from hpamdp.policies.shared.memory import MemoryOptions, ReplayMemoryOptions
 from hpamdp.policies.shared.perception import Perception
+from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
 from hpamdp.policies.shared.symmetry import RandomSymmetry
 from hpamdp.settings import PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
@@ -134,7 +135,8 @@ class ReplayLearner(Learner):
         self.memory_key = self.perception.memory_key
         if self.perception.is_recurrent:
             self.links = HistoryLinks()
-            self.window = options.burn_in, options.sequence_length
+            self.burn_in = options.burn_in
+            self.num_past = options.burn_in + options.sequence_length
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizers and the replay buffer."""
@@ -257,30 +259,13 @@ class ReplayLearner(Learner):
         """Yield samples for `num_batches` updates, each with transitions `[batch_size]`."""
         # One call for all updates: the buffer's overhead is as long as a forward pass.
         num = num_batches * self.options.batch_size
-        drawn = self.buffer.sample(num) if self.links is None else self._sample_with_past(num)
+        drawn = self.buffer.sample(num) if self.links is None else sample_with_past(self.buffer, num, self.num_past)
         for sample in drawn.split(self.options.batch_size):
             if self._packs:
                 sample = self._unpacked(sample)
             if self.stores_own_parameters:
                 sample = sample.set("unit", self._all_parameters(sample["discrete"], sample["unit"]))
             yield self.augmented(sample)
-
-    def _sample_with_past(self, num: int) -> TensorDict:
-        """Return random rows `[num]` of the buffer, each with the steps before it, see `_window_states`.
-
-        Each row is drawn with the same probability, and the sequence ends with it. TorchRL's SliceSampler draws
-        histories with the same probability instead, and would learn too seldom from the last step of a long one.
-        """
-        stored, (burn_in, length) = self.buffer[:], self.window
-        place = torch.randint(len(stored), (num,), device=self.frames.device)
-        num_stored = self.buffer.write_count
-        newest = num_stored - 1 - (num_stored - 1 - place) % len(stored)
-        places, num_found = ancestors(newest, stored["previous"], num_stored, burn_in + length)
-        sample: TensorDict = stored[place]
-        first = places[:, 0]
-        for name in ("memory", "begins"):
-            sample.set(f"first_{name}", stored[name][first])
-        return sample.set("past", stored["state"][places]).set("num_past", num_found)
 
     def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
         """Refuse invalid saved rows `[N]`; see `Level.check_rows`."""
@@ -390,31 +375,8 @@ class ReplayLearner(Learner):
     def memory_of(self, sample: TensorDictBase, perception: Perception) -> Tensor | None:
         """Return the memory's states after a sample's states, `[B, size]`, by a perception; None without memory."""
         if self.links is not None:
-            return self._window_states(sample, perception)
+            return states_of_past(sample, perception, self.burn_in)
         return None if self.memory_key is None else sample["memory"]
-
-    def _window_states(self, sample: TensorDictBase, perception: Perception) -> Tensor:
-        """Return the states `[B, size]` of a recurrent memory after the sequences of a sample.
-
-        They begin with the stored state of their first step, or fresh if the history begins there. The first `burn_in`
-        of the longest ones have no gradient: Kapturowski et al. 2019, section 3.
-        """
-        past, num_past = sample["past"], sample["num_past"]
-        burn_in, length = self.window
-        is_fresh = sample["first_begins"]
-        held = torch.where(is_fresh.unsqueeze(-1), 0.0, sample["first_memory"])
-        has_seen = ~is_fresh
-        num_burnt = (num_past - length).clamp(min=0)
-        if burn_in > 0:
-            with torch.no_grad():
-                burnt = perception.states(past[:, :burn_in], held, has_seen)
-            is_burnt = num_burnt > 0
-            held = torch.where(is_burnt.unsqueeze(-1), _at(burnt, (num_burnt - 1).clamp(min=0)), held)
-            has_seen = has_seen & ~is_burnt
-        places = num_burnt.unsqueeze(-1) + torch.arange(length, device=past.device)
-        places = places.clamp(max=past.shape[1] - 1)
-        recent = past.gather(1, places.unsqueeze(-1).expand(-1, -1, past.shape[-1]))
-        return _at(perception.states(recent, held, has_seen), num_past - num_burnt - 1)
 
     @torch.no_grad()
     def detached(self, sample: TensorDictBase) -> Tensor:
@@ -428,11 +390,6 @@ class ReplayLearner(Learner):
     def pairs(self, sample: TensorDictBase) -> Tensor | None:
         """Return which discrete actions go together in a sample's states, as in `pair_mask`. If None, all do."""
         return sample.get("pair_mask", None)
-
-
-def _at(states: Tensor, place: Tensor) -> Tensor:
-    """Return the states `[B, size]` at places `[B]` of sequences `[B, L, size]`."""
-    return states[torch.arange(len(place), device=place.device), place]
 
 
 def first_multiple(updates_per_step: float) -> int:
