@@ -373,6 +373,10 @@ def built(*words: str):
         ),
         (["low=hyar"], "low=hyar: env=catch_point_picture observes pictures"),
         (["low=hppo", "env=goal", "encoder=cnn"], "encoder=cnn: env=goal observes no pictures; use encoder=auto"),
+        (
+            ["low=hppo", "env=goal", "encoder.channels=[8,8,8]"],
+            "encoder.channels=.8, 8, 8.: env=goal observes no pictures",
+        ),
         (["low=hppo", "encoder.net=nature", "encoder.num_features=0"], "encoder.num_features=0"),
     ],
 )

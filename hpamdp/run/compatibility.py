@@ -365,10 +365,16 @@ def data_sets_have_no_pictures(config: Config, problem: ProblemFacts) -> str | N
 
 
 def encoder_has_pictures(config: Config, problem: ProblemFacts) -> str | None:
-    """Refuse an encoder of pictures if the problem has none, unless it was chosen automatically."""
+    """Refuse an encoder of pictures, or its settings, if the problem has none."""
     encoder = config.encoder
-    if encoder.name != AUTO_ENCODER and not getattr(encoder.cls, "flattens", False) and not problem.has_pictures:
+    if problem.has_pictures or getattr(encoder.cls, "flattens", False):
+        return None
+    if encoder.name != AUTO_ENCODER:
         return f"{encoder}: {config.env} observes no pictures; use encoder={AUTO_ENCODER}"
+    model = encoder.as_model
+    for name, value in encoder.settings.items():
+        if model is not None and value != type(model).model_fields[name].default:
+            return f"encoder.{name}={as_json(value)}: {config.env} observes no pictures; leave it out"
     return None
 
 
