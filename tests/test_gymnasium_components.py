@@ -395,7 +395,7 @@ def test_the_form_of_a_problem_reads_bounds_and_masks_of_components():
         form.read(observation)
 
 
-@pytest.mark.parametrize("low", ["random", "hppo", "hyar", "pdqn"])
+@pytest.mark.parametrize("low", ["random", "hppo", "pdqn"])
 def test_a_problem_without_parameters_can_be_learned(low, tmp_path):
     words = [f"low={low}", *SHORT[low], "high=none", "env=gymnasium", "env.entry_point=action_trees:Recorder"]
     words += ["env.kwargs={tree: discrete}", "env.max_steps=10", "num_envs=4", "steps_per_batch=16"]

@@ -340,7 +340,7 @@ class HyARPolicy(TensorDictModuleBase):
             latent = proposals[torch.arange(best.shape[0], device=best.device), best]
         discrete, unit_parameters = self.decode(state, latent, allowed)
         if is_exploring and self.epsilon > 0.0:
-            is_random = torch.rand_like(unit_parameters.new_empty(len(unit_parameters), 1)) < self.epsilon
+            is_random = torch.rand_like(unit_parameters[:, :1]) < self.epsilon
             unit_parameters = torch.where(is_random, 2.0 * torch.rand_like(unit_parameters) - 1.0, unit_parameters)
             random_discrete = random_choice(discrete.shape, self.specs.num_discrete, allowed, discrete.device)
             discrete = torch.where(is_random.squeeze(-1), random_discrete, discrete)
