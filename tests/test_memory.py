@@ -269,6 +269,75 @@ def test_n_step_returns_with_a_stack_go_on_with_the_state_after_their_last_step(
     assert torch.equal(rows["last_memory"][:, 2], rolled["stack_8"][:, 3]), "the episode ends there"
 
 
+# Options that end inside their episodes.
+
+
+class Asked:
+    """The `NextOptions` that keep the stored option, and the memories with which they were asked for values."""
+
+    def __init__(self, *, decides_ends: bool) -> None:
+        self.decides_ends = decides_ends
+        self.memories: list[torch.Tensor] = []
+
+    def choose(self, observation, option, held):
+        return option
+
+    def value(self, observation, option, action_mask=None, memory=None, *, has_seen=False):
+        self.memories.append(memory["gru_8"])
+        return torch.zeros(len(observation))
+
+
+@pytest.mark.parametrize("is_shared", [False, True])
+@pytest.mark.parametrize("decides_ends", [False, True])
+def test_a_replayed_option_that_ends_is_followed_by_a_fresh_memory_unless_all_share_it(decides_ends, is_shared):
+    torch.manual_seed(0)
+    specs = PAMDPSpecs.from_env(Crossing(1))
+    learner = make("pdqn", specs.with_option_observed() if is_shared else specs.of_option(0), "gru")
+    learner.next_options = asked = Asked(decides_ends=decides_ends)
+    num, dim = 3, learner.specs.observation_dim
+    sample = TensorDict(
+        {
+            "state": torch.rand(num, dim), "next_state": torch.rand(num, dim), "past": torch.rand(num, 24, dim),
+            "num_past": torch.tensor([1, 5, 24]), "first_memory": torch.rand(num, 8),
+            "first_begins": torch.tensor([True, False, False]), "option_ended": torch.tensor([True, False, True]),
+            "option": torch.zeros(num).long(), "next_option": torch.tensor([1, 0, 0]),
+        },
+        [num],
+    )  # fmt: skip
+    learner.next_value(sample)
+    held = learner.last_memory(sample)
+    expected = held if decides_ends else held[[0, 2]]
+    if not is_shared:
+        # A selector that decides on ends lets its option go on if it would choose it again.
+        expected = expected * torch.tensor([0.0, 1.0, 1.0] if decides_ends else [0.0, 0.0]).unsqueeze(-1)
+    torch.testing.assert_close(asked.memories[0], expected)
+
+
+@pytest.mark.parametrize("is_shared", [False, True])
+@pytest.mark.parametrize("decides_ends", [False, True])
+def test_an_option_that_ends_is_followed_by_a_fresh_memory_in_the_trace_unless_all_share_it(decides_ends, is_shared):
+    specs = PAMDPSpecs.from_env(Crossing(1))
+    learner = make("hppo", specs.with_option_observed() if is_shared else specs.of_option(0), "gru")
+    learner.next_options = asked = Asked(decides_ends=decides_ends)
+    ended = torch.tensor([[[True], [False], [True]]])
+    batch = TensorDict(
+        {
+            keys.OBSERVATION: torch.rand(1, 3, learner.specs.observation_dim), "gru_8": torch.rand(1, 3, 8),
+            keys.OPTION: torch.zeros(1, 3).long(),
+            "next": {
+                keys.OBSERVATION: torch.rand(1, 3, learner.specs.observation_dim), keys.OPTION_ENDED: ended,
+                keys.OPTION: torch.zeros(1, 3).long(), keys.REWARD: torch.zeros(1, 3, 1),
+                keys.DONE: torch.zeros_like(ended), keys.TERMINATED: torch.zeros_like(ended),
+            },
+        },
+        [1, 3],
+    )  # fmt: skip
+    learner.advantages(batch, everything(batch))
+    assert torch.equal(asked.memories[0], batch["gru_8"][0])
+    goes_on = torch.tensor([1.0, 1.0, 1.0] if is_shared else [0.0, 1.0, float(decides_ends)])
+    torch.testing.assert_close(asked.memories[1], batch["gru_8"][0] * goes_on.unsqueeze(-1))
+
+
 # Selectors.
 
 SELECTORS = {"actor": Actor, "meta_critic": MetaCritic, "option_critic": OptionCritic}
@@ -377,10 +446,14 @@ def test_other_runs_with_a_memory_resume_to_the_last_bit(low, more, tmp_path, mo
     stop_and_resume([*words_of("ucb", low), "low.memory=gru", *more], tmp_path, monkeypatch, signal.SIGTERM)
 
 
-@pytest.mark.parametrize("termination", ["steps", "learned"])
-@pytest.mark.parametrize("sharing", ["per_option", "shared"])
-@pytest.mark.parametrize("memory", ["stack", "gru"])
-@pytest.mark.parametrize("low", LEARNERS)
+ENDING = list(itertools.product(LEARNERS, ["stack", "gru"], ["per_option", "shared"], ["steps", "learned"]))
+QUICK = {("hppo", "gru", "per_option", "learned"), ("pdqn", "gru", "shared", "steps")}
+
+
+@pytest.mark.parametrize(
+    ("low", "memory", "sharing", "termination"),
+    [pytest.param(*each, marks=() if each in QUICK else pytest.mark.slow) for each in ENDING],
+)
 def test_options_that_end_go_with_a_memory(low, memory, sharing, termination, tmp_path):
     words = [
         "env=crossing", "high=meta_critic", f"low={low}", f"low.memory={memory}", f"agent.sharing={sharing}",
