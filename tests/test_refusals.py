@@ -37,6 +37,10 @@ REFUSED = [
     ("low=hppo low.critic_hidden_dims=[10000000000]", "low.critic_hidden_dims=[10000000000]: the run takes at least "),
     ("high=actor high.hidden_dims=[10000000000]", "high.hidden_dims=[10000000000]: the run takes at least "),
     ("high=meta_critic high.buffer_size=100000000000", "high.buffer_size=100000000000: the run takes at least "),
+    (
+        PLATFORM + "low=pdqn low.buffer_size=20000000 low.memory=gru low.memory_size=100000",
+        "low.buffer_size=20000000: the run takes at least ",
+    ),
     ("low.codec_hidden_dim=1000000000000", "low.codec_hidden_dim=1000000000000, low.buffer_size=300000: takes more "),
     ("low.latent_dim=1000000000000", "low.latent_dim=1000000000000, low.buffer_size=300000: takes more memory "),
     ("high.memory=sliding_window high.window=10000000000000", "high.window=10000000000000: takes more memory "),

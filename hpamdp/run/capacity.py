@@ -70,12 +70,13 @@ def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component]
     observation = sum(entry.size if entry.is_picture else 4 * entry.size for entry in specs.entries)
     observation = observation if specs.entries else 4 * specs.observation_dim
     row = 2 * observation + 4 * (specs.num_parameters + 2)
+    row += specs.num_discrete**2 if specs.has_pair_mask else 0
     needs = {}
     for component, num in ((config.high, 1), *((low, learners.count(low)) for low in learners)):
         for name, value in component.settings.items():
             setting = f"{component.group}.{name}={as_json(value)}"
             if name == "buffer_size":
-                needs[setting] = num * value * row
+                needs[setting] = num * value * (row + _bytes_remembered(component, specs))
             elif name in ("batch_size", "minibatch_size"):
                 needs[setting] = value * row
             elif name.endswith("hidden_dims"):
@@ -84,6 +85,16 @@ def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component]
                 weights = sum(a * b for a, b in zip(sizes, value, strict=False))
                 needs[setting] = num * weights * _BYTES_A_WEIGHT
     _check_memory(needs, device)
+
+
+def _bytes_remembered(component: Component, specs: PAMDPSpecs) -> int:
+    """Return the bytes of a memory's state, which a replay buffer holds in every row."""
+    settings = component.settings
+    if settings.get("memory") == "gru":
+        return 4 * int(settings["memory_size"])
+    if settings.get("memory") == "stack":
+        return 4 * int(settings["stack_steps"]) * specs.observation_dim
+    return 0
 
 
 def _check_memory(needs: Mapping[str, int], device: torch.device) -> None:

@@ -78,6 +78,6 @@ class CreditCritic(nn.Module):
     def baselines(self, features: Tensor, contributions: Tensor) -> Tensor:
         """Return for each component what the others contributed without it, `[B, num_components]`."""
         num = contributions.shape[-1]
-        without = contributions.unsqueeze(1) * (1.0 - torch.eye(num, device=contributions.device))
+        without = contributions.unsqueeze(1) * (1.0 - torch.eye(num, device=contributions.device, dtype=torch.float32))
         repeated = features.unsqueeze(1).expand(-1, num, -1)
         return self.total(repeated.flatten(0, 1), without.flatten(0, 1)).unflatten(0, (-1, num))
