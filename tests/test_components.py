@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torchrl.data import Binary
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_components import OneStep, random_steps
 
 from hpamdp import keys
+from hpamdp.api.export import GreedyStep
 from hpamdp.components import Components
 from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.bc import BC
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.hppo import HPPO
@@ -29,6 +33,26 @@ PAIR = Components((2, 3))
 FAST = {"lr": 3e-3, "lr_final": 1e-3, "anneal_steps": 20_000, "minibatch_size": 128, "epochs": 4}
 FAST |= {"hidden_dims": (32,), "critic_hidden_dims": (32,)}
 SMALL = {"hidden_dims": (64, 64), "warmup_steps": 300}
+
+
+class HalfForbidden(OneStep):
+    """Whole parameters of the first component, whose discrete action that equals the coin is forbidden."""
+
+    integer_parameters = (True, True)
+
+    def __init__(self, num_envs=1, **settings):
+        super().__init__(num_envs, **settings)
+        mask = Binary(5, shape=(num_envs, 5), dtype=torch.bool)
+        self.observation_spec = self.observation_spec.clone().update({keys.ACTION_MASK: mask})
+
+    def make_action_spec(self, low, high, **settings):
+        return super().make_action_spec(3.0 * low, 3.0 * high, **settings)
+
+    def _read(self, *, is_over):
+        td = super()._read(is_over=is_over)
+        mask = torch.ones(*self.batch_size, 5, dtype=torch.bool)
+        mask[:, :2] = torch.arange(2) != self.coin.unsqueeze(-1)
+        return td.set(keys.ACTION_MASK, mask)
 
 
 def train(learner, env, num_batches):
@@ -144,6 +168,63 @@ def test_autoregressive_heads_and_random_agents_never_choose_a_pair_that_is_forb
     for learner in (Random(specs), HPPO(specs, autoregressive=True, **FAST)):
         train(learner, env, 5)
         assert env.violations == 0
+
+
+@pytest.mark.parametrize("is_shared", [False, True])
+def test_learners_of_options_never_choose_a_pair_that_is_forbidden(is_shared):
+    torch.manual_seed(0)
+    env = OneStep(200, forbids_pairs=True)
+    env.group_actions({"all": [0, 1, 2, 3, 4], "some": [0, 1, 2, 3]})
+    specs = PAMDPSpecs.from_env(env)
+    seen = [specs.with_option_observed()] if is_shared else [specs.of_option(option) for option in range(2)]
+    learners = [HPPO(each, autoregressive=True, **FAST) for each in seen]
+    agent = HierarchicalAgent(Uniform(specs), learners, specs, is_shared)
+    for _ in range(3):
+        agent.learn(with_decisions(env).rollout(1, agent.policy, break_when_any_done=False))
+    assert env.violations == 0
+
+
+def test_an_option_is_possible_where_it_has_an_allowed_action_of_each_component():
+    env = HalfForbidden(64)
+    env.group_actions({"all": [0, 1, 2, 3, 4], "first": [0, 2, 3], "second": [1, 2, 3]})
+    specs = PAMDPSpecs.from_env(env)
+    agent = HierarchicalAgent(Uniform(specs), [Random(specs.with_option_observed())], specs, is_shared=True)
+    batch = with_decisions(env).rollout(1, agent.policy).squeeze(1)
+    coin = batch[keys.OBSERVATION].argmax(-1)
+    expected = torch.stack([torch.ones_like(coin), coin == 1, coin == 0], -1).bool()
+    assert batch[keys.OPTION_MASK].equal(expected)
+    assert specs.components.of_choice(batch[keys.ACTION_MASK], batch[keys.DISCRETE]).all()
+    step = GreedyStep(agent, None, None)
+    step.choice = lambda td: td[keys.OPTION_MASK].long().argmin(-1)  # the option that is not possible
+    held, is_due = torch.zeros(64, dtype=torch.long), torch.ones(64, dtype=torch.bool)
+    given = {**batch.select(keys.OBSERVATION, keys.ACTION_MASK), "held_option": held, keys.IS_DECISION: is_due}
+    assert step(*(given[name] for name in step.names))[2].equal(1 + coin)
+
+
+@pytest.mark.parametrize(
+    "learner",
+    [
+        lambda specs: HPPO(specs, **FAST),
+        lambda specs: HPPO(specs, **FAST, autoregressive=True),
+        lambda specs: HSAC(specs, warmup_steps=100, updates_per_step=0.02),
+        lambda specs: IQL(specs, warmup_steps=100, updates_per_step=0.02),
+    ],
+)
+def test_updates_in_bfloat16_have_nearly_the_same_likelihoods(learner):
+    torch.manual_seed(0)
+    env = HalfForbidden(256)
+    learner = learner(PAMDPSpecs.from_env(env))
+    learner.lower_precision()
+    train(learner, env, 1)
+    state, raw = torch.eye(2), torch.tensor([[0.3, -0.2], [0.9, 0.4]])
+    discrete = torch.tensor([[0, 2], [1, 1]])
+    exact = learner.actor.given(state, discrete, raw, None, None)
+    with torch.autocast("cpu", torch.bfloat16):
+        lower = learner.actor.given(state, discrete, raw, None, None)
+        parts = [*lower.log_prob(discrete, raw), *lower.entropy()]
+    assert all(part.dtype == torch.float32 for part in parts)
+    for part, expected in zip(parts, [*exact.log_prob(discrete, raw), *exact.entropy()], strict=True):
+        torch.testing.assert_close(part, expected, atol=0.03, rtol=0.03)
 
 
 def test_independent_heads_refuse_a_mask_of_pairs():

@@ -103,7 +103,8 @@ class GreedyStep(nn.Module):
             if name in given:
                 td.set(name, given[name])
         if self.option_actions is not None:
-            td.set(keys.OPTION_MASK, (self.option_actions & given[keys.ACTION_MASK].unsqueeze(-2)).any(-1))
+            allowed = self.option_actions & given[keys.ACTION_MASK].unsqueeze(-2)
+            td.set(keys.OPTION_MASK, self.specs.components.any_of_each(allowed))
         if self.selector is not None:
             held = (given[HELD_OPTION], *([] if self.pairs is None else [given[HELD_LENGTH]]))
             chosen = self._choice(td, held, given[keys.IS_DECISION])

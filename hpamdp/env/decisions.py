@@ -11,6 +11,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Transform, TransformedEnv
 
 from hpamdp import keys
+from hpamdp.components import Components
 from hpamdp.env.base import PAMDPEnv, ProblemError
 
 OptionLength: TypeAlias = float | Literal["chosen"] | None
@@ -28,8 +29,8 @@ class DecisionTracker(Transform):
     - `decision_observation` `[*B, observation_dim]`: the observation at which the option was chosen.
     - `option_ended`, bool, only with an `option_length`: under `next`, the option ended with this step by itself, not
       only because its episode did.
-    - `option_mask`, bool `[*B, num_options]`, only with `option_actions`: which options have an allowed action. Where
-      the held option has none, it ends.
+    - `option_mask`, bool `[*B, num_options]`, only with `option_actions`: which options have an allowed action, of each
+      component. Where the held option has none, it ends.
     - `episode_return` and `episode_steps`: undiscounted sum of rewards and number of steps since the episode began.
 
     The rows where `("next", "is_decision")` is True are the transitions of the semi-MDP. All state travels in the
@@ -45,6 +46,7 @@ class DecisionTracker(Transform):
             int64 `[*B]`.
         option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`, if options are sets of
             actions and some may be forbidden; else None.
+        components: of the action; if None, there is one.
         keeps_observation: whether to write `decision_observation`. Pictures are large, so they are kept only if there
             are options to choose.
     """
@@ -55,12 +57,14 @@ class DecisionTracker(Transform):
         option_length: OptionLength = None,
         option_actions: Tensor | None = None,
         *,
+        components: Components | None = None,
         keeps_observation: bool = True,
     ) -> None:
         super().__init__()
         self.gamma = gamma
         self.option_length = option_length
         self.option_actions = option_actions
+        self.components = components
         self.keeps_observation = keeps_observation
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -161,15 +165,17 @@ class DecisionTracker(Transform):
             )
         return is_stuck
 
-    @staticmethod
-    def _possible_options(tensordict: TensorDictBase, option_actions: Tensor) -> Tensor:
-        """Return which options have an allowed action, bool `[*B, num_options]`; all where an episode is over.
+    def _possible_options(self, tensordict: TensorDictBase, option_actions: Tensor) -> Tensor:
+        """Return which options have an allowed action of each component, bool `[*B, num_options]`.
+
+        All options have one where an episode is over.
 
         Raises:
             ProblemError: none has one where the episode goes on.
         """
         allowed = option_actions & tensordict.get(keys.ACTION_MASK).unsqueeze(-2)
-        possible = allowed.any(-1) | tensordict.get(keys.DONE)
+        has_action = allowed.any(-1) if self.components is None else self.components.any_of_each(allowed)
+        possible = has_action | tensordict.get(keys.DONE)
         is_stuck = ~possible.any(-1)
         if is_stuck.any():
             row = int(is_stuck.flatten().nonzero()[0])
@@ -210,7 +216,9 @@ def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLen
     if env.option_actions is not None and keys.ACTION_MASK in env.observation_spec.keys():
         option_actions = torch.tensor(env.option_actions, device=env.device)
     keeps_observation = env.has_choice or not env.observation_entries
-    return DecisionTracker(gamma, option_length, option_actions, keeps_observation=keeps_observation)
+    return DecisionTracker(
+        gamma, option_length, option_actions, components=env.components, keeps_observation=keeps_observation
+    )
 
 
 def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLength = None) -> DecisionEnv:

@@ -55,8 +55,14 @@ class OptionRouter(TensorDictModuleBase):
         self.out_keys = list(dict.fromkeys(key for own_keys in self._own_out_keys for key in own_keys))
         in_keys = {key for learner in learners for key in learner.policy.in_keys}
         self.state_keys = [key for key in self.out_keys if key in in_keys]
-        masks = [keys.ACTION_MASK] if specs.has_action_mask else []
-        self.in_keys = [*in_keys, *masks, *([keys.OPTION] if specs.num_options else [])]
+        given = {
+            keys.ACTION_MASK: specs.has_action_mask,
+            keys.PAIR_MASK: specs.has_pair_mask,
+            keys.PARAMETER_LOW: specs.has_parameter_bounds,
+            keys.PARAMETER_HIGH: specs.has_parameter_bounds,
+            keys.OPTION: specs.num_options > 0,
+        }
+        self.in_keys = [*in_keys, *(key for key, is_given in given.items() if is_given)]
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the action leaves and the other `out_keys` of the learners' policies."""

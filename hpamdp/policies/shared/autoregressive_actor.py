@@ -86,7 +86,7 @@ class AutoregressiveActor(HybridActor):
             self.components.sizes, self.parameter_sizes, self.heads, self.owners, self.parts, strict=True
         ):
             allowed = allowed_next(self.components, len(choices), is_chosen > 0.0, mask, pair_mask)
-            output = head(torch.cat([hidden, is_chosen, own], -1))
+            output = head(torch.cat([hidden, is_chosen, own], -1)).float()
             logits, mean, raw_scale, value_logits = output.split(
                 [size, num, num, output.shape[-1] - size - 2 * num], -1
             )

@@ -136,10 +136,11 @@ class HybridActor(nn.Module):
             mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; if None, all.
         """
         hidden = self.hidden(observation)
-        mean, raw_scale = self.parameter_head(hidden).chunk(2, -1)
+        # In float32, also where the products are bfloat16: sums over parameters and their likelihoods need it.
+        mean, raw_scale = self.parameter_head(hidden).float().chunk(2, -1)
         mean = mean + self.initial(observation)
-        logits = masked_logits(self.discrete_head(hidden), mask)
-        values = None if self.values is None else self.values.distribution(self.value_head(hidden))
+        logits = masked_logits(self.discrete_head(hidden).float(), mask)
+        values = None if self.values is None else self.values.distribution(self.value_head(hidden).float())
         log_probs = self.components.log_softmax(logits)
         return HybridDistribution(log_probs, mean, self.log_scale(raw_scale), self.owner, self.components, values)
 
