@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torchrl.data import Binary
@@ -11,6 +13,8 @@ from toy_components import OneStep, random_steps
 from hpamdp import keys
 from hpamdp.api.export import GreedyStep
 from hpamdp.components import Components
+from hpamdp.data.errors import DataError
+from hpamdp.data.row_checks import check_actions
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.high_level.uniform import Uniform
@@ -168,6 +172,28 @@ def test_autoregressive_heads_and_random_agents_never_choose_a_pair_that_is_forb
     for learner in (Random(specs), HPPO(specs, autoregressive=True, **FAST)):
         train(learner, env, 5)
         assert env.violations == 0
+
+
+def test_data_without_the_masks_or_bounds_of_its_states_or_against_them_are_refused_in_one_line():
+    rows = random_steps(OneStep(), 20).flatten()
+    pairs = PAMDPSpecs.from_env(OneStep(forbids_pairs=True))
+    with pytest.raises(DataError, match="lack pair_mask, which the environment gives"):
+        check_actions(rows, pairs)
+    mask = torch.ones(20, 5, 5, dtype=torch.bool)
+    check_actions(rows.set(keys.PAIR_MASK, mask), pairs)
+    first, second = rows[keys.DISCRETE][7].tolist()
+    mask[7, first, 2 + second] = False
+    with pytest.raises(DataError, match=r"row 7: action.discrete\[1\] is \d, but .* the row's pair_mask"):
+        check_actions(rows.set(keys.PAIR_MASK, mask), pairs)
+    bounded = replace(PAMDPSpecs.from_env(OneStep()), has_parameter_bounds=True)
+    with pytest.raises(DataError, match="lack parameter_low"):
+        check_actions(rows, bounded)
+    high = torch.ones(20, 2)
+    rows.set(keys.PARAMETER_LOW, -high).set(keys.PARAMETER_HIGH, high.clone())
+    check_actions(rows, bounded)
+    rows[keys.PARAMETER_HIGH][3] = rows[keys.PARAMETERS][3] - 0.1
+    with pytest.raises(DataError, match=r"row 3: action.parameters\[\d\] is .*within the row's parameter_low"):
+        check_actions(rows, bounded)
 
 
 @pytest.mark.parametrize("is_shared", [False, True])

@@ -31,6 +31,7 @@ class Demonstrations:
             `next` `observation`, `reward`, `done`, `terminated`, `truncated` and `is_decision`; shapes and types are
             the environment's. The last row of each episode is `done`, and no other row. Parameters of discrete actions
             that a row does not take may be 0. `action_mask` and `option_mask` are optional.
+            `pair_mask`, `parameter_low` and `parameter_high` are required if the environment gives them.
         device: where the tensors are kept.
         decisions: `[K]`, for selectors, if more is known of the options' returns than the transitions show. At the root
             `option`; under `next` `decision_observation`, `option_return`, `option_steps`, `observation`, `done` and

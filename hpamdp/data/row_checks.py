@@ -50,6 +50,9 @@ _OPTIONAL: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
     ("next", keys.ACTION_MASK): (_BOOL, (None,)),
     keys.OPTION_MASK: (_BOOL, (None,)),
     ("next", keys.OPTION_MASK): (_BOOL, (None,)),
+    keys.PAIR_MASK: (_BOOL, (None, None)),
+    keys.PARAMETER_LOW: (_FLOAT, (None,)),
+    keys.PARAMETER_HIGH: (_FLOAT, (None,)),
 }
 _OBSERVATIONS: tuple[_Key, ...] = (
     keys.OBSERVATION,
@@ -118,6 +121,7 @@ def check_actions(rows: TensorDictBase, specs: PAMDPSpecs) -> None:
     shape, expected = list(rows.get(keys.DISCRETE).shape[1:]), list(specs.components.shape)
     if shape != expected:
         raise DataError(f"{what}' {_dotted(keys.DISCRETE)} has shape {shape} a row, but must have {expected}")
+    _check_state_entries(what, rows, specs)
     _check_rules(what, rows, _action_rules(rows, specs))
     if specs.num_options:
         check_options(what, rows, specs)
@@ -178,6 +182,19 @@ def _check_lengths(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
         for name in (mask, ("next", mask)):
             if length and name in present:
                 _check_length(what, rows, name, length)
+
+
+def _check_state_entries(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
+    """Check that the rows have the pair mask and the bounds of their states, if the environment gives them."""
+    needed = {keys.PAIR_MASK: specs.num_discrete} if specs.has_pair_mask else {}
+    if specs.has_parameter_bounds:
+        needed |= dict.fromkeys((keys.PARAMETER_LOW, keys.PARAMETER_HIGH), specs.num_parameters)
+    for name, length in needed.items():
+        if name not in rows.keys():
+            raise DataError(f"{what} lack {name}, which the environment gives with every state")
+        shape, expected = list(rows.get(name).shape[1:]), [length] * (2 if name == keys.PAIR_MASK else 1)
+        if shape != expected:
+            raise DataError(f"{what}' {name} has shape {shape} a row, but must have {expected}")
 
 
 def _check_rules(what: str, rows: TensorDictBase, rules: Iterator[_Rule]) -> None:
@@ -248,6 +265,18 @@ def _action_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
     # Other actions' parameters do not count, so recordings fill them with zeros.
     is_filled = is_inside | is_own | (parameters == 0.0)
     yield _Rule(keys.PARAMETERS, is_filled, [f"{each}, or 0 as it is another action's" for each in bounds])
+    if specs.has_parameter_bounds:
+        state_low, state_high = rows.get(keys.PARAMETER_LOW), rows.get(keys.PARAMETER_HIGH)
+        is_inside = (parameters >= state_low - slack) & (parameters <= state_high + slack)
+        yield _Rule(
+            keys.PARAMETERS, is_inside | ~is_own, f"within the row's {keys.PARAMETER_LOW} and {keys.PARAMETER_HIGH}"
+        )
+    if specs.has_pair_mask:
+        places = components.places(discrete)
+        pairs = rows.get(keys.PAIR_MASK).gather(-2, places.unsqueeze(-1).expand(-1, -1, specs.num_discrete))
+        pairs = pairs.gather(-1, places.unsqueeze(-2).expand(-1, len(components.sizes), -1))
+        may_follow = (pairs | pairs.new_ones(pairs.shape[1:]).tril()).all(-2)
+        yield _Rule(keys.DISCRETE, may_follow, f"allowed by the row's {keys.PAIR_MASK}")
     if specs.has_action_mask and keys.ACTION_MASK in rows.keys():
         allowed = components.of_choice(rows.get(keys.ACTION_MASK), discrete)
         allowed = allowed.unsqueeze(-1) if components.is_single else allowed
