@@ -7,6 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.low_level.hyar import LATENT, HyAR
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
@@ -364,8 +365,11 @@ def test_the_range_of_a_latent_dimension_that_the_codec_does_not_use_is_that_of_
 
 def test_without_a_number_z_has_as_many_dimensions_as_an_action_has_parameters_at_most():
     assert make(latent_dim=None).codec.latent_dim == 2
-    no_parameters = PAMDPSpecs(4, (), (0, 0), (), ())
-    assert make(no_parameters, latent_dim=None).codec.latent_dim == 1
+
+
+def test_a_problem_without_parameters_is_refused():
+    with pytest.raises(SettingError, match="no discrete action of the problem has one"):
+        make(PAMDPSpecs(4, (), (0, 0), (), ()))
 
 
 def test_the_learning_rates_fall_to_their_final_fraction():
