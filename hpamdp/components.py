@@ -84,3 +84,30 @@ class Components:
     def total(self, each: Tensor) -> Tensor:
         """Return the sum over components of numbers in a choice's shape, `[*B]`."""
         return each if self.is_single else each.sum(-1)
+
+    def allowed_next(
+        self, number: int, is_chosen: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> Tensor | None:
+        """Return which discrete actions a component may choose after those before it, bool `[*B, size]`; if None, all.
+
+        A choice that would leave nothing to a later component is left out. With three or more components, two choices
+        that leave something each may together leave nothing, so a `pair_mask` must allow a choice after each such pair.
+
+        Args:
+            number: of the component that chooses.
+            is_chosen: what the components before it have chosen, bool `[*B, num_discrete]`.
+            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; if None, all.
+            pair_mask: whether the column's discrete action may follow the row's, bool
+                `[*B, num_discrete, num_discrete]`; if None, all pairs.
+        """
+        begin, size = self.starts[number], self.sizes[number]
+        if pair_mask is None:
+            return None if mask is None else mask[..., begin : begin + size]
+        allowed = (pair_mask | ~is_chosen.unsqueeze(-1)).all(-2)
+        if mask is not None:
+            allowed = allowed & mask
+        own = allowed[..., begin : begin + size]
+        follows = pair_mask[..., begin : begin + size, :] & allowed.unsqueeze(-2)
+        for start, later in zip(self.starts[number + 1 :], self.sizes[number + 1 :], strict=True):
+            own = own & follows[..., start : start + later].any(-1)
+        return own

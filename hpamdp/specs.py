@@ -311,6 +311,8 @@ class PAMDPSpecs:
         has_parameter_bounds = keys.PARAMETER_LOW in observed
         if has_action_mask or has_parameter_bounds or env.option_actions is not None or len(env.component_sizes) > 1:
             symmetries = None  # they do not say how masks, bounds, components and sets of actions are mapped
+        if len(env.component_sizes) > 1:
+            geometry = None  # nor does it say where several discrete actions at once point
         return cls(
             observation_dim=observation_dim,
             option_names=tuple(env.option_names) if keys.OPTION in action.keys() else (),

@@ -15,6 +15,7 @@ from hpamdp.api.export import GreedyStep
 from hpamdp.components import Components
 from hpamdp.data.errors import DataError
 from hpamdp.data.row_checks import check_actions
+from hpamdp.env.base import ProblemError
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.high_level.uniform import Uniform
@@ -30,6 +31,8 @@ from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.qpamdp import QPAMDP
 from hpamdp.policies.low_level.random import Random
 from hpamdp.policies.low_level.td3_bc import TD3BC
+from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
+from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
@@ -280,3 +283,23 @@ def test_the_likelihood_of_an_autoregressive_action_is_that_with_which_it_was_dr
     _, _, same = learner.actor.act(lambda _: next(drawn), features, None, None)
     for one, other in zip(given.log_prob(discrete, raw), same.log_prob(discrete, raw), strict=True):
         torch.testing.assert_close(one, other)
+
+
+def test_a_mask_of_pairs_that_allows_nothing_ends_with_one_line():
+    class Stuck(OneStep):
+        def _read(self, *, is_over):
+            td = super()._read(is_over=is_over)
+            return td.set(keys.PAIR_MASK, torch.zeros_like(td[keys.PAIR_MASK]))
+
+    with pytest.raises(ProblemError, match="environment 0 gave a pair_mask that allows no action"):
+        with_decisions(Stuck(2, forbids_pairs=True)).reset()
+
+
+def test_components_see_whole_numbers_in_the_middle_of_their_cells_when_acting_and_when_learning():
+    torch.manual_seed(0)
+    specs = PAMDPSpecs(1, (), (1, 0, 0), (0.0,), (99.0,), component_sizes=(1, 2), integer_parameters=(True,))
+    actor = AutoregressiveActor(specs, (8,), (0.1, 1.0))
+    state = torch.randn(6, 1)
+    discrete, raw, acted = actor.act(HybridDistribution.sample, state, None, None)
+    learned = actor.given(state, discrete, specs.to_unit(specs.from_unit(raw.clamp(-1.0, 1.0))), None, None)
+    torch.testing.assert_close(acted.discrete_log_probs, learned.discrete_log_probs)

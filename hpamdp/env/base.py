@@ -186,6 +186,17 @@ class PAMDPEnv(EnvBase):
                 row = int(is_stuck.nonzero()[0])
                 raise ProblemError(f"{self.title}: environment {row} gave an {name} that allows nothing")
             tensordict.set(name, mask | is_empty.unsqueeze(-1))
+        pair_mask = tensordict.get(keys.PAIR_MASK, None)
+        if pair_mask is not None:
+            action_mask = tensordict.get(keys.ACTION_MASK, None)
+            first = self.components.allowed_next(0, torch.zeros_like(pair_mask[..., 0]), action_mask, pair_mask)
+            assert first is not None
+            is_empty = ~first.any(-1)
+            is_stuck = is_empty & ~tensordict.get(keys.DONE).squeeze(-1)
+            if is_stuck.any():
+                row = int(is_stuck.nonzero()[0])
+                raise ProblemError(f"{self.title}: environment {row} gave a {keys.PAIR_MASK} that allows no action")
+            tensordict.set(keys.PAIR_MASK, pair_mask | is_empty[..., None, None])
         return tensordict
 
     @property

@@ -10,7 +10,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.components import Components
 from hpamdp.specs import PAMDPSpecs
 
 # With this logit a choice has probability 0, while entropies and gradients stay finite.
@@ -60,39 +59,11 @@ def random_discrete(
     is_chosen = torch.zeros(*shape, specs.num_discrete, dtype=torch.bool, device=device)
     drawn = []
     for number, (start, size) in enumerate(zip(components.starts, components.sizes, strict=True)):
-        allowed = allowed_next(components, number, is_chosen, mask, pair_mask)
+        allowed = components.allowed_next(number, is_chosen, mask, pair_mask)
         choice = random_choice(shape, size, allowed, device)
         drawn.append(choice)
         is_chosen[..., start : start + size] = torch.arange(size, device=device) == choice.unsqueeze(-1)
     return torch.stack(drawn, -1)
-
-
-def allowed_next(
-    components: Components, number: int, is_chosen: Tensor, mask: Tensor | None, pair_mask: Tensor | None
-) -> Tensor | None:
-    """Return which discrete actions a component may choose after those before it, bool `[*B, size]`; if None, all.
-
-    A choice that would leave nothing to a later component is left out.
-
-    Args:
-        components: of the action.
-        number: of the component that chooses.
-        is_chosen: what the components before it have chosen, bool `[*B, num_discrete]`.
-        mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; if None, all.
-        pair_mask: whether the column's discrete action may follow the row's, bool `[*B, num_discrete, num_discrete]`;
-            if None, all pairs.
-    """
-    begin, size = components.starts[number], components.sizes[number]
-    if pair_mask is None:
-        return None if mask is None else mask[..., begin : begin + size]
-    allowed = (pair_mask | ~is_chosen.unsqueeze(-1)).all(-2)
-    if mask is not None:
-        allowed = allowed & mask
-    own = allowed[..., begin : begin + size]
-    follows = pair_mask[..., begin : begin + size, :] & allowed.unsqueeze(-2)
-    for start, later in zip(components.starts[number + 1 :], components.sizes[number + 1 :], strict=True):
-        own = own & follows[..., start : start + later].any(-1)
-    return own
 
 
 def allowed_or_first(choice: Tensor, mask: Tensor) -> Tensor:

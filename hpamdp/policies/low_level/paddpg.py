@@ -89,7 +89,10 @@ class PADDPGActor(nn.Module):
     def forward(self, state: Tensor) -> Tensor:
         """Return what the actor outputs, clipped; its gradients are inverted."""
         scores, parameters = self.net(state).tensor_split([self.num_discrete], -1)
-        output = InvertingGradients.apply(torch.cat([scores, parameters + self.initial(state)], -1))
+        return self.in_cells(InvertingGradients.apply(torch.cat([scores, parameters + self.initial(state)], -1)))
+
+    def in_cells(self, output: Tensor) -> Tensor:
+        """Return an output with whole parameters in the middle of their cells, see `PAMDPSpecs.in_cells`."""
         if not self.specs.has_integers:
             return output
         scores, parameters = output.tensor_split([self.num_discrete], -1)
@@ -200,6 +203,7 @@ class PADDPG(ReplayLearner):
         output = self.target_actor(observation)
         if self.options.twin:
             output = with_clipped_noise(output, self.options.target_smoothing, self.options.target_smoothing_clip)
+            output = self.target_actor.in_cells(output)
         output = with_lowest_scores(output, self.specs.allowed(observation, action_mask))
         return q_values(self.target_critics, observation, output).amin(0)
 

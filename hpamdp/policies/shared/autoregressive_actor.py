@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hpamdp.components import Components
-from hpamdp.policies.masks import allowed_next, masked_logits
+from hpamdp.policies.masks import masked_logits
 from hpamdp.policies.shared.hybrid_actor import HybridActor, make_small
 from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution
 from hpamdp.specs import PAMDPSpecs
@@ -42,6 +42,7 @@ class AutoregressiveActor(HybridActor):
 
     def make_heads(self, specs: PAMDPSpecs, width: int, raw_scale: float) -> None:
         """Make a head for each component on an encoder's output; deviations start at sigmoid(raw_scale)."""
+        self.in_cells = specs.in_cells
         sizes = self.components.sizes
         dims = torch.tensor(specs.parameter_dims).split(sizes)
         self.parameter_sizes = [int(part.sum()) for part in dims]
@@ -85,7 +86,7 @@ class AutoregressiveActor(HybridActor):
         for size, num, head, owner, part in zip(
             self.components.sizes, self.parameter_sizes, self.heads, self.owners, self.parts, strict=True
         ):
-            allowed = allowed_next(self.components, len(choices), is_chosen > 0.0, mask, pair_mask)
+            allowed = self.components.allowed_next(len(choices), is_chosen > 0.0, mask, pair_mask)
             output = head(torch.cat([hidden, is_chosen, own], -1)).float()
             logits, mean, raw_scale, value_logits = output.split(
                 [size, num, num, output.shape[-1] - size - 2 * num], -1
@@ -107,7 +108,7 @@ class AutoregressiveActor(HybridActor):
             is_own = torch.arange(size, device=choice.device) == choice.unsqueeze(-1)
             is_chosen = _with_part(is_chosen, first, is_own.to(is_chosen.dtype))
             executed = self.bound(raw) * is_own.index_select(-1, distribution.owner)
-            own = _with_part(own, first_parameter, executed.to(own.dtype))
+            own = self.in_cells(_with_part(own, first_parameter, executed.to(own.dtype))) * is_chosen[..., self.owner]
             first, first_parameter = first + size, first_parameter + num
         discrete = choices[0] if self.components.is_single else torch.stack(choices, -1)
         return discrete, torch.cat(raws, -1), self._joined(distributions)
