@@ -33,6 +33,7 @@ AGENTS = {
     "hppo_hard_move_8": [*HARD_MOVE, "env.n=8"],
     "hppo_moving": ["high=none", "low=hppo", "env=moving"],
     "hppo_sliding": ["high=none", "low=hppo", "env=sliding"],
+    "hppo_lunar_lander": ["high=none", "low=hppo", "env=lunar_lander", "eval.layouts=200", "seed=101"],
     # The options of this agent change inside an episode.
     "meta_critic_hppo_rooms": [
         *("high=meta_critic", "high.hidden_dims=[64,64]", "low=hppo", "env=rooms", "low.gamma=0.97"),

@@ -6,7 +6,7 @@ import itertools
 import math
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -130,9 +130,9 @@ class GymnasiumEnv(PAMDPEnv):
         ProblemError: a copy gave what its own spaces do not have.
     """
 
-    Options = GymnasiumOptions
+    Options: ClassVar[type[Settings]] = GymnasiumOptions
     result_keys = (_SUCCESS,)
-    guarded_settings = ("id", "entry_point", "kwargs")
+    guarded_settings: ClassVar[tuple[str, ...]] = ("id", "entry_point", "kwargs")
 
     def __init__(
         self,

@@ -1,0 +1,101 @@
+"""Hybrid LunarLander as a batched TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial, update_wrapper
+from typing import Annotated, Any, ClassVar
+
+import torch
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
+
+from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
+from hpamdp.env.lunar_lander.lander import SOLVED, HybridLunarLander
+from hpamdp.env.lunar_lander.registration import MAX_STEPS
+from hpamdp.settings import PositiveFraction, Settings
+
+# Mean return, fraction of solved episodes and length of Gymnasium's own hand-written player, over 500 episodes with the
+# default settings; experiments/hybrid_control/study.py measures it.
+HEURISTIC = {"score": 282.8, "success": 0.998, "steps": 200.7}
+
+
+class LunarLanderOptions(Settings):
+    """Settings of `LunarLanderEnv`."""
+
+    max_steps: PositiveInt = MAX_STEPS
+    """Steps after which an episode is truncated."""
+    gravity: Annotated[float, Field(gt=-12.0, lt=0.0)] = -10.0
+    """Acceleration by gravity."""
+    enable_wind: bool = False
+    """Blow the lander about, more strongly or less."""
+    wind_power: NonNegativeFloat = 15.0
+    """Largest force of the wind."""
+    turbulence_power: NonNegativeFloat = 1.5
+    """Largest torque of the wind."""
+    render: bool = False
+    """Draw the lander, for films; steps then take longer."""
+    reward_scaling: PositiveFraction | None = None
+    """Divide rewards in training by the running deviation of the return with this discount. If None, they stay."""
+    num_workers: NonNegativeInt = 0
+    """Processes that step the landers at the same time. If 0, this process steps them."""
+
+
+class LunarLanderEnv(GymnasiumEnv):
+    """Land `num_envs` landers at once, with two components: the main engine and the side engines.
+
+    Action leaves: `("action", "discrete")` int64 `[N, 2]`: 0 off, 1 on; 0 off, 1 left, 2 right; `("action",
+    "parameters")` float32 `[N, 3]`: the throttles of `main`, `left` and `right`, in [0.5, 1].
+
+    The dynamics, the observations and the rewards are those of Gymnasium's LunarLanderContinuous-v3; observations are
+    not scaled. See `HybridLunarLander`, and `GymnasiumEnv` for the arguments and the errors.
+    """
+
+    Options: ClassVar[type[Settings]] = LunarLanderOptions
+    guarded_settings: ClassVar[tuple[str, ...]] = ()
+    observation_names = ("x", "y", "x_speed", "y_speed", "angle", "angular_speed", "left_leg", "right_leg")
+    discrete_names = ("main off", "main on", "side off", "left", "right")
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        options: LunarLanderOptions | None = None,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+        **settings: Any,
+    ) -> None:
+        given = LunarLanderOptions.of(options, settings)
+        lander = {name: getattr(given, name) for name in ("gravity", "enable_wind", "wind_power", "turbulence_power")}
+        # Its own bounds are exceeded now and then, and its numbers have the size of 1 already.
+        reading = GymnasiumOptions(
+            max_steps=given.max_steps,
+            observation_scaling="none",
+            out_of_bounds="allow",
+            reward_scaling=given.reward_scaling,
+            num_workers=given.num_workers,
+        )
+        make = partial(HybridLunarLander, render_mode="rgb_array" if given.render else None, **lander)
+        update_wrapper(make, HybridLunarLander)  # errors call it by its name
+        super().__init__(
+            num_envs,
+            make=make,
+            options=reading,
+            device=device,
+            seed=seed,
+            first_env=first_env,
+        )
+
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem: there are no options."""
+        return ProblemFacts(
+            title=cls.__name__,
+            is_shardable=options.num_workers == 0,
+            has_statistics=options.reward_scaling is not None,
+        )
+
+    def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return Gymnasium's bar for a solution, and its hand-written player with the default settings."""
+        return {"solved": {"score": SOLVED}, "heuristic": HEURISTIC}

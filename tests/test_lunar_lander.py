@@ -1,0 +1,89 @@
+"""Hybrid LunarLander has the dynamics of Gymnasium's continuous LunarLander, with two components."""
+
+from __future__ import annotations
+
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("Box2D")
+
+from gymnasium.envs.box2d.lunar_lander import heuristic
+from torchrl.envs.utils import check_env_specs
+
+from hpamdp import keys
+from hpamdp.env.lunar_lander.environment import LunarLanderEnv
+from hpamdp.env.lunar_lander.lander import continuous_action, hybrid_action
+from hpamdp.env.registration import register
+from hpamdp.settings import SettingError
+from hpamdp.specs import PAMDPSpecs
+
+register()
+
+
+def test_it_has_two_components_whose_engines_have_throttles():
+    specs = PAMDPSpecs.from_env(LunarLanderEnv(1))
+    assert specs.component_sizes == (2, 3) and specs.parameter_dims == (0, 1, 0, 1, 1)
+    assert specs.parameter_low == (0.5,) * 3 and specs.parameter_high == (1.0,) * 3
+
+
+def test_all_tensors_are_as_the_specs_say():
+    check_env_specs(LunarLanderEnv(2), return_contiguous=True)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_episode_is_that_of_the_continuous_form_with_the_same_engines(seed):
+    hybrid, continuous = gymnasium.make("hpamdp/LunarLander-v0"), gymnasium.make("LunarLanderContinuous-v3")
+    seen, same = hybrid.reset(seed=seed)[0], continuous.reset(seed=seed)[0]
+    is_over, total = False, 0.0
+    while not is_over:
+        given = np.asarray(heuristic(continuous, same), np.float32)
+        action = hybrid_action(given)
+        assert hybrid.action_space.contains(action)
+        seen, reward, terminated, truncated, info = hybrid.step(action)
+        same, expected, *flags, _ = continuous.step(given)
+        np.testing.assert_allclose(seen, same, atol=1e-4)
+        assert reward == pytest.approx(expected, abs=1e-3) and flags == [terminated, truncated]
+        total += reward
+        is_over = terminated or truncated
+        assert info["is_success"] == (total >= 200.0)
+    assert total >= 200.0
+
+
+def test_every_chosen_engine_fires_even_at_its_lowest_throttle():
+    generator = np.random.default_rng(0)
+    space = gymnasium.make("hpamdp/LunarLander-v0").action_space
+    space.seed(0)
+    for _ in range(100):
+        action = space.sample()
+        for of_part in (action["main"][1][1], *action["side"][1][1:]):
+            of_part[:] = generator.choice([0.5, 0.75, 1.0])
+        lift, push = continuous_action(action)
+        main, side = int(action["main"][0]), int(action["side"][0])
+        assert (lift > 0.0) == bool(main) and (abs(push) > 0.5) == bool(side)
+        assert side == 0 or (np.sign(push) == (-1.0 if side == 1 else 1.0))
+        power = 0.5 * (lift + 1.0) if main else None
+        assert power is None or power == pytest.approx(action["main"][1][1][0], abs=1e-5)
+
+
+def test_copies_have_episodes_of_their_own_and_the_settings_reach_them():
+    env = LunarLanderEnv(3, gravity=-5.0, enable_wind=True)
+    assert {copy.unwrapped.gravity for copy in env.envs} == {-5.0} and env.envs[0].unwrapped.enable_wind
+    assert len(set(env.reset()[keys.OBSERVATION][:, 0].tolist())) == 3
+
+
+def test_without_box2d_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium.envs.box2d.lunar_lander", None)
+    with pytest.raises(SettingError, match=r"Box2D is not installed; pip install 'hpamdp\[box2d\]'$") as raised:
+        LunarLanderEnv(1)
+    assert "\n" not in str(raised.value)
+
+
+def test_it_can_be_drawn():
+    env = LunarLanderEnv(1, render=True)
+    env.reset()
+    (picture,) = env.film_state(1).values()
+    assert picture.dtype == torch.uint8 and picture.shape[-1] == 3
