@@ -58,16 +58,16 @@ class PAMDPSpecs:
     parameter_dims: tuple[int, ...]
     parameter_low: tuple[float, ...]
     parameter_high: tuple[float, ...]
-    component_sizes: tuple[int, ...] = ()
-    integer_parameters: tuple[bool, ...] = ()
-    has_parameter_bounds: bool = False
     initial_weight: tuple[tuple[float, ...], ...] | None = None
     initial_bias: tuple[float, ...] | None = None
     has_action_mask: bool = False
-    has_pair_mask: bool = False
     has_option_mask: bool = False
     option_actions: tuple[tuple[bool, ...], ...] | None = None
     held_option: int | None = None
+    component_sizes: tuple[int, ...] = ()
+    integer_parameters: tuple[bool, ...] = ()
+    has_parameter_bounds: bool = False
+    has_pair_mask: bool = False
     symmetries: Symmetries | None = field(default=None, compare=False, repr=False)
     geometry: PlaneGeometry | None = field(default=None, compare=False, repr=False)
     entries: tuple[ObservationEntry, ...] = ()
