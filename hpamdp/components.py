@@ -57,6 +57,12 @@ class Components:
             return choice.unsqueeze(-1)
         return choice + torch.tensor(self.starts, device=choice.device)
 
+    def exists(self, choice: Tensor) -> Tensor:
+        """Return whether every component of a choice has a number that exists, bool `[*B]`."""
+        if self.is_single:
+            return (choice >= 0) & (choice < self.sizes[0])
+        return ((choice >= 0) & (choice < torch.tensor(self.sizes, device=choice.device))).all(-1)
+
     def of_choice(self, values: Tensor, choice: Tensor) -> Tensor:
         """Return the entries of values `[*B, num_discrete]` that belong to a choice, in the choice's shape."""
         entries = values.gather(-1, self.places(choice))

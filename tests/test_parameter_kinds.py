@@ -95,6 +95,16 @@ def rollout(learner, env, num, mode=ExplorationType.RANDOM):
         return with_decisions(env).rollout(num, learner.policy, break_when_any_done=False)
 
 
+def greedy_steps_after_training(make):
+    torch.manual_seed(0)
+    env = GymnasiumEnv(256, make=make, max_steps=1)
+    learner = HPPO(PAMDPSpecs.from_env(env), minibatch_size=128, lr=3e-3, hidden_dims=(32,), anneal_steps=10_000)
+    for _ in range(30):
+        batch = rollout(learner, env, 1)
+        learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
+    return rollout(learner, env, 1, ExplorationType.DETERMINISTIC)
+
+
 def test_each_whole_number_has_a_cell_of_the_same_width():
     unit = torch.linspace(-1.0, 1.0, 100_001).unsqueeze(-1).expand(-1, 3)
     first, middle, last = SPECS.from_unit(unit).unbind(-1)
@@ -115,13 +125,7 @@ def test_values_in_cells_pass_the_gradient_on():
 
 
 def test_values_without_an_order_are_learned_by_a_categorical_head():
-    torch.manual_seed(0)
-    env = GymnasiumEnv(256, make=Orders, max_steps=1)
-    learner = HPPO(PAMDPSpecs.from_env(env), minibatch_size=128, lr=3e-3, hidden_dims=(32,), anneal_steps=10_000)
-    for _ in range(30):
-        batch = rollout(learner, env, 1)
-        learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
-    steps = rollout(learner, env, 1, ExplorationType.DETERMINISTIC)
+    steps = greedy_steps_after_training(Orders)
     assert steps["next", "reward"].mean() > 0.99
     assert (steps[keys.PARAMETERS][..., 0] == 5.0).all()
 
@@ -151,13 +155,7 @@ def test_actions_lie_within_bounds_that_depend_on_the_state(learner_class):
 
 
 def test_a_learner_sells_all_where_the_stock_is_the_bound():
-    torch.manual_seed(0)
-    env = GymnasiumEnv(256, make=Stock, max_steps=1)
-    learner = HPPO(PAMDPSpecs.from_env(env), minibatch_size=128, lr=3e-3, hidden_dims=(32,), anneal_steps=10_000)
-    for _ in range(30):
-        batch = rollout(learner, env, 1)
-        learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
-    steps = rollout(learner, env, 1, ExplorationType.DETERMINISTIC)
+    steps = greedy_steps_after_training(Stock)
     has_stock = steps[keys.PARAMETER_HIGH][..., 0] > 0.0
     assert steps["next", "reward"].squeeze(-1)[has_stock].mean() > 0.95
 

@@ -35,10 +35,8 @@ def check_action_values(
     device = discrete.device
     owner = torch.arange(len(parameter_dims), device=device)
     owner = owner.repeat_interleave(torch.tensor(parameter_dims, device=device))
-    sizes = components.sizes[0] if components.is_single else torch.tensor(components.sizes, device=device)
-    exists = ((discrete >= 0) & (discrete < sizes)).reshape(len(discrete), -1).all(-1)
     is_own = components.is_chosen(discrete).index_select(-1, owner)
-    is_valid = exists & (parameters.isfinite() | ~is_own).all(-1)
+    is_valid = components.exists(discrete) & (parameters.isfinite() | ~is_own).all(-1)
     if not is_valid.all():
         row = int((~is_valid).nonzero()[0])
         discrete_name, parameters_name = names

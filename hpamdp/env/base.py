@@ -425,8 +425,7 @@ class PAMDPEnv(EnvBase):
     def _check_option(self, option: Tensor, discrete: Tensor) -> None:
         """Refuse an option that does not exist, `[N]`, and an action `[N, ...]` that its option does not allow."""
         components = self.components
-        sizes = components.sizes[0] if components.is_single else torch.tensor(components.sizes, device=discrete.device)
-        is_action = ((discrete >= 0) & (discrete < sizes)).reshape(len(option), -1).all(-1)
+        is_action = components.exists(discrete)
         exists = (option >= 0) & (option < len(self._allowed_by_option)) & is_action
         places = components.places(torch.where(is_action.reshape(-1, *[1] * (discrete.ndim - 1)), discrete, 0))
         allowed = self._allowed_by_option[torch.where(exists, option, 0)].gather(-1, places)

@@ -107,8 +107,8 @@ class AutoregressiveActor(HybridActor):
             distributions.append(distribution)
             is_own = torch.arange(size, device=choice.device) == choice.unsqueeze(-1)
             is_chosen = _with_part(is_chosen, first, is_own.to(is_chosen.dtype))
-            executed = self.bound(raw) * is_own.index_select(-1, distribution.owner)
-            own = self.in_cells(_with_part(own, first_parameter, executed.to(own.dtype))) * is_chosen[..., self.owner]
+            executed = self.in_cells(_with_part(own, first_parameter, self.bound(raw).to(own.dtype)))
+            own = executed * is_chosen[..., self.owner]
             first, first_parameter = first + size, first_parameter + num
         discrete = choices[0] if self.components.is_single else torch.stack(choices, -1)
         return discrete, torch.cat(raws, -1), self._joined(distributions)
