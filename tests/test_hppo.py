@@ -250,6 +250,24 @@ def test_learning_rate_and_scale_are_annealed_over_the_steps_of_the_whole_run():
     assert scales == pytest.approx([0.05, 0.0005**0.5, 0.01, 0.01])
 
 
+def test_the_largest_scale_is_annealed_and_follows_from_the_steps_in_a_state_dict():
+    options = dict(max_scale_final=0.1, initial_scale=0.9, lr=1e-6, lr_final=0.0, anneal_steps=512)
+    learner, resumed, started = make(**options), make(**options), make(**options)
+    observation = torch.zeros(1, 4)
+    scales = [learner.actor(observation).log_scale.exp().max().item()]
+    for _ in range(2):
+        rows = one_step_rows(learner, 256)
+        learner.learn(rows, everything(rows))
+        scales.append(learner.actor(observation).log_scale.exp().max().item())
+    assert scales[0] > 0.8
+    assert 0.1 < scales[1] < 0.32
+    assert scales[2] < 0.1
+    resumed.load_state_dict(learner.state_dict())
+    torch.testing.assert_close(resumed.actor.log_max_scale, learner.actor.log_max_scale, rtol=0.0, atol=0.0)
+    started.load_networks(learner.state_dict())
+    assert started.actor.log_max_scale.exp().item() == pytest.approx(1.0)
+
+
 def test_too_few_rows_wait_for_more_and_are_part_of_the_state_dict():
     learner, other = make(minibatch_size=150), make(minibatch_size=150)
     first, second = random_rows(learner, 50, 2), random_rows(learner, 50, 2)
@@ -262,6 +280,12 @@ def test_too_few_rows_wait_for_more_and_are_part_of_the_state_dict():
         assert one.learn(second, everything(second)) and not one.waiting
     assert not torch.equal(learner.actor.discrete_head.weight, before)
     assert torch.equal(learner.actor.discrete_head.weight, other.actor.discrete_head.weight)
+
+
+@pytest.mark.parametrize("final", [0.01, 1.5])
+def test_a_largest_scale_that_ends_outside_its_range_is_refused(final):
+    with pytest.raises(ValueError, match=f"max_scale_final={final}"):
+        make(max_scale_final=final)
 
 
 def test_a_scale_outside_its_range_is_refused():

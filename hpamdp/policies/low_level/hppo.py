@@ -11,7 +11,8 @@ Differs from the source:
 - The parameters are Gaussian in units where their bounds are [-1, 1]. The ratio is that of the raw sample, which is
   clipped only for execution: the density of a squashed sample diverges at the bounds.
 - The Gaussian's standard deviation has a lower limit. Without it the ratios explode when the standard deviation shrinks
-  faster than the mean moves. This limit, the learning rate and the entropy bonus are annealed over `anneal_steps`.
+  faster than the mean moves. This limit, the learning rate and the entropy bonus are annealed over `anneal_steps`, and
+  so is an upper limit, if `max_scale_final` is set.
 - With `vector_products` actors and critic also see products of the vectors that the problem declares.
 - With `memory` actors and critic share a memory of the history. A recurrent one is trained on whole sequences, each
   from the state that was stored at its first step.
@@ -71,7 +72,13 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     min_scale_final: PositiveFloat = 0.02
     """Smallest standard deviation at the end; the limit is annealed from `min_scale` to this value."""
     max_scale: PositiveFloat = 1.0
-    """Largest standard deviation."""
+    """Largest standard deviation at the start."""
+    max_scale_final: PositiveFloat | None = None
+    """Largest standard deviation at the end; the limit is annealed from `max_scale` to this value. None keeps it.
+
+    Where noise on a parameter costs little, its standard deviation stays large. Then the means are never tried alone,
+    but evaluations use them alone.
+    """
     epochs: Annotated[int, Field(ge=1, le=1000)] = 5
     """Passes over the collected steps in an update."""
     gamma: Fraction = 0.99
@@ -91,7 +98,7 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     entropy_final: Fraction = 0.1
     """Fraction of both entropy bonuses that is left at the end."""
     anneal_steps: PositiveInt = 200_000
-    """Steps of the whole run over which learning rate, `min_scale` and entropy bonuses are annealed."""
+    """Steps of the whole run over which learning rate, `min_scale`, `max_scale` and entropy bonuses are annealed."""
     max_grad_norm: PositiveFloat = 1.0
     """Largest gradient norm, of actors and critic together."""
     credit: Credit = "joint"
@@ -115,6 +122,11 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
             )
         if not self.min_scale_final < self.max_scale:
             raise ValueError(f"min_scale_final={self.min_scale_final}: must be less than max_scale={self.max_scale}")
+        if self.max_scale_final is not None and not self.min_scale_final < self.max_scale_final <= self.max_scale:
+            raise ValueError(
+                f"max_scale_final={self.max_scale_final}: must be more than min_scale_final={self.min_scale_final} and "
+                f"at most max_scale={self.max_scale}"
+            )
         if self.credit != "joint" and self.autoregressive:
             raise ValueError(
                 f"credit={self.credit!r}: needs autoregressive=false, as a component must not depend on "
@@ -171,6 +183,7 @@ class HPPO(OnPolicy, Learner):
             self.actor, specs, writes_raw=True, samples_when_greedy=samples, perception=self.perception
         )
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
+        self.register_load_state_dict_post_hook(lambda *_: self._limit_scale())
         self.to(device)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=options.lr, eps=1e-5, fused=True)
 
@@ -196,7 +209,15 @@ class HPPO(OnPolicy, Learner):
         entropy_weight = torch.tensor(left, device=rows.device, dtype=torch.float32)
         steps = [self.gradient_step(self.loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]
         self.actor.set_min_scale(options.min_scale * (options.min_scale_final / options.min_scale) ** progress)
+        self._limit_scale()
         return mean_scalars(steps)
+
+    def _limit_scale(self) -> None:
+        """Set the largest standard deviation for the steps to come, from the number of steps so far."""
+        start, final = self.options.max_scale, self.options.max_scale_final
+        if final is not None:
+            progress = min(1.0, self.frames.item() / self.options.anneal_steps)
+            self.actor.set_max_scale(start * (final / start) ** progress)
 
     def loss(self, rows: Mapping[str, Tensor], entropy_weight: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of actors and critic on a minibatch `[B]`, and scalars to log."""

@@ -81,6 +81,7 @@ class HybridActor(nn.Module):
     takes_pairs: ClassVar[bool] = False
 
     log_min_scale: Tensor
+    log_max_scale: Tensor
     owner: Tensor
 
     def __init__(
@@ -106,13 +107,13 @@ class HybridActor(nn.Module):
         self.num_inputs = specs.observation_dim if self.products is None else self.products.num_outputs
         self.encoder = encoder(self.num_inputs, hidden_dims)
         log_min_scale, log_max_scale = (math.log(scale) for scale in scale_range)
-        self.log_max_scale = log_max_scale
         self.values = ValuePlaces.of(specs) if has_values else None
         if initial_scale is None:
             initial_scale = (scale_range[0] * scale_range[1]) ** 0.5
         fraction = (math.log(initial_scale) - log_min_scale) / (log_max_scale - log_min_scale)
         self.make_heads(specs, hidden_dims[-1], math.log(fraction / (1.0 - fraction)))
         self.register_buffer("log_min_scale", torch.tensor(log_min_scale, dtype=torch.float32))
+        self.register_buffer("log_max_scale", torch.tensor(log_max_scale, dtype=torch.float32), persistent=False)
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
 
     def make_heads(self, specs: PAMDPSpecs, width: int, raw_scale: float) -> None:
@@ -184,6 +185,10 @@ class HybridActor(nn.Module):
     def set_min_scale(self, min_scale: float) -> None:
         """Set the smallest standard deviation."""
         self.log_min_scale.fill_(math.log(min_scale))
+
+    def set_max_scale(self, max_scale: float) -> None:
+        """Set the largest standard deviation. It is not part of the state dict, since a learner knows its schedule."""
+        self.log_max_scale.fill_(math.log(max_scale))
 
 
 class HybridPolicy(TensorDictModuleBase):
