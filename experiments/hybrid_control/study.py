@@ -61,7 +61,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
 
 
 def variant(run: Run) -> str:
-    """Return how a run's action is put together."""
+    """Return the key of a run's variant in `VARIANTS`."""
     low, env = run.config["low"], run.config["env"]
     if env.get("action_form", "components") == "auto":
         return "one choice"
@@ -87,8 +87,8 @@ def table(results: Rows) -> str:
 
 
 def differences(results: Rows) -> str:
-    """Return a line for each variant: its return less that of independent heads."""
-    lines = ["| problem | | less independent heads (95 %) |", "|---|---|---|"]
+    """Return a line for each variant: the difference of its return from that of independent heads."""
+    lines = ["| problem | H-PPO with | difference from independent heads (95 % interval) |", "|---|---|---|"]
     for (problem,), rows in groups(results, "problem").items():
         scores = {name: [row["score"] for row in of_name] for (name,), of_name in groups(rows, "variant").items()}
         plain = scores.pop("independent", [])
@@ -124,7 +124,7 @@ def _draw_panel(axes: Axes, rows: Rows, bar: float) -> None:
 
 
 def play_heuristic() -> str:
-    """Return the mean return of Gymnasium's hand-written player in Hybrid LunarLander."""
+    """Return a line with the mean return of Gymnasium's hand-written player in Hybrid LunarLander."""
     import gymnasium
     from gymnasium.envs.box2d.lunar_lander import heuristic
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -67,9 +68,13 @@ def share_on_crossing(run: Run) -> float:
 
 def tabulate(rows: Rows) -> None:
     """Print a row for each problem and each way to end options."""
-    print("| problem | `agent.termination` | `high` | n | share | 95 % | worst | success | steps | length | CPU |")
-    print("|---|---|---|---|---|---|---|---|---|---|---|")
-    for (env, title), (ends, how) in ((problem, end) for problem in PROBLEMS.items() for end in ENDS.items()):
+    columns = (
+        *("problem", "`agent.termination`", "`high`", "seeds", "of the best return", "95 % interval", "worst seed"),
+        *("success", "steps", "length", "CPU"),
+    )
+    print("| " + " | ".join(columns) + " |")
+    print("|---" * len(columns) + "|")
+    for (env, title), (ends, how) in product(PROBLEMS.items(), ENDS.items()):
         of_ends = [row for row in rows if (row["env"], row["termination"], row["high"]) == (env, *ends)]
         if not of_ends:
             continue
