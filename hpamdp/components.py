@@ -1,7 +1,8 @@
-"""Actions of several components: what lies side by side in logits, values and masks, and what was chosen of it.
+"""Actions of several components: which logits, values and mask entries belong to which component.
 
-A component is one discrete choice, or a box: a choice with one discrete action, which owns the box's parameters. The
-discrete actions of all components lie side by side. What was chosen is numbered from 0 within each component.
+A component is one discrete choice, or a box. A box is a choice with one discrete action, which owns the box's
+parameters. The discrete actions of all components lie side by side in logits, values and masks. A choice is numbered
+from 0 within its component.
 """
 
 from __future__ import annotations
@@ -52,19 +53,19 @@ class Components:
         return torch.stack([part.argmax(-1) for part in values.split(self.sizes, -1)], -1)
 
     def places(self, choice: Tensor) -> Tensor:
-        """Return where the chosen discrete actions lie among all, int64 `[*B, num_components]`."""
+        """Return the places of the chosen discrete actions among all, int64 `[*B, num_components]`."""
         if self.is_single:
             return choice.unsqueeze(-1)
         return choice + torch.tensor(self.starts, device=choice.device)
 
     def exists(self, choice: Tensor) -> Tensor:
-        """Return whether every component of a choice has a number that exists, bool `[*B]`."""
+        """Return whether the discrete action chosen in each component exists, bool `[*B]`."""
         if self.is_single:
             return (choice >= 0) & (choice < self.sizes[0])
         return ((choice >= 0) & (choice < torch.tensor(self.sizes, device=choice.device))).all(-1)
 
     def of_choice(self, values: Tensor, choice: Tensor) -> Tensor:
-        """Return the entries of values `[*B, num_discrete]` that belong to a choice, in the choice's shape."""
+        """Return the values of the chosen discrete actions, given the values of all, `[*B, num_discrete]`."""
         entries = values.gather(-1, self.places(choice))
         return entries.squeeze(-1) if self.is_single else entries
 
@@ -76,20 +77,20 @@ class Components:
         return numbers == choice.index_select(-1, self.component_of(choice.device))
 
     def log_softmax(self, logits: Tensor) -> Tensor:
-        """Return the log-probabilities of each component's discrete actions, of logits `[*B, num_discrete]`."""
+        """Return log-probabilities `[*B, num_discrete]`, normalised within each component, of logits of this shape."""
         if self.is_single:
             return logits.log_softmax(-1)
         return torch.cat([part.log_softmax(-1) for part in logits.split(self.sizes, -1)], -1)
 
     def any_of_each(self, mask: Tensor) -> Tensor:
-        """Return whether a mask bool `[*B, num_discrete]` holds anything of every component, bool `[*B]`."""
+        """Return whether a mask bool `[*B, num_discrete]` allows a discrete action of each component, bool `[*B]`."""
         if self.is_single:
             return mask.any(-1)
         return torch.stack([part.any(-1) for part in mask.split(self.sizes, -1)], -1).all(-1)
 
-    def total(self, each: Tensor) -> Tensor:
-        """Return the sum over components of numbers in a choice's shape, `[*B]`."""
-        return each if self.is_single else each.sum(-1)
+    def total(self, values: Tensor) -> Tensor:
+        """Return the sum over the components, `[*B]`, of one value for each: `[*B]` or `[*B, num_components]`."""
+        return values if self.is_single else values.sum(-1)
 
     def allowed_next(
         self, number: int, is_chosen: Tensor, mask: Tensor | None, pair_mask: Tensor | None

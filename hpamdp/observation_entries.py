@@ -1,4 +1,4 @@
-"""The entries of an observation that holds pictures, and the uint8 form in which such observations are stored."""
+"""Entries of observations with pictures, and how such observations are stored as bytes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ObservationEntry:
 
     @property
     def place(self) -> slice:
-        """Its place in the observation."""
+        """Which numbers of the observation belong to the entry."""
         return slice(self.start, self.start + self.size)
 
     @property
@@ -88,20 +88,23 @@ def observation_dtype(entries: Sequence[ObservationEntry]) -> torch.dtype:
 def packed(observation: Tensor, entries: Sequence[ObservationEntry]) -> Tensor:
     """Return observations `[*B, observation_dim]` with pictures among vectors as bytes, uint8 `[*B, num_bytes]`.
 
-    A pixel takes one byte and another number four. `unpacked` returns the same numbers.
+    A pixel takes one byte, and any other number four. `unpacked` is the inverse.
     """
     parts = []
     for entry in entries:
         part = observation[..., entry.place]
-        parts.append(part.to(torch.uint8) if entry.is_picture else part.float().contiguous().view(torch.uint8))
+        if entry.is_picture:
+            parts.append(part.to(torch.uint8))
+        else:
+            parts.append(part.float().contiguous().view(torch.uint8))
     return torch.cat(parts, -1)
 
 
 def unpacked(stored: Tensor, entries: Sequence[ObservationEntry]) -> Tensor:
     """Return the observations float32 `[*B, observation_dim]` of what `packed` returned."""
     sizes = [entry.size if entry.is_picture else 4 * entry.size for entry in entries]
-    parts = [
-        part.float() if entry.is_picture else part.clone().view(torch.float32)  # a copy lies where floats may lie
-        for entry, part in zip(entries, stored.split(sizes, -1), strict=True)
-    ]
+    parts = []
+    for entry, part in zip(entries, stored.split(sizes, -1), strict=True):
+        # Cloned, because bytes can only be viewed as float32 from an aligned address.
+        parts.append(part.float() if entry.is_picture else part.clone().view(torch.float32))
     return torch.cat(parts, -1)

@@ -1,4 +1,4 @@
-"""Memory: what policies remember, where it begins anew, and how learners are trained on sequences of it."""
+"""Memory: what policies remember, where it is reset, and how learners are trained on sequences of it."""
 
 import itertools
 import shutil

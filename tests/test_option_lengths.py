@@ -403,9 +403,9 @@ def test_an_evaluation_measures_the_mean_length_of_the_options_that_were_chosen(
         ("high=actor data=recorded data.path=x", "agent.termination=chosen: the decisions of data=recorded have no"),
         ("high=actor agent.option_length=3", "agent.option_length=3: goes with agent.termination=steps only"),
         ("high=actor low.freeze=true", "agent.termination=chosen: low.freeze=true plays whole episodes; use"),
-        ("high=actor agent.option_lengths=[1,4,2]", "agent.option_lengths=[1, 4, 2]: must be a list of rising numbers"),
-        ("high=actor agent.option_lengths=[2,2]", "agent.option_lengths=[2, 2]: must be a list of rising numbers"),
-        ("high=actor agent.option_lengths=[]", "agent.option_lengths=[]: must be a list of rising numbers"),
+        ("high=actor agent.option_lengths=[1,4,2]", "agent.option_lengths=[1, 4, 2]: must be increasing numbers"),
+        ("high=actor agent.option_lengths=[2,2]", "agent.option_lengths=[2, 2]: must be increasing numbers"),
+        ("high=actor agent.option_lengths=[]", "agent.option_lengths=[]: must be increasing numbers"),
         ("high=actor agent.option_lengths=[0,1]", "agent.option_lengths.0=0: must be greater than 0"),
         (
             "high=actor agent.termination=steps agent.option_length=2",

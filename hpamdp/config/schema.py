@@ -32,9 +32,9 @@ def _check_device(name: str) -> str:
     return name
 
 
-def _check_rising(lengths: tuple[int, ...]) -> tuple[int, ...]:
+def _check_increasing(lengths: tuple[int, ...]) -> tuple[int, ...]:
     if not lengths or any(one >= two for one, two in pairwise(lengths)):
-        raise ValueError("must be a list of rising numbers")
+        raise ValueError("must be increasing numbers")
     return lengths
 
 
@@ -46,12 +46,12 @@ class AgentConfig(Settings):
     termination: Literal["episode", "steps", "learned", "chosen"] = "episode"
     """When options end: with the episode, after `option_length` steps, or at any step if the selector decides so.
 
-    `chosen`: the selector chooses an option and its length, of `option_lengths`.
+    `chosen`: the selector chooses an option, and its length from `option_lengths`.
     """
     option_length: PositiveInt | None = None
     """Steps of an option, with `termination=steps` only."""
-    option_lengths: Annotated[tuple[PositiveInt, ...], FromList, AfterValidator(_check_rising)] | None = None
-    """Numbers of steps to choose from with `termination=chosen`, rising. If null, 1, 2, 4, 8, 16, 32, 64 and 128."""
+    option_lengths: Annotated[tuple[PositiveInt, ...], FromList, AfterValidator(_check_increasing)] | None = None
+    """With `termination=chosen`: lengths to choose from, in steps, increasing. If null, 1, 2, 4, 8, 16, 32, 64, 128."""
     uniform_option_steps: NonNegativeInt = 0
     """Steps at the start of training in which options are chosen uniformly, so that each option's learner gets data.
 

@@ -70,8 +70,8 @@ class PAMDPEnv(EnvBase):
     figures show it. All of them have defaults.
     """
 
-    # The entries of the observation, in their order, if any of them is a picture. Pixels are whole numbers 0 to 255.
-    # If the constructor takes `flatten_pictures`, and gets true, there are none: pictures are part of the vector.
+    # The entries of the observation, in their order, if any of them is a picture. Pixels are integers from 0 to 255.
+    # Empty if the constructor gets `flatten_pictures=True`, since pictures are then part of the vector.
     observation_entries: tuple[ObservationEntry, ...] = ()
     option_names: tuple[str, ...] = ()
     discrete_names: tuple[str, ...] = ()  # of the discrete actions, if they have names
@@ -216,7 +216,7 @@ class PAMDPEnv(EnvBase):
 
     @property
     def position(self) -> Tensor | None:
-        """Positions of the agents for drawing, `[N, 2]`; None if there are none."""
+        """Positions of the agents for drawing, `[N, 2]`; None if agents have no position."""
         return None
 
     @property

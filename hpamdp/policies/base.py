@@ -21,7 +21,7 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class ActionFeature(Enum):
-    """What an action may have beyond one choice with bounded parameters, and how refusals call it."""
+    """What an action may have beyond one choice with bounded parameters, and its name in refusals."""
 
     COMPONENTS = "an action of several components"
     PAIR_MASK = "a pair_mask, which forbids pairs of discrete actions"
@@ -428,13 +428,13 @@ class Learner(Level, nn.Module):
         policy: the module that acts.
         modes: what the learner can learn from: transitions that the agent collects (`train`), or a data set
             (`offline`, for `mode=offline` and for `data=...` with `mode=train`).
-        takes: what actions may have that the learner knows how to handle. Problems with anything else are refused. With
-            several components, see `hpamdp.components`; with `PARAMETER_BOUNDS`, hand the step to `specs.from_unit` and
+        takes: the features of actions that the learner can handle. Problems with other features are refused. With
+            `COMPONENTS`, see `hpamdp.components`. With `PARAMETER_BOUNDS`, pass the step to `specs.from_unit` and
             `specs.to_unit`.
         value_setting: setting that must be true for `value` to work. If None, `value` always works.
-        memory_key: under which the policy's memory of earlier observations lies in a step, if `value` depends on it.
+        memory_key: key of the memory's state in a step, if the policy and `value` have a memory; else None.
         progress: the buffers, by the last part of their names, that count the steps of a run, or follow from such
-            counters. They start afresh if a new run takes over the learner.
+            counters. They are reset if a new run takes over the learner.
         next_options: which options follow one that ended, and their values. The agent sets it.
         while_compiling: gives a context for updates that are compiled first, which takes seconds. The run sets it.
     """
@@ -467,8 +467,12 @@ class Learner(Level, nn.Module):
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the values `[N]` of states `[N, observation_dim]` from which this learner would bootstrap.
 
-        Target networks give the value, if the learner has any. A learner with a `memory_key` takes the further
-        arguments `memory`, `[N, *]`, and `has_seen`, see `NextOptions.value`.
+        Target networks give the value, if the learner has any.
+
+        A learner that can have a memory also takes `memory`, as the next argument, and the keyword `has_seen`. They are
+        passed only if it has a `memory_key`, so learners without a memory need not take them. `memory` is the state of
+        its memory in these states, `[N, size]`; if None, the memory is empty. `has_seen` says whether the memory has
+        seen the observations already, as that of a stored step has.
 
         Args:
             observation: of the states.

@@ -1,4 +1,4 @@
-"""Pairs of an option and its length, from which a selector chooses as from options.
+"""Let a selector choose an option together with its length: it chooses among their pairs as among options.
 
 Source: Henaff, Fujimoto, Matthews and Rabbat 2025, *Scalable Option Learning in High-Throughput Environments*, arXiv
 2509.00338, whose high level chooses an option and a power of two, up to 128, as its length.
@@ -23,7 +23,7 @@ from hpamdp import keys
 from hpamdp.policies.base import Selector
 from hpamdp.specs import PAMDPSpecs
 
-# Largest length, and its halves, if `agent.option_lengths` names none.
+# The lengths of the source, if `agent.option_lengths` is not set.
 DEFAULT_LENGTHS = (1, 2, 4, 8, 16, 32, 64, 128)
 
 
@@ -35,7 +35,7 @@ class OptionLengths(nn.Module):
     learners see `option` and `option_length`.
 
     Args:
-        lengths: numbers of steps, positive and rising.
+        lengths: numbers of steps, positive and increasing.
     """
 
     lengths: Tensor
@@ -43,7 +43,7 @@ class OptionLengths(nn.Module):
     def __init__(self, lengths: Sequence[int]) -> None:
         super().__init__()
         self.longest = max(lengths)
-        # A part of the checkpoint would be a second place for a setting.
+        # Not persistent, since the lengths are a setting, which the checkpoint already holds.
         self.register_buffer("lengths", torch.tensor(lengths, dtype=torch.long), persistent=False)
 
     def extra_repr(self) -> str:
@@ -60,7 +60,7 @@ class OptionLengths(nn.Module):
         option, length = rows.get(keys.OPTION, None), rows.get(keys.OPTION_LENGTH, None)
         if option is not None and length is not None:
             rows.set(keys.OPTION, option * len(self.lengths) + torch.searchsorted(self.lengths, length))
-        elif option is not None:  # without a length no pair is held
+        elif option is not None:  # an option without a length is no pair that the selector could hold
             rows = rows.exclude(keys.OPTION)
         for name in (keys.OPTION_MASK, ("next", keys.OPTION_MASK)):
             mask = rows.get(name, None)
@@ -79,7 +79,7 @@ class PairSelector(TensorDictModuleBase):
 
     Args:
         selector: chooses among the pairs.
-        pairs: their numbers.
+        pairs: numbers the pairs.
     """
 
     def __init__(self, selector: Selector, pairs: OptionLengths) -> None:

@@ -26,26 +26,31 @@ class LunarLanderOptions(Settings):
     max_steps: PositiveInt = MAX_STEPS
     """Steps after which an episode is truncated."""
     gravity: Annotated[float, Field(gt=-12.0, lt=0.0)] = -10.0
-    """Acceleration by gravity."""
+    """Gravity in Box2D's units, negative downwards."""
     enable_wind: bool = False
-    """Blow the lander about, more strongly or less."""
+    """Whether wind pushes and turns the lander, with a strength that changes from step to step."""
     wind_power: NonNegativeFloat = 15.0
-    """Largest force of the wind."""
+    """With `enable_wind`: largest force of the wind."""
     turbulence_power: NonNegativeFloat = 1.5
-    """Largest torque of the wind."""
+    """With `enable_wind`: largest torque of the wind."""
     render: bool = False
     """Draw the lander, for films; steps then take longer."""
     reward_scaling: PositiveFraction | None = None
-    """Divide rewards in training by the running deviation of the return with this discount. If None, they stay."""
+    """Divide rewards in training by the running standard deviation of the return with this discount.
+
+    If None, rewards are not scaled.
+    """
     num_workers: NonNegativeInt = 0
-    """Processes that step the landers at the same time. If 0, this process steps them."""
+    """Processes that step the environments in parallel. If 0, this process steps them."""
 
 
 class LunarLanderEnv(GymnasiumEnv):
     """Land `num_envs` landers at once, with two components: the main engine and the side engines.
 
-    Action leaves: `("action", "discrete")` int64 `[N, 2]`: 0 off, 1 on; 0 off, 1 left, 2 right; `("action",
-    "parameters")` float32 `[N, 3]`: the throttles of `main`, `left` and `right`, in [0.5, 1].
+    Action leaves:
+
+    - `("action", "discrete")` int64 `[N, 2]`: main engine 0 off, 1 on; side engines 0 off, 1 left, 2 right;
+    - `("action", "parameters")` float32 `[N, 3]`: the throttles of `main`, `left` and `right`, in [0.5, 1].
 
     The dynamics, the observations and the rewards are those of Gymnasium's LunarLanderContinuous-v3; observations are
     not scaled. See `HybridLunarLander`, and `GymnasiumEnv` for the arguments and the errors.
@@ -68,7 +73,7 @@ class LunarLanderEnv(GymnasiumEnv):
     ) -> None:
         given = LunarLanderOptions.of(options, settings)
         lander = {name: getattr(given, name) for name in ("gravity", "enable_wind", "wind_power", "turbulence_power")}
-        # Its own bounds are exceeded now and then, and its numbers have the size of 1 already.
+        # LunarLander's observations are already of order 1, and sometimes exceed the bounds that it declares.
         reading = GymnasiumOptions(
             max_steps=given.max_steps,
             observation_scaling="none",
@@ -77,7 +82,7 @@ class LunarLanderEnv(GymnasiumEnv):
             num_workers=given.num_workers,
         )
         make = partial(HybridLunarLander, render_mode="rgb_array" if given.render else None, **lander)
-        update_wrapper(make, HybridLunarLander)  # errors call it by its name
+        update_wrapper(make, HybridLunarLander)  # so that errors name HybridLunarLander
         super().__init__(
             num_envs,
             make=make,
@@ -89,7 +94,7 @@ class LunarLanderEnv(GymnasiumEnv):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem: there are no options."""
+        """Return the facts about the problem under these settings."""
         return ProblemFacts(
             title=cls.__name__,
             is_shardable=options.num_workers == 0,
@@ -97,5 +102,5 @@ class LunarLanderEnv(GymnasiumEnv):
         )
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return Gymnasium's bar for a solution, and its hand-written player with the default settings."""
+        """Return the return that Gymnasium counts as solved, and its hand-written player with the default settings."""
         return {"solved": {"score": SOLVED}, "heuristic": HEURISTIC}

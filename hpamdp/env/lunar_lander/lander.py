@@ -15,10 +15,10 @@ SOLVED = 200.0
 
 _NONE = spaces.Box(0.0, 1.0, (0,), np.float32)
 _THROTTLE = spaces.Box(0.5, 1.0, (1,), np.float32)
-# The dynamics take 0 of the main engine and 0.5 of the side engines for off.
+# The dynamics switch an engine off at 0 (main) and at 0.5 (side), so the lowest throttles lie just above.
 _LEAST_MAIN = np.float32(1e-6)
 _LEAST_SIDE = np.nextafter(np.float32(0.5), np.float32(1.0))
-_SIDES = (0.0, -1.0, 1.0)  # off, left, right, as LunarLander signs them
+_SIDES = (0.0, -1.0, 1.0)  # signs of off, left and right in LunarLander's action
 
 
 class HybridLunarLander(gymnasium.Wrapper):
@@ -32,11 +32,11 @@ class HybridLunarLander(gymnasium.Wrapper):
     - `main`: off, or on with a throttle in [0.5, 1];
     - `side`: off, left or right, with a throttle in [0.5, 1] each.
 
-    The info of a step has `is_success`: whether the return so far is at least 200, Gymnasium's bar for a solution.
+    The info of a step has `is_success`: whether the return so far is at least 200, which Gymnasium counts as solved.
 
     Args:
         render_mode: None or `rgb_array`.
-        settings: what LunarLander takes besides: `gravity`, `enable_wind`, `wind_power`, `turbulence_power`.
+        settings: further arguments of LunarLander: `gravity`, `enable_wind`, `wind_power`, `turbulence_power`.
 
     Raises:
         SettingError: Box2D is not installed.
@@ -67,7 +67,7 @@ class HybridLunarLander(gymnasium.Wrapper):
 
 
 def continuous_action(action: dict[str, Any]) -> np.ndarray:
-    """Return the action of LunarLanderContinuous-v3 that fires the same engines as strongly, float32 `[2]`."""
+    """Return the action of LunarLanderContinuous-v3 that fires the same engines equally strongly, float32 `[2]`."""
     (main, of_main), (side, of_side) = action["main"], action["side"]
     lift, push = np.float32(-1.0), np.float32(0.0)
     if main:
@@ -78,7 +78,7 @@ def continuous_action(action: dict[str, Any]) -> np.ndarray:
 
 
 def hybrid_action(action: np.ndarray) -> dict[str, Any]:
-    """Return the action of `HybridLunarLander` that fires the same engines as an action of LunarLanderContinuous-v3."""
+    """Return the action of `HybridLunarLander` with the same effect as an action of LunarLanderContinuous-v3."""
     lift, push = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
     main = int(lift > 0.0)
     side = 0 if abs(push) <= 0.5 else 1 + int(push > 0.0)

@@ -1,4 +1,4 @@
-"""The contract of encoders, and the module that joins what they make of an observation."""
+"""The contract of encoders, and the module that concatenates the features of all entries of an observation."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from torch import Tensor, nn
 from hpamdp.observation_entries import ObservationEntry
 from hpamdp.specs import PAMDPSpecs
 
-# Rows that are encoded at once where no gradient is needed. In larger pieces the CPU waits for its memory.
+# Rows that are encoded at once if no gradient is needed. Larger pieces are slower on a CPU: they exceed its caches.
 _PIECE = 256
 
 
 class Encoder(nn.Module):
-    """Turns pictures, an entry of the observation, into features.
+    """Turns one entry of the observation, a picture, into features.
 
     A learner makes one encoder for each entry that is a picture, and trains it together with its own networks. Vectors
-    pass as they are::
+    are passed on unchanged::
 
         class Downscaled(Encoder):  # mean colours of 8 x 8 areas
             def __init__(self, entry: ObservationEntry) -> None:
@@ -33,9 +33,9 @@ class Encoder(nn.Module):
     arguments. Their names and types are the schema of the encoder's yaml in `conf/encoder`.
 
     Attributes:
-        entry: the entry.
+        entry: name, place and shape of the picture in the observation.
         num_features: number of features. A subclass sets it.
-        flattens: whether a run with this choice makes pictures part of the vector, so that nothing is left to encode.
+        flattens: if true, the environment makes pictures part of the vector, and no encoder is made.
         guarded_settings: settings that can run code, read files or reach servers.
     """
 
@@ -58,14 +58,14 @@ class Encoder(nn.Module):
 
 
 class JoinedEncoders(nn.Module):
-    """The features of all entries of an observation, side by side; the one-hot option stays at the end.
+    """Concatenates the features of all entries of an observation; the one-hot option stays at the end.
 
     Args:
         specs: of the learner or the selector. `specs.encoder` makes the encoders; by default a `CNN` for each picture.
 
     Attributes:
-        feature_specs: the specs with the features as observation. The problem's initial parameters, symmetries and
-            geometry are of observations, so there are none.
+        feature_specs: the specs with the features as observation. They have no initial parameters, symmetries or
+            geometry, because problems declare these of observations.
     """
 
     def __init__(self, specs: PAMDPSpecs) -> None:

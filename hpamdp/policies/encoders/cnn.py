@@ -24,9 +24,14 @@ from hpamdp.observation_entries import ObservationEntry
 from hpamdp.policies.encoders.base import Encoder
 from hpamdp.settings import FromList, SettingError, Settings
 
-_NATURE_KERNELS, _NATURE_STRIDES, _NATURE_CHANNELS, _NATURE_FEATURES = [8, 4, 3], [4, 2, 1], (32, 64, 64), 512
-_IMPALA_CHANNELS, _IMPALA_FEATURES = (16, 32, 32), 256
-_NATURE_SMALLEST = 36  # px that leave something to the last layer
+_NATURE_KERNELS = [8, 4, 3]
+_NATURE_STRIDES = [4, 2, 1]
+_NATURE_CHANNELS = (32, 64, 64)
+_NATURE_FEATURES = 512
+_NATURE_SMALLEST = 36  # px a side; of smaller pictures nothing is left for the last convolution
+
+_IMPALA_CHANNELS = (16, 32, 32)
+_IMPALA_FEATURES = 256
 
 Channels = Annotated[tuple[PositiveInt, PositiveInt, PositiveInt], FromList]
 
@@ -40,9 +45,12 @@ class CNNOptions(Settings):
     `auto`: `impala` for pictures below 36 px a side, which are too small for `nature`, else `nature`.
     """
     channels: Channels | None = None
-    """Channels of the three layers or stages. If null, those of the papers: [32, 64, 64] and [16, 32, 32]."""
+    """Channels of the three layers or stages. If null, those of the papers.
+
+    `nature`: [32, 64, 64]; `impala`: [16, 32, 32].
+    """
     num_features: Annotated[int, Field(ge=1, le=65536)] | None = None
-    """Number of features of a picture. If null, those of the papers: 512 and 256."""
+    """Number of features of a picture. If null, those of the papers: 512 for `nature`, 256 for `impala`."""
 
 
 class CNN(Encoder):
@@ -61,7 +69,8 @@ class CNN(Encoder):
                 f"{height} x {width}; use net=impala"
             )
         is_nature = options.net == "nature" or (options.net == "auto" and not is_small)
-        if is_nature:  # float32 whatever torch's default dtype is, which ConvNet cannot be told
+        if is_nature:
+            # ConvNet has no argument for its dtype, so it is converted: torch's default dtype may be another one.
             net: nn.Module = ConvNet(
                 channels,
                 num_cells=list(options.channels or _NATURE_CHANNELS),

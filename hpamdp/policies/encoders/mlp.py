@@ -1,4 +1,4 @@
-"""Pictures as vectors: the user asks for a flattened picture."""
+"""Flattened pictures, for learners that read vectors."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from hpamdp.policies.encoders.base import Encoder
 
 
 class MLP(Encoder):
-    """Make pictures part of the vector, which each learner and selector reads by its own networks.
+    """Makes pictures part of the vector, which each learner and selector reads by its own networks.
 
-    There are no weights of its own. The replay buffers hold the pixels as float32.
+    It has no weights. Replay buffers hold the pixels as float32.
     """
 
     flattens: ClassVar[bool] = True

@@ -1,7 +1,7 @@
 """H-PPO: proximal policy optimisation with a discrete actor and a continuous actor for the parameters.
 
-Both actors share an encoder, and one critic V(s) serves both. Each actor has its own probability ratio and its own
-clipped surrogate. The ratio of the parameters covers only the chosen action's own parameters.
+Both actors share their hidden layers, and one critic V(s) serves both. Each actor has its own probability ratio and its
+own clipped surrogate. The ratio of the parameters covers only the chosen action's own parameters.
 
 Source: Fan, Su, Zhang and Yu, *Hybrid Actor-Critic Reinforcement Learning in Parameterized Action Space*, 2019, arXiv
 1903.01344, section 4; PPO: Schulman, Wolski, Dhariwal, Radford and Klimov 2017, arXiv 1707.06347, equation 7; GAE:
@@ -40,7 +40,7 @@ from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.credit import Credit, CreditCritic
 from hpamdp.policies.shared.default_dtype import float32_by_default
 from hpamdp.policies.shared.exported_policy import exported_actor
-from hpamdp.policies.shared.hybrid_actor import RAW, HeadOptions, HybridActor, HybridPolicy, encoder
+from hpamdp.policies.shared.hybrid_actor import RAW, HeadOptions, HybridActor, HybridPolicy, hidden_layers
 from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.policies.shared.memory import MemoryOptions
 from hpamdp.policies.shared.networks import InitialParameters
@@ -50,7 +50,7 @@ from hpamdp.policies.shared.sequences import sequence_starts
 from hpamdp.settings import Fraction, LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
 
-# What the other components contributed to a step's return, for the credit of each.
+# For each component, the part of a step's advantage that the other components contributed.
 BASELINE = "credit_baseline"
 
 
@@ -58,7 +58,7 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     """Settings of `HPPO`. Standard deviations are in units where the parameters' bounds are [-1, 1]."""
 
     hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
-    """Hidden layers of the encoder that both actors share."""
+    """Hidden layers that both actors share."""
     critic_hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
     """Hidden layers of the critic."""
     vector_products: bool = False
@@ -102,10 +102,10 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     max_grad_norm: PositiveFloat = 1.0
     """Largest gradient norm, of actors and critic together."""
     credit: Credit = "joint"
-    """Advantage of each component of an action: `joint` gives the action's to all of them.
+    """Advantage of each component of an action. `joint`: the advantage of the action.
 
-    `summed` and `mixed` subtract what the other components contributed, by a critic of contributions that are summed,
-    or mixed by a network.
+    `summed` and `mixed` subtract what the other components contributed to it. A critic learns the contributions, whose
+    sum (`summed`) or monotonic function (`mixed`) is the advantage of the action.
     """
     greedy_discrete: Literal["most_probable", "sampled"] = "most_probable"
     """Discrete action of the greedy policy; its parameters are the means. `sampled` draws it, as in the published code.
@@ -171,7 +171,7 @@ class HPPO(OnPolicy, Learner):
         products = [] if self.actor.products is None else [self.actor.products]
         self.critic = nn.Sequential(
             *products,
-            encoder(self.actor.num_inputs, options.critic_hidden_dims),
+            hidden_layers(self.actor.num_inputs, options.critic_hidden_dims),
             nn.Linear(options.critic_hidden_dims[-1], 1, dtype=torch.float32),
         )
         has_credit = options.credit != "joint" and not specs.components.is_single
@@ -337,7 +337,7 @@ class HPPO(OnPolicy, Learner):
         *,
         has_seen: bool = False,
     ) -> Tensor:
-        """Return V(s), `[N]`, given what the policy remembers there; see `NextOptions.value`."""
+        """Return V(s), `[N]`, given the memory in these states; see `Learner.value`."""
         return self.critic(self.perception(observation, memory, has_seen=has_seen)).squeeze(-1)
 
     def features(self, rows: Mapping[str, Tensor]) -> Tensor:
@@ -384,7 +384,7 @@ class HPPO(OnPolicy, Learner):
         return value.reshape(*option.shape, 1)
 
     def _held_on(self, batch: TensorDictBase) -> Tensor | None:
-        """Return the memories `[*B, T, size]` with which learners go on; zeros where they begin anew."""
+        """Return the memories `[*B, T, size]` for the values of the next states; zeros where an option has ended."""
         if self.memory_key is None:
             return None
         memory: Tensor = batch.get(self.memory_key)

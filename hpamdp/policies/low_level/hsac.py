@@ -13,8 +13,8 @@ Differs from the source:
 - Each temperature has a target entropy: a fraction of the uniform distribution's for the discrete action, and nats for
   each parameter of the executed action. So actions with more parameters, or none, need no target of their own.
 - The actor and the temperatures may be updated less often than the critics, as in TD3 (arXiv 1802.09477).
-- If an action has several components, the expectation over all discrete actions would be a sum over their products. The
-  soft value is then the mean of `component_samples` actions, whose values come from critics of the action as a whole.
+- If an action has several components, the expectation over all discrete actions would be a sum over all combinations.
+  The soft value is then the mean of `component_samples` sampled actions, and the critics value the action as a whole.
   The discrete heads get a policy gradient with the other samples' mean as its baseline (Kool, van Hoof and Welling
   2019, *Buy 4 REINFORCE Samples, Get a Baseline for Free!*), the parameters a gradient through the critics.
 
@@ -88,7 +88,7 @@ class HSACOptions(HeadOptions, ReplayMemoryOptions, ActorCriticOptions, TargetRa
     policy_delay: PositiveInt = 2
     """Critic updates for each update of the actor and the temperatures."""
     component_samples: Annotated[int, Field(ge=2, le=64)] = 4
-    """Sampled actions in the soft value of a state, if an action has several components."""
+    """Actions sampled in each state to estimate its soft value, if an action has several components."""
 
 
 class HSACActor(nn.Module):
@@ -253,7 +253,7 @@ class HSAC(ReplayLearner):
     ) -> Tensor:
         """Return the soft value V'(s) by the target critics, `[B]`; the actor, too, sees the target's features.
 
-        `NextOptions.value` explains `memory` and `has_seen`.
+        `Learner.value` explains `memory` and `has_seen`.
         """
         allowed = self.specs.allowed(observation, action_mask)
         features = self.target_perception(observation, memory, has_seen=has_seen)

@@ -310,8 +310,8 @@ class PDQN(ReplayLearner):
     ) -> Tensor:
         """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`; the sum over the components.
 
-        With `double_q`, the learned critics choose k instead of the target critics. `NextOptions.value` explains
-        `memory` and `has_seen`.
+        With `double_q`, the learned critics choose k instead of the target critics. `Learner.value` explains `memory`
+        and `has_seen`.
         """
         smoothing = self.options.target_smoothing, self.options.target_smoothing_clip
         state = self.target_perception(observation, memory, has_seen=has_seen)

@@ -21,7 +21,7 @@ def _clipped(raw: Tensor) -> Tensor:
 
 
 class AutoregressiveActor(HybridActor):
-    """Heads in a row: each component sees what the components before it have chosen, and their own parameters.
+    """One head after another: each component sees the choices of those before it, and the parameters of these choices.
 
     Independent heads cannot represent that components depend on each other, as where two of them must match.
 
@@ -41,7 +41,7 @@ class AutoregressiveActor(HybridActor):
         self.bound = bound
 
     def make_heads(self, specs: PAMDPSpecs, width: int, raw_scale: float) -> None:
-        """Make a head for each component on an encoder's output; deviations start at sigmoid(raw_scale)."""
+        """Make a head for each component on the hidden layers; see `HybridActor.make_heads`."""
         self.in_cells = specs.in_cells
         sizes = self.components.sizes
         dims = torch.tensor(specs.parameter_dims).split(sizes)
@@ -67,7 +67,10 @@ class AutoregressiveActor(HybridActor):
     def given(
         self, observation: Tensor, discrete: Tensor, raw: Tensor, mask: Tensor | None, pair_mask: Tensor | None
     ) -> HybridDistribution:
-        """Return each component's distribution given the choices of the components before it."""
+        """Return each component's distribution given the choices of the components before it.
+
+        `draw` ignores the distribution, and takes the next component's part of the given action.
+        """
         chosen = iter(zip(self._choices(discrete), raw.split(self.parameter_sizes, -1), strict=True))
         _, _, distribution = self.act(lambda _: next(chosen), observation, mask, pair_mask)
         return distribution
@@ -118,14 +121,13 @@ class AutoregressiveActor(HybridActor):
 
     def _joined(self, parts: Sequence[HybridDistribution]) -> HybridDistribution:
         """Return the distributions of the components as one."""
-        log_probs, mean, log_scale = (
-            torch.cat([part[column] for part in parts], -1)  # type: ignore[misc]
-            for column in range(3)
-        )
+        log_probs = torch.cat([part.discrete_log_probs for part in parts], -1)
+        mean = torch.cat([part.mean for part in parts], -1)
+        log_scale = torch.cat([part.log_scale for part in parts], -1)
         values = None
         if self.values is not None:
-            known = [part.values.log_probs for part in parts if part.values is not None]
-            values = self.values.joined(torch.cat(known, -2))
+            of_parts = [part.values.log_probs for part in parts if part.values is not None]
+            values = self.values.joined(torch.cat(of_parts, -2))
         return HybridDistribution(log_probs, mean, log_scale, self.owner, self.components, values)
 
 

@@ -1,4 +1,4 @@
-"""Credit for each component of an action: a critic that says what each of them contributed to the return.
+"""Credit for each component of an action: a critic estimates what each component contributed to the return.
 
 Source: Flavin and Sen 2026, *Revisiting Action Factorization for Complex Action Spaces*, arXiv 2606.26574 (a branching
 critic for PPO whose branches are summed, VDN-PPO, or mixed, PPO-MIX). Sum: Sunehag et al. 2018, arXiv 1706.05296.
@@ -6,7 +6,7 @@ Monotonic mixing: Rashid et al. 2018, *QMIX*, arXiv 1803.11485, section 4.
 
 Differs from the source: what the other components contributed is subtracted from the advantage as a baseline (Wu et al.
 2018, *Variance Reduction for Policy Gradient with Action-Dependent Factorized Baselines*, arXiv 1803.07246). So errors
-of this critic add variance, and no bias.
+of this critic add variance, but no bias.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.policies.shared.networks import HybridCritics
 from hpamdp.specs import PAMDPSpecs
 
-# How components share the credit: all get the whole advantage, or the critic's branches are summed or mixed.
+# `joint`: every component gets the whole advantage. Otherwise the branches of a `CreditCritic` are summed or mixed.
 Credit = Literal["joint", "summed", "mixed"]
 
 _MIXING_UNITS = 32
@@ -36,7 +36,7 @@ class CreditCritic(nn.Module):
     Args:
         specs: of what the networks see.
         hidden_dims: hidden layers of the branches.
-        credit: `summed` or `mixed`; mixed by a network that increases with each contribution.
+        credit: `summed`, or `mixed` by a network that is monotonic in each contribution.
     """
 
     def __init__(self, specs: PAMDPSpecs, hidden_dims: Sequence[int], credit: Credit) -> None:
@@ -46,6 +46,7 @@ class CreditCritic(nn.Module):
         self.is_mixed = credit == "mixed"
         if self.is_mixed:
             num = len(self.components.sizes)
+            # Weights and bias of the mixing network's hidden layer, and weights of its output.
             self.sizes = [num * _MIXING_UNITS, _MIXING_UNITS, _MIXING_UNITS]
             self.hyper = nn.Linear(specs.observation_dim, sum(self.sizes), dtype=torch.float32)
 
@@ -67,17 +68,19 @@ class CreditCritic(nn.Module):
         return self.components.of_choice(q, discrete) - by_component
 
     def total(self, features: Tensor, contributions: Tensor) -> Tensor:
-        """Return the advantages `[B]` that contributions `[B, num_components]` make together."""
+        """Return the advantages `[B]`, given contributions `[B, num_components]`; 0 if all of these are 0."""
         if not self.is_mixed:
             return contributions.sum(-1)
-        weight, bias, last = self.hyper(features).split(self.sizes, -1)
+        weight, bias, out_weight = self.hyper(features).split(self.sizes, -1)
         weight = weight.abs().unflatten(-1, (contributions.shape[-1], _MIXING_UNITS))
-        hidden = F.elu(torch.einsum("bc,bch->bh", contributions, weight) + bias) - F.elu(bias)
-        return (hidden * last.abs()).sum(-1)
+        mixed = torch.einsum("bc,bch->bh", contributions, weight)
+        hidden = F.elu(mixed + bias) - F.elu(bias)
+        return (hidden * out_weight.abs()).sum(-1)
 
     def baselines(self, features: Tensor, contributions: Tensor) -> Tensor:
-        """Return for each component what the others contributed without it, `[B, num_components]`."""
+        """Return for each component the advantage of the others' contributions alone, `[B, num_components]`."""
         num = contributions.shape[-1]
-        without = contributions.unsqueeze(1) * (1.0 - torch.eye(num, device=contributions.device, dtype=torch.float32))
+        is_other = 1.0 - torch.eye(num, device=contributions.device, dtype=torch.float32)
+        of_others = contributions.unsqueeze(1) * is_other
         repeated = features.unsqueeze(1).expand(-1, num, -1)
-        return self.total(repeated.flatten(0, 1), without.flatten(0, 1)).unflatten(0, (-1, num))
+        return self.total(repeated.flatten(0, 1), of_others.flatten(0, 1)).unflatten(0, (-1, num))

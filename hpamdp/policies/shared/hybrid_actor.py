@@ -31,7 +31,10 @@ class HeadOptions(Settings):
     """How the components of an action depend on each other."""
 
     autoregressive: bool = False
-    """Let each component of an action see what the components before it chose; else they are independent in a state."""
+    """Let each component of an action see the choices of the components before it.
+
+    If false, the components are independent given the state.
+    """
 
 
 class ScaleOptions(Settings):
@@ -55,27 +58,28 @@ class ScaleOptions(Settings):
 
 
 class HybridActor(nn.Module):
-    """A discrete head and a parameter head on one encoder, nearly uniform and centred at initialisation.
+    """A discrete head and a parameter head on shared hidden layers, nearly uniform and centred at initialisation.
 
     Given the state, the components of an action are independent.
 
     Args:
         specs: sizes and bounds of the problem.
-        hidden_dims: sizes of the encoder's layers.
+        hidden_dims: sizes of the hidden layers.
         scale_range: smallest and largest standard deviation, in units where the bounds are [-1, 1].
         initial_scale: standard deviation at initialisation, strictly within `scale_range`; if None, its geometric mean.
         initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
-        vector_products: whether the encoder also sees `VectorProducts`.
-        has_values: whether parameters with at most `MAX_VALUES` whole numbers have a categorical.
+        vector_products: whether the hidden layers also see `VectorProducts`.
+        has_values: whether integer parameters with at most `MAX_VALUES` values have a categorical.
 
     Attributes:
-        products: appends these products to observations; None if there are none.
-        num_inputs: how many numbers the encoder sees.
-        values: places and numbers of values of the parameters with a categorical; None if there are none.
-        takes_pairs: whether it heeds a `pair_mask`.
+        products: appends vector products to observations; None without `vector_products`.
+        num_inputs: how many numbers the hidden layers see.
+        encoder: the hidden layers. Unlike `perception.encoder`, they encode no pictures.
+        values: places of the parameters with a categorical; None if no parameter has one.
+        takes_pairs: whether it follows a `pair_mask`.
 
     Raises:
-        SettingError: the problem has a `pair_mask`, which the actor cannot heed.
+        SettingError: the problem has a `pair_mask`, which the actor cannot follow.
     """
 
     takes_pairs: ClassVar[bool] = False
@@ -105,7 +109,7 @@ class HybridActor(nn.Module):
         self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
         self.products = VectorProducts(specs) if vector_products else None
         self.num_inputs = specs.observation_dim if self.products is None else self.products.num_outputs
-        self.encoder = encoder(self.num_inputs, hidden_dims)
+        self.encoder = hidden_layers(self.num_inputs, hidden_dims)
         log_min_scale, log_max_scale = (math.log(scale) for scale in scale_range)
         self.values = ValuePlaces.of(specs) if has_values else None
         if initial_scale is None:
@@ -117,7 +121,7 @@ class HybridActor(nn.Module):
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
 
     def make_heads(self, specs: PAMDPSpecs, width: int, raw_scale: float) -> None:
-        """Make the heads on an encoder's output of this width; their deviations start at sigmoid(raw_scale)."""
+        """Make the heads on hidden layers of this width; `log_scale(raw_scale)` is their initial log-scale."""
         self.discrete_head = nn.Linear(width, specs.num_discrete, dtype=torch.float32)
         self.parameter_head = nn.Linear(width, 2 * specs.num_parameters, dtype=torch.float32)
         heads = [self.discrete_head, self.parameter_head]
@@ -146,11 +150,11 @@ class HybridActor(nn.Module):
         return HybridDistribution(log_probs, mean, self.log_scale(raw_scale), self.owner, self.components, values)
 
     def hidden(self, observation: Tensor) -> Tensor:
-        """Return the encoder's output for observations `[*B, observation_dim]`."""
+        """Return the output of the hidden layers for observations `[*B, observation_dim]`."""
         return self.encoder(observation if self.products is None else self.products(observation))
 
     def log_scale(self, raw_scale: Tensor) -> Tensor:
-        """Return the logarithms of standard deviations, of a head's outputs."""
+        """Return the logarithms of standard deviations, given a head's outputs."""
         return self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
 
     def given(
@@ -244,7 +248,7 @@ def make_small(head: nn.Linear) -> None:
         head.bias.zero_()
 
 
-def encoder(in_dim: int, hidden_dims: Sequence[int]) -> nn.Sequential:
+def hidden_layers(in_dim: int, hidden_dims: Sequence[int]) -> nn.Sequential:
     """Return ReLU layers with orthogonal initial weights, for heads to stand on."""
     layers: list[nn.Module] = []
     for layer_in, layer_out in pairwise([in_dim, *hidden_dims]):

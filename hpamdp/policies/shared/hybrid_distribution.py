@@ -14,7 +14,7 @@ from hpamdp.components import Components
 from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.specs import PAMDPSpecs
 
-# A parameter with at most this many whole numbers has a categorical; one with more has a Gaussian, and is rounded.
+# An integer parameter with at most this many values has a categorical. With more it has a Gaussian, and is rounded.
 MAX_VALUES = 32
 
 
@@ -34,7 +34,7 @@ class HybridDistribution(NamedTuple):
         log_scale: logarithm of their standard deviation, `[*B, num_parameters]`.
         owner: the discrete action that each parameter belongs to, int64 `[num_parameters]`.
         components: of the action.
-        values: distributions of the parameters with few whole numbers; None if there are none.
+        values: categoricals of the integer parameters with few values; None if no parameter has one.
     """
 
     discrete_log_probs: Tensor
@@ -56,7 +56,7 @@ class HybridDistribution(NamedTuple):
     def mode(self) -> tuple[Tensor, Tensor]:
         """Return the most probable discrete action `[*B]` and the mean raw parameters `[*B, num_parameters]`.
 
-        Parameters with few whole numbers have the most probable one.
+        Parameters with a categorical take the most probable value.
         """
         return self.components.best(self.discrete_log_probs), self._central()
 
@@ -108,10 +108,10 @@ class HybridDistribution(NamedTuple):
         return discrete_entropy, (probs.index_select(-1, self.owner) * parameter_entropy).sum(-1)
 
     def sum_of_own(self, values: Tensor) -> Tensor:
-        """Return the sums over each discrete action's own parameters, `[*B, num_discrete]`, of values of all of them.
+        """Return the sum of the numbers of each discrete action's own parameters, `[*B, num_discrete]`.
 
         Args:
-            values: `[*B, num_parameters]`.
+            values: a number for each parameter, `[*B, num_parameters]`.
         """
         return torch.zeros_like(self.discrete_log_probs).index_add(-1, self.owner, values)
 
@@ -126,15 +126,15 @@ class HybridDistribution(NamedTuple):
 
 
 class ValueDistribution(NamedTuple):
-    """Categoricals over the values of the parameters that are whole numbers and have few of them.
+    """Categoricals over the values of the integer parameters with few values.
 
     A raw parameter is the middle of its value's cell in [-1, 1], see `PAMDPSpecs.from_unit`.
 
     Attributes:
-        log_probs: of the values, `[*B, I, V]`, with V the largest number of values. A parameter's own come
-            first; the others have probability 0.
-        places: of the I parameters among all, int64 `[I]`.
-        counts: their numbers of values, `[I]`.
+        log_probs: log-probabilities of the values of these I parameters, `[*B, I, V]`, with V the largest number of
+            values. If a parameter has fewer, the last entries have probability 0.
+        places: places of the I parameters among all, int64 `[I]`.
+        counts: numbers of values of the I parameters, `[I]`.
     """
 
     log_probs: Tensor
@@ -142,21 +142,22 @@ class ValueDistribution(NamedTuple):
     counts: Tensor
 
     def sampled(self, raw: Tensor) -> Tensor:
-        """Return raw parameters `[*B, num_parameters]` with sampled values in their places."""
+        """Return raw parameters `[*B, num_parameters]`, in which integer parameters have sampled values."""
         return raw.index_copy(-1, self.places, self._middle(sample_index(self.log_probs)))
 
     def most_probable(self, raw: Tensor) -> Tensor:
-        """Return raw parameters `[*B, num_parameters]` with the most probable values in their places."""
+        """Return raw parameters `[*B, num_parameters]`, in which integer parameters have their most probable values."""
         return raw.index_copy(-1, self.places, self._middle(self.log_probs.argmax(-1)))
 
     def with_log_probs(self, log_density: Tensor, raw: Tensor) -> Tensor:
-        """Return log-densities `[*B, num_parameters]` with the values' log-probabilities in their places."""
+        """Return log-densities `[*B, num_parameters]`, in which integer parameters have log-probabilities instead."""
         cell = (0.5 * (raw.index_select(-1, self.places) + 1.0) * self.counts).floor().long()
-        log_prob = self.log_probs.gather(-1, cell.clamp(min=0).minimum(self.counts - 1).unsqueeze(-1)).squeeze(-1)
+        value = cell.clamp(min=0).minimum(self.counts - 1)
+        log_prob = self.log_probs.gather(-1, value.unsqueeze(-1)).squeeze(-1)
         return log_density.index_copy(-1, self.places, log_prob)
 
     def with_entropies(self, entropy: Tensor) -> Tensor:
-        """Return the parameters' entropies `[*B, num_parameters]` with those of the values in their places."""
+        """Return entropies `[*B, num_parameters]`, in which integer parameters have those of the categoricals."""
         return entropy.index_copy(-1, self.places, -(self.log_probs.exp() * self.log_probs).sum(-1))
 
     def _middle(self, value: Tensor) -> Tensor:
@@ -164,11 +165,11 @@ class ValueDistribution(NamedTuple):
 
 
 class ValuePlaces(NamedTuple):
-    """Which parameters are whole numbers with at most `MAX_VALUES` values.
+    """Which parameters are integers with at most `MAX_VALUES` values.
 
     Attributes:
-        places: of these I parameters among all.
-        counts: their numbers of values.
+        places: places of these I parameters among all.
+        counts: numbers of values of these parameters.
         most: the largest number of values, V.
     """
 
@@ -178,7 +179,7 @@ class ValuePlaces(NamedTuple):
 
     @classmethod
     def of(cls, specs: PAMDPSpecs) -> ValuePlaces | None:
-        """Return those of a problem; None if there are none, or if bounds depend on the state."""
+        """Return the places in a problem; None if no parameter is such an integer, or if bounds depend on the state."""
         if specs.has_parameter_bounds:
             return None
         bounds = zip(specs.integer_parameters, specs.parameter_low, specs.parameter_high, strict=False)
@@ -188,11 +189,11 @@ class ValuePlaces(NamedTuple):
 
     @property
     def num_logits(self) -> int:
-        """How many outputs of a network the distributions take."""
+        """Number of network outputs that the distributions need."""
         return len(self.places) * self.most
 
     def split(self, sizes: Sequence[int]) -> list[ValuePlaces | None]:
-        """Return those of each of several groups of parameters of these sizes, with places within the group."""
+        """Return the places for each of several groups of parameters of these sizes, counted within the group."""
         groups: list[ValuePlaces | None] = []
         start = 0
         for size in sizes:
@@ -203,14 +204,14 @@ class ValuePlaces(NamedTuple):
         return groups
 
     def distribution(self, logits: Tensor) -> ValueDistribution:
-        """Return the distribution of the values, of logits `[*B, num_logits]`."""
+        """Return the distribution of the values, given logits `[*B, num_logits]`."""
         logits = logits.unflatten(-1, (len(self.places), self.most))
         counts = torch.tensor(self.counts, device=logits.device)
         exists = torch.arange(self.most, device=logits.device) < counts.unsqueeze(-1)
         return self.joined(masked_logits(logits, exists).log_softmax(-1))
 
     def joined(self, log_probs: Tensor) -> ValueDistribution:
-        """Return the distribution with these log-probabilities, `[*B, I, V]`."""
+        """Return the distribution of the values, given log-probabilities `[*B, I, V]`."""
         places, counts = (torch.tensor(each, device=log_probs.device) for each in (self.places, self.counts))
         return ValueDistribution(log_probs, places, counts)
 

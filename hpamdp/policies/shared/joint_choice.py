@@ -1,4 +1,4 @@
-"""An action of several components as one choice, for planners that try sequences of choices."""
+"""An action of several components as one choice among all combinations, for planners that search sequences."""
 
 from __future__ import annotations
 
@@ -15,20 +15,23 @@ _MAX_CHOICES = 65_536
 
 
 class JointChoice(nn.Module):
-    """All ways to choose in every component, numbered; with one component the numbers are its discrete actions.
+    """The combinations of the components' choices, numbered from 0. With one component, they are its discrete actions.
 
     Args:
         specs: of the problem.
 
     Attributes:
-        num: how many there are, J.
-        parameter_dims: number of parameters of each, J entries.
-        slots: the indices of their own parameters among all, int64 `[J, D]`; indices of others fill the rest.
-        has_slot: which of these are their own, float32 `[J, D]`.
-        is_chosen: which discrete actions each takes, bool `[J, num_discrete]`; only with several components.
+        num: number of combinations, J.
+        parameter_dims: number of parameters of each combination, J entries, at most D.
+        slots: places of a combination's own parameters among all parameters, int64 `[J, D]`. If it has fewer than D,
+            places of other parameters follow.
+        has_slot: 1 where `slots` is the place of an own parameter, else 0; float32 `[J, D]`.
+        choices: what each combination chooses, int64 `[J, num_components]`; only with several components.
+        strides: `choices @ strides` are the numbers, int64 `[num_components]`; only with several components.
+        is_chosen: which discrete actions each combination has, bool `[J, num_discrete]`; only with several components.
 
     Raises:
-        SettingError: there are too many for the tables.
+        SettingError: there are more than 65,536 combinations.
     """
 
     choices: Tensor
@@ -57,7 +60,9 @@ class JointChoice(nn.Module):
             is_chosen = self.components.is_chosen(choices)
             is_own = is_chosen.index_select(-1, specs.parameter_owner)
             self.parameter_dims = tuple(is_own.sum(-1).tolist())
-            slots = (~is_own).to(torch.int8).argsort(dim=-1, stable=True)[:, : max(self.parameter_dims)]
+            # The stable sort puts the places of own parameters first, in their order.
+            own_first = (~is_own).to(torch.int8).argsort(dim=-1, stable=True)
+            slots = own_first[:, : max(self.parameter_dims)]
             tables = {"slots": slots, "has_slot": is_own.gather(-1, slots).float(), "choices": choices}
             strides = [math.prod(sizes[place + 1 :]) for place in range(len(sizes))]
             tables |= {"strides": torch.tensor(strides), "is_chosen": is_chosen}
@@ -65,24 +70,34 @@ class JointChoice(nn.Module):
             self.register_buffer(name, table, persistent=False)
 
     def number(self, choice: Tensor) -> Tensor:
-        """Return the numbers `[*B]` of choices `[*B]` or `[*B, num_components]`."""
+        """Return the numbers of the combinations, `[*B]`, given choices `[*B]` or `[*B, num_components]`."""
         return choice if self.components.is_single else (choice * self.strides).sum(-1)
 
     def choice(self, number: Tensor) -> Tensor:
-        """Return the choices of numbers `[*B]`, the inverse of `number`."""
+        """Return the choices, given numbers `[*B]` of combinations; the inverse of `number`."""
         return number if self.components.is_single else self.choices[number]
 
     def allowed(self, mask: Tensor) -> Tensor:
-        """Return which numbers a mask bool `[*B, num_discrete]` allows, bool `[*B, J]`."""
+        """Return which combinations are allowed, bool `[*B, J]`, given a mask bool `[*B, num_discrete]`."""
         if self.components.is_single:
             return mask
         return ~(self.is_chosen & ~mask.unsqueeze(-2)).any(-1)
 
     def spread(self, number: Tensor, own: Tensor) -> Tensor:
-        """Return parameters `[*B, num_parameters]`, 0 but for the own ones `[*B, D]` of numbered choices `[*B]`."""
-        everything = own.new_zeros(*own.shape[:-1], self.num_parameters)
-        return everything.scatter(-1, self.slots[number], own * self.has_slot[number])
+        """Return parameters `[*B, num_parameters]`: those of a combination in their places, and 0 for all others.
 
-    def own(self, number: Tensor, everything: Tensor) -> Tensor:
-        """Return the own parameters `[*B, D]` of numbered choices, of all parameters `[*B, num_parameters]`."""
-        return everything.gather(-1, self.slots[number]) * self.has_slot[number]
+        Args:
+            number: of the combination, `[*B]`.
+            own: its own parameters, `[*B, D]`.
+        """
+        parameters = own.new_zeros(*own.shape[:-1], self.num_parameters)
+        return parameters.scatter(-1, self.slots[number], own * self.has_slot[number])
+
+    def own(self, number: Tensor, parameters: Tensor) -> Tensor:
+        """Return a combination's own parameters `[*B, D]`; the inverse of `spread`.
+
+        Args:
+            number: of the combination, `[*B]`.
+            parameters: all parameters, `[*B, num_parameters]`.
+        """
+        return parameters.gather(-1, self.slots[number]) * self.has_slot[number]

@@ -1,7 +1,7 @@
 """What a policy remembers of the observations of its history, and where that history begins.
 
 The state of a memory is one vector `[*B, size]` in the tensordict. In a step it is the state after that step's
-observation. Zeros are a fresh memory, which has seen nothing.
+observation. An empty memory, which has seen nothing, is zeros.
 
 Sources: Mnih et al. 2015, *Human-level control through deep reinforcement learning*, Nature 518 (stacked observations);
 Cho et al. 2014, arXiv 1406.1078 (GRU); Hausknecht and Stone 2015, *Deep Recurrent Q-Learning for Partially Observable
@@ -31,13 +31,16 @@ class StackOptions(Settings):
     """Settings of a memory of the last observations."""
 
     memory: MemoryKind = "none"
-    """What the networks see beside the observation: nothing, or the observations before it."""
+    """What the networks see beside the observation. `none`: nothing; `stack`: the observations before it."""
     stack_steps: Annotated[int, Field(ge=2, le=1000)] = 4
-    """With `memory=stack`: observations that the networks see, with the present one; zeros before the first."""
+    """With `memory=stack`: number of observations that the networks see, the current one included.
+
+    Zeros stand for observations before the first one.
+    """
 
     @model_validator(mode="after")
     def _check_memory(self) -> Self:
-        for name in ("vector_products", "augment"):  # what a problem declares of its observation, not of its features
+        for name in ("vector_products", "augment"):  # problems declare vectors and symmetries of observations alone
             if self.memory != "none" and getattr(self, name, False) is True:
                 raise ValueError(f"{name}=true: does not go with memory={self.memory}; use {name}=false or memory=none")
         return self
@@ -47,9 +50,12 @@ class MemoryOptions(StackOptions):
     """Settings of a memory."""
 
     memory: MemoryKind = "none"
-    """What the networks see beside the observation: nothing, the observations before it, or the state of a GRU."""
+    """What the networks see beside the observation. `none`: nothing; `stack`: the observations before it.
+
+    `gru`: the state of a GRU that has seen all observations since the memory was reset.
+    """
     memory_size: PositiveInt = 64
-    """With `memory=gru`: numbers in its state."""
+    """With `memory=gru`: units of the GRU."""
     sequence_length: PositiveInt = 16
     """With `memory=gru`: steps through which gradients flow back in time."""
 
@@ -58,7 +64,10 @@ class ReplayMemoryOptions(MemoryOptions):
     """Settings of a memory that learns from a replay buffer."""
 
     burn_in: NonNegativeInt = 8
-    """With `memory=gru`: further steps before these, from which today's networks compute the state to begin with."""
+    """With `memory=gru`: steps before each sequence that the current GRU replays without gradients.
+
+    They give the state in which the sequence starts.
+    """
 
 
 class Stack(nn.Module):
@@ -71,7 +80,7 @@ class Stack(nn.Module):
     Attributes:
         size: entries of the state.
         num_features: entries of the features, which are the state.
-        name: of its state in a tensordict.
+        name: key of its state in a tensordict.
     """
 
     is_recurrent = False
@@ -101,7 +110,7 @@ class GRU(nn.Module):
     Attributes:
         size: entries of the state.
         num_features: entries of the features.
-        name: of its state in a tensordict.
+        name: key of its state in a tensordict.
     """
 
     is_recurrent = True
@@ -122,8 +131,13 @@ class GRU(nn.Module):
         return torch.cat([state, seen], -1)
 
     def unrolled(self, seen: Tensor, held: Tensor) -> Tensor:
-        """Return the states `[N, L, size]` after each of observations `[N, L, num_inputs]`, given those before."""
-        # Also where matrix products are computed in bfloat16: errors would add up over the steps.
+        """Return the states `[N, L, size]` after each of the observations `[N, L, num_inputs]`.
+
+        Args:
+            seen: the observations.
+            held: the states before the first ones, `[N, size]`.
+        """
+        # In float32 even if matrix products are computed in bfloat16: errors would add up over the steps.
         with torch.autocast(seen.device.type, enabled=False):
             states: Tensor = self.net(seen.float(), held.unsqueeze(0).contiguous())[0]
         return states

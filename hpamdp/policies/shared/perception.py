@@ -16,30 +16,30 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class Perception(nn.Module):
-    """Stands between a learner's observations and its networks, which are built from `specs` and see `forward`.
+    """Turns a learner's observations into the features that its networks see.
 
-    If the observation has pictures, an encoder makes features of them, which a memory sees in their place. Without
-    pictures and memory, features are the observations themselves, and nothing is computed. The end of the features is
-    the end of the observation, so that a shared learner's one-hot option stays in its place.
+    An encoder makes features of pictures, and a memory adds what it remembers of earlier observations. Without pictures
+    and memory, features are the observations themselves, and nothing is computed. Features end as the observation does,
+    so a shared learner's one-hot option stays at the end. The networks are built from `specs`.
 
     An on-policy learner trains it with its whole loss. A learner with a replay buffer trains it with the critics' loss
     alone, and has a target copy beside the target critics; actors see detached features.
 
-    A memory's history begins where its learner begins to act: with the option, if each option has its own learner
-    (Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*: the policy of a semi-Markov option depends on what
-    happened since the option began); with the episode, if a learner serves all options or there are none.
+    The history that a memory remembers begins with the option if each option has its own learner. The policy of a
+    semi-Markov option depends on what happened since the option began (Sutton, Precup and Singh 1999, *Between MDPs and
+    semi-MDPs*). If one learner serves all options, or the problem has no options, the history begins with the episode.
 
     Args:
         specs: of the problem, as the learner sees it.
-        options: settings of the memory; None if there is none.
-        prefix: of the name of the memory's state in a step.
+        options: settings of the memory. If None, there is no memory.
+        prefix: of the key of the memory's state in a step.
 
     Attributes:
-        specs: of the features; the networks behind are built from them.
+        specs: those of the problem, with the features as observation.
         is_plain: whether features are the observations themselves.
-        encoder: what encodes pictures; None if there are none.
-        memory: what remembers earlier observations; None if there is none.
-        memory_key: of the memory's state in a step; None if there is none.
+        encoder: encodes pictures; None without pictures.
+        memory: remembers earlier observations; None without a memory.
+        memory_key: key of the memory's state in a step; None without a memory.
         in_keys: what `see` reads of a step.
         out_keys: what `see` writes.
     """
@@ -91,13 +91,13 @@ class Perception(nn.Module):
         return self.memory is not None and self.memory.is_recurrent
 
     def see(self, td: TensorDictBase) -> Tensor:
-        """Return the features of a step `[*B]`, `[*B, specs.observation_dim]`; write the memory's state after it."""
-        features, states = self.look(td)
+        """Return the features `[*B, specs.observation_dim]` of a step, and write the memory's new state into it."""
+        features, states = self.features_and_memory(td)
         td.update(states)
         return features
 
-    def look(self, td: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the features of a step as `see` does, and the memory's state after it under its key."""
+    def features_and_memory(self, td: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the features of a step, and the memory's new state under `memory_key`; empty without a memory."""
         encoded = self.encoded(td.get(keys.OBSERVATION))
         if self.memory is None or self.memory_key is None:
             return encoded, {}
@@ -124,8 +124,9 @@ class Perception(nn.Module):
 
         Args:
             observation: the observations.
-            memory: the memory's states `[*B, size]`. If None, fresh.
-            has_seen: whether these states are after the observations. Otherwise they are before them.
+            memory: the memory's states `[*B, size]`. If None, an empty memory.
+            has_seen: whether `memory` holds the states after the observations, as steps do. If false, it holds the
+                states before them.
         """
         encoded = self.encoded(observation)
         if self.memory is None:
@@ -134,11 +135,14 @@ class Perception(nn.Module):
         return self.memory.features(encoded, state)
 
     def after(self, observation: Tensor, memory: Tensor | None = None) -> Tensor:
-        """Return the memory's states `[*B, size]` after observations `[*B, *]`, given those before; if None, fresh."""
+        """Return the memory's states `[*B, size]` after observations `[*B, *]`, given the states before.
+
+        Without states before, the memory is empty.
+        """
         return self._after(self.encoded(observation), memory)
 
     def _after(self, encoded: Tensor, memory: Tensor | None = None) -> Tensor:
-        """Return the memory's states `[*B, size]` after what it sees `[*B, *]`, given those before; if None, fresh."""
+        """Return what `after` does, given encoded observations `[*B, *]`."""
         assert self.memory is not None
         if memory is None:
             memory = encoded.new_zeros(*encoded.shape[:-1], self.memory.size, dtype=torch.float32)
@@ -151,8 +155,8 @@ class Perception(nn.Module):
 
         Args:
             observations: `[N, L, observation_dim]`.
-            memory: the states to begin with, `[N, size]`.
-            has_seen: where these are after the first observation, and not before it, bool `[N]`.
+            memory: the states to start from, `[N, size]`.
+            has_seen: whether these are the states after the first observation, or before it; bool `[N]`.
         """
         return self._states(self.encoded(observations), memory, has_seen)
 
@@ -165,25 +169,25 @@ class Perception(nn.Module):
         return torch.cat([first.unsqueeze(1), self.memory.unrolled(encoded[:, 1:], first)], 1)
 
     def of_sequences(self, observation: Tensor, memory: Tensor, begins: Tensor, starts: Tensor) -> Tensor:
-        """Return the features `[N, specs.observation_dim]` of rows that are sequences, one after another.
+        """Return the features `[N, specs.observation_dim]` of rows that form sequences, one sequence after another.
 
-        The first row of a sequence takes the stored state as it is, unless its history begins there.
+        A sequence starts from the stored state of its first row, or from an empty memory if a history begins there.
 
         Args:
             observation: `[N, observation_dim]`.
-            memory: the states after them at the time, `[N, size]`.
+            memory: the stored states after these observations, `[N, size]`.
             begins: where a history begins, bool `[N]`.
-            starts: where a sequence starts, bool `[N]`. The first row does.
+            starts: where a sequence starts, bool `[N]`; true for the first row.
         """
         assert self.memory is not None
-        sequence = starts.long().cumsum(0) - int(starts[0])
+        # Of each row, the number of its sequence and its place in it.
+        sequence = starts.long().cumsum(0) - 1
         lengths = sequence.bincount()
-        ends = lengths.cumsum(0)
-        place = torch.arange(len(sequence), device=sequence.device) - (ends - lengths)[sequence]
+        first = lengths.cumsum(0) - lengths
+        place = torch.arange(len(sequence), device=sequence.device) - first[sequence]
         encoded = self.encoded(observation)
         padded = encoded.new_zeros(len(lengths), int(lengths.max()), encoded.shape[-1])
         padded[sequence, place] = encoded
-        first = ends - lengths
         is_fresh = begins[first]
         states = self._states(padded, torch.where(is_fresh.unsqueeze(-1), 0.0, memory[first]), ~is_fresh)
         return self.memory.features(encoded, states[sequence, place])

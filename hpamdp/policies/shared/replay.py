@@ -125,7 +125,7 @@ class ReplayLearner(Learner):
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(options.buffer_size, device=device))
         self.descent = Descent()
         self.links = None
-        # Pictures among vectors come as float32, and take a quarter of the memory as bytes.
+        # Pictures beside vectors come as float32. As bytes they take a quarter of the memory.
         self._packs = specs.has_pictures and specs.observation_dtype == torch.float32
 
     def set_perception(self, options: ReplayMemoryOptions) -> None:
@@ -167,7 +167,7 @@ class ReplayLearner(Learner):
             self.store(batch, mask)
 
     def update(self, num_updates: int) -> dict[str, float]:
-        """Make updates from the stored transitions; do nothing if there are none."""
+        """Make updates from the stored transitions; do nothing if the buffer is empty."""
         if len(self.buffer) == 0:
             return {}
         if int(self.frames) == int(self.updates) == 0:
@@ -354,11 +354,12 @@ class ReplayLearner(Learner):
         return self.memory_of(sample, self.target_perception) if self.memory_key is not None else None
 
     def _memory_of_next(self, memory: Tensor, is_same: Tensor) -> TensorDict:
-        """Return the memories with which the next options begin; a learner of a single option begins anew.
+        """Return the memories with which the next options begin: empty ones, if each option has its own learner.
 
         Args:
             memory: the target's memories before, `[N, size]`.
-            is_same: whether the next option is the held one, bool `[N]`. If the selector ends options, it goes on.
+            is_same: whether the next option is the held one, bool `[N]`. If the selector decides where options end,
+                such an option continues, and keeps its memory.
         """
         assert self.memory_key is not None
         if not self.perception.lasts_an_episode:

@@ -25,14 +25,17 @@ class SelectorStackOptions(StackOptions):
     """Settings of a selector's memory of the last decisions."""
 
     memory: Literal["none", "stack"] = "none"
-    """What the networks see beside the observation: nothing, or the observations at the episode's earlier decisions."""
+    """What the networks see beside the observation. `none`: nothing; `stack`: those at the last decisions."""
 
 
 class SelectorMemoryOptions(MemoryOptions):
     """Settings of a selector's memory."""
 
     memory: Literal["none", "stack", "gru"] = "none"
-    """What the networks see beside the observation: nothing, those at earlier decisions, or a GRU's state of them."""
+    """What the networks see beside the observation. `none`: nothing; `stack`: those at the last decisions.
+
+    `gru`: the state of a GRU that has seen the observations at all decisions of the episode.
+    """
 
 
 class SelectorReplayMemoryOptions(ReplayMemoryOptions, SelectorMemoryOptions):
@@ -42,8 +45,8 @@ class SelectorReplayMemoryOptions(ReplayMemoryOptions, SelectorMemoryOptions):
 class RemembersDecisions(Selector):
     """Base class for selectors whose networks see a `Perception` of the observations at the decisions so far.
 
-    A subclass calls `set_perception` in its constructor, and its networks see `seen`. A memory goes on at decisions
-    alone, since `forward` holds what `choose` returns until the next one.
+    A subclass calls `set_perception` in its constructor, and its networks see `seen`. The memory changes only at
+    decisions: between them, `forward` holds what `choose` returned.
 
     Attributes:
         perception: what the networks see of an observation.
@@ -69,27 +72,27 @@ class RemembersDecisions(Selector):
         return {**super().choose_uniformly(td), **self.remembered(td)}
 
     def seen(self, td: TensorDictBase) -> Tensor:
-        """Return what the networks see of a step `[*B]`, as at a decision, `[*B, perception.specs.observation_dim]`."""
-        features, _ = self.perception.look(td)
+        """Return what the networks see of a decision in a step `[*B]`, `[*B, perception.specs.observation_dim]`."""
+        features, _ = self.perception.features_and_memory(td)
         return features
 
     @torch.no_grad()
     def remembered(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return the memory's state after a decision at a step `[*B]`, under its key; empty without memory."""
-        _, states = self.perception.look(td)
+        """Return the memory's state after a decision in a step `[*B]`, under its key; empty without a memory."""
+        _, states = self.perception.features_and_memory(td)
         return states
 
     def held(self, batch: TensorDictBase) -> Tensor | None:
-        """Return the memory's states after the last decisions, `[*B, size]`; None without memory."""
+        """Return the memory's states after the last decisions, `[*B, size]`; None without a memory."""
         return None if self.memory_key is None else batch.get(self.memory_key)
 
     @property
     def stores_features(self) -> bool:
-        """Whether stored states are what the networks see: those of a memory that does not learn."""
+        """Whether the buffer stores features instead of observations: those of a stack, which has nothing to learn."""
         return self.perception.memory is not None and not self.perception.is_recurrent
 
     def stored_state(self, decisions: TensorDictBase) -> Tensor:
-        """Return what is stored of the observations at finished decisions `[*B]`: these, or features of them."""
+        """Return the observations at finished decisions `[*B]`, or features of them if `stores_features`."""
         observation: Tensor = decisions.get(("next", keys.DECISION_OBSERVATION))
         if not self.stores_features:
             return observation
@@ -97,7 +100,10 @@ class RemembersDecisions(Selector):
         return features
 
     def of_stored(self, state: Tensor) -> Tensor:
-        """Return what the networks see of stored states, `[N, perception.specs.observation_dim]`; not if recurrent."""
+        """Return what the networks see of stored states, `[N, perception.specs.observation_dim]`.
+
+        For a recurrent memory, use `states_of_past` instead.
+        """
         return state if self.stores_features else self.perception(state)
 
     @staticmethod

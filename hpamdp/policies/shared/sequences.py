@@ -18,7 +18,7 @@ from hpamdp.policies.shared.sized_by_data import SizedByData
 def sequence_starts(begins: Tensor, mask: Tensor, length: int) -> Tensor:
     """Return where sequences start among the rows in a mask, bool `[N]`.
 
-    They start with a history or a batch, and then every `length` rows.
+    Sequences start where a history or the batch begins, and then after every `length` rows.
 
     Args:
         begins: where a history begins, bool `[*B, T]`.
@@ -26,12 +26,14 @@ def sequence_starts(begins: Tensor, mask: Tensor, length: int) -> Tensor:
         length: the most rows of a sequence.
     """
     own = mask.flatten(0, -2)
-    environment = torch.arange(len(own), device=mask.device).unsqueeze(-1).expand_as(own)[own]
-    follows = ~begins[mask]
-    follows[:1] = False
-    follows[1:] &= environment[1:] == environment[:-1]
-    place = torch.arange(len(follows), device=mask.device)
-    first = torch.where(follows, 0, place).cummax(0).values
+    number = torch.arange(len(own), device=mask.device).unsqueeze(-1)
+    environment = number.expand_as(own)[own]
+    continues = ~begins[mask]
+    continues[:1] = False
+    continues[1:] &= environment[1:] == environment[:-1]
+    place = torch.arange(len(continues), device=mask.device)
+    # Of each row, the place of the first row of its history in this batch.
+    first = torch.where(continues, 0, place).cummax(0).values
     return (place - first) % length == 0
 
 
@@ -51,19 +53,19 @@ class HistoryLinks(SizedByData):
         self.register_buffer("last_rows", torch.zeros(0, dtype=torch.long))
 
     def forward(self, begins: Tensor, mask: Tensor, num_stored: int) -> Tensor:
-        """Return the numbers `[*B, T]` of the rows before the rows of a batch; -1 if there is none.
+        """Return the number of the row before each row of a batch, `[*B, T]`; -1 for the first row of a history.
 
         Args:
             begins: where a history begins, bool `[*B, T]`.
             mask: the rows that are now stored, in this order, bool `[*B, T]`.
-            num_stored: how many rows were stored before, now forgotten ones included.
+            num_stored: how many rows were stored before, including those that have been overwritten.
         """
         own = mask.flatten(0, -2)
         numbers = (num_stored - 1 + own.flatten().cumsum(0)).reshape(own.shape)
         numbers = torch.where(own, numbers, -1)
         if self.last_rows.shape != numbers.shape[:1] or num_stored == 0:
             self.last_rows = torch.full_like(numbers[:, 0], -1)
-        # A row that is yet to be stored is of a buffer that was given up.
+        # A number beyond the stored rows belongs to an earlier buffer, which this one replaced.
         first = torch.where(self.last_rows < num_stored, self.last_rows, -1)
         newest = torch.cat([first.unsqueeze(-1), numbers], -1).cummax(-1).values
         self.last_rows = newest[:, -1].clone()
@@ -76,13 +78,13 @@ def ancestors(newest: Tensor, previous: Tensor, num_stored: int, num_steps: int)
 
     Args:
         newest: numbers of the rows to begin with, `[N]`.
-        previous: `HistoryLinks` of the rows in the buffer, by their places, `[len(buffer)]`.
+        previous: numbers by `HistoryLinks` of the rows in the buffer, by their places, `[len(buffer)]`.
         num_stored: how many rows were stored in all; a full buffer holds the last `len(previous)` of them.
-        num_steps: the most rows to find, with the first.
+        num_steps: the most rows to find, including the first one.
 
     Returns:
-        The places of the rows in the buffer, int64 `[N, num_steps]`, the oldest first and padded behind, and how many
-        there are, `[N]`.
+        The places of the rows in the buffer, int64 `[N, num_steps]`, the oldest first and padded at the end, and how
+        many there are, `[N]`.
     """
     capacity = len(previous)
     oldest = num_stored - capacity
@@ -110,11 +112,12 @@ def sample_with_past(buffer: ReplayBuffer, num: int, num_steps: int) -> TensorDi
         num_steps: the most rows of a sequence.
 
     Returns:
-        The rows, also with `past`, the states of the sequence `[num, num_steps, *]`, padded behind; `num_past`, how
-        many there are; and `first_memory` and `first_begins` of the first one.
+        The rows, also with `past`, the states of the sequence `[num, num_steps, *]`, padded at the end; `num_past`, how
+        many there are; and `first_memory` and `first_begins`, the entries of the sequence's first row.
     """
     stored, num_stored = buffer[:], buffer.write_count
     place = torch.randint(len(stored), (num,), device=stored["previous"].device)
+    # The number of the row at a place: the largest one below `num_stored` that the ring buffer keeps there.
     newest = num_stored - 1 - (num_stored - 1 - place) % len(stored)
     places, num_past = ancestors(newest, stored["previous"], num_stored, num_steps)
     sample: TensorDict = stored[place]
@@ -126,13 +129,13 @@ def sample_with_past(buffer: ReplayBuffer, num: int, num_steps: int) -> TensorDi
 def states_of_past(sample: TensorDictBase, perception: Perception, burn_in: int) -> Tensor:
     """Return a recurrent memory's states `[B, size]` after the sequences of `sample_with_past`.
 
-    A sequence begins with the stored state of its first row, or afresh if the history begins there. The first `burn_in`
-    rows of the longest ones, and fewer of shorter ones, have no gradient.
+    A sequence starts from the stored state of its first row, or from an empty memory if the history begins there. The
+    gradient flows through the last rows, at most `num_steps - burn_in` of them. The rows before these have none.
 
     Args:
         sample: the rows, `[B]`.
         perception: has the memory.
-        burn_in: rows without a gradient.
+        burn_in: rows without a gradient in the longest sequences.
     """
     past, num_past = sample["past"], sample["num_past"]
     length = past.shape[1] - burn_in
