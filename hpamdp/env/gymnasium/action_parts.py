@@ -1,6 +1,6 @@
-"""The components of an action space: discrete choices, with or without parameters of their own, and boxes.
+"""The parts of an action space: discrete choices, with or without parameters of their own, boxes, and groups of these.
 
-Each class reads one part of the space. It has the same attributes and methods, see `Part`.
+Each class reads one kind of part. All have the attributes and methods of `Part`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gymnasium import spaces
 from hpamdp.env.gymnasium.parameter_trees import NotAcceptedError, ParameterTree, by_row
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers
 
-# Narrower bounds of the parameters, in the space's own numbers, float64 `[M, size]` each.
+# Lower and upper bounds of the space's own parameters, narrower than those of the space, float64 `[M, size]` each.
 Bounds = tuple[np.ndarray, np.ndarray]
 
 
@@ -26,7 +26,7 @@ class Part(ABC):
     Attributes:
         sizes: number of discrete actions of each component.
         parameter_dims: number of parameters of each discrete action of all components.
-        trees: the trees of the parameters, side by side.
+        trees: the spaces of the parameters, in the order of the parameters.
     """
 
     sizes: tuple[int, ...]
@@ -40,12 +40,12 @@ class Part(ABC):
 
     @abstractmethod
     def natives(self, discrete: np.ndarray, parameters: np.ndarray, bounds: Bounds | None) -> list[Any]:
-        """Return values of the part.
+        """Return M values of the part, in the format of its space.
 
         Args:
-            discrete: counted from 0 in each component, int64 `[M, components]`.
+            discrete: the discrete actions, counted from 0 in each component, int64 `[M, len(sizes)]`.
             parameters: the agent's, `[M, num_parameters]`.
-            bounds: narrower bounds of the parameters, or None.
+            bounds: narrower bounds of the parameters. If None, those of the space.
         """
 
     @abstractmethod
@@ -56,7 +56,7 @@ class Part(ABC):
     def fill_mask(self, given: Any, mask: np.ndarray) -> None:
         """Write a mask in the part's structure into a vector, bool, with an entry for each discrete action.
 
-        The structure is that of the masks of Gymnasium's `sample`. A part that is None allows everything.
+        The structure is that of the masks of Gymnasium's `sample`. None in place of a part allows everything.
 
         Raises:
             MisfitError: `given` has another structure.
@@ -68,7 +68,7 @@ class Choice(Part):
 
     Args:
         space: see the docstring of `hpamdp.env.gymnasium.action_spaces`.
-        parameter_dims: number of parameters that each discrete action takes of one box for all.
+        parameter_dims: number of parameters of each discrete action, if one box for all is divided among them.
 
     Raises:
         NotAcceptedError: the parameters are not accepted.
@@ -92,22 +92,22 @@ class Choice(Part):
 
     def natives(self, discrete: np.ndarray, parameters: np.ndarray, bounds: Bounds | None) -> list[Any]:
         """Return values of the part; see `Part.natives`."""
-        return self.of_one(discrete[:, 0], parameters, bounds)
+        return self.chosen_natives(discrete[:, 0], parameters, bounds)
 
-    def of_one(self, chosen: np.ndarray, parameters: np.ndarray, bounds: Bounds | None = None) -> list[Any]:
-        """Return values of the part, as `natives`, of discrete actions `[M]`."""
+    def chosen_natives(self, chosen: np.ndarray, parameters: np.ndarray, bounds: Bounds | None = None) -> list[Any]:
+        """Return what `natives` returns, given discrete actions `[M]`."""
         form = self._form
-        natives = list((self._first + chosen if self._first else chosen).astype(form.discrete.dtype, copy=False))
+        numbers = self._first + chosen if self._first else chosen
+        natives = list(numbers.astype(form.discrete.dtype, copy=False))
         values: list[Any] = self._tree.natives(parameters, bounds)
         if form.is_shared:
-            values = [
-                boxes[0 if self._is_split else index] for boxes, index in zip(values, chosen.tolist(), strict=True)
-            ]
+            places = [0] * len(values) if self._is_split else chosen.tolist()
+            values = [boxes[place] for boxes, place in zip(values, places, strict=True)]
         elif form.part_names is not None:
             values = [dict(zip(form.part_names, boxes, strict=True)) for boxes in values]
         if form.is_one_of:
-            owned = zip(values, chosen.tolist(), strict=True)
-            return list(zip(natives, [parts[index] for parts, index in owned], strict=True))
+            values = [parts[index] for parts, index in zip(values, chosen.tolist(), strict=True)]
+            return list(zip(natives, values, strict=True))
         if form.names is not None and form.is_flat:
             (name, _) = form.names
             return [{name: native, **parts} for native, parts in zip(natives, values, strict=True)]
@@ -119,7 +119,7 @@ class Choice(Part):
         return list(zip(natives, values, strict=True))
 
     def fill_bounds(self, given: Any, numbers: np.ndarray) -> None:
-        """Write bounds; those of one box for all are the same for each discrete action."""
+        """Write bounds; the bounds of one box for all hold for every discrete action."""
         if given is None:
             return
         form = self._form
@@ -133,7 +133,7 @@ class Choice(Part):
         self._tree.fill(of_parts, numbers)
 
     def fill_mask(self, given: Any, mask: np.ndarray) -> None:
-        """Write the mask of the discrete actions; numbers alone, or in the place of the `Discrete`."""
+        """Write the mask of the discrete actions: given alone, or in the structure, in place of the `Discrete`."""
         if given is None:
             return
         numbers = as_numbers(given)
@@ -143,7 +143,7 @@ class Choice(Part):
             _write_mask(given, mask)
 
     def _divided(self, given: Any) -> tuple[Any, Any]:
-        """Return what stands in the place of the `Discrete`, and what stands in the place of the parameters."""
+        """Return what is given in place of the `Discrete`, and what is given in place of the parameters."""
         form = self._form
         if form.is_one_of:
             return None, given
@@ -163,8 +163,8 @@ class Choice(Part):
         return given[0], list(given[1:]) if form.is_flat else given[1]
 
 
-class Numbers(Part):
-    """A `Discrete`, `MultiDiscrete` or `MultiBinary`: a component without parameters for each number."""
+class PlainChoices(Part):
+    """A `Discrete`, `MultiDiscrete` or `MultiBinary`: for each of its numbers a choice without parameters."""
 
     trees = ()
 
@@ -192,7 +192,7 @@ class Numbers(Part):
         """Do nothing: there are no parameters."""
 
     def fill_mask(self, given: Any, mask: np.ndarray) -> None:
-        """Write the mask: an array for each number, in tuples; of a `MultiBinary` one array of 0, 1 or 2 for both."""
+        """Write the mask: an array for each number, in tuples. A `MultiBinary` has one array of 0, 1 or 2 (both)."""
         if given is None:
             return
         if isinstance(self._space, spaces.Discrete):
@@ -201,7 +201,8 @@ class Numbers(Part):
             values = as_numbers(given)
             if values is None or values.shape != self._space.shape or not np.isin(values, (0, 1, 2)).all():
                 raise MisfitError(given, f"0, 1 or 2 (both) in shape {self._space.shape}")
-            mask[:] = ((values.ravel()[:, None] == (0, 1)) | (values.ravel()[:, None] == 2)).ravel()
+            allowed = values.ravel()[:, None]
+            mask[:] = ((allowed == (0, 1)) | (allowed == 2)).ravel()
         else:
             start = 0
             for size, of_number in zip(self.sizes, _leaves_of(given, self._space.shape or ()), strict=True):
@@ -209,8 +210,8 @@ class Numbers(Part):
                 start += size
 
 
-class Boxed(Part):
-    """A `Box`: a component of one discrete action, whose parameters are the numbers of the box."""
+class BoxComponent(Part):
+    """A `Box`: a component with one discrete action, whose parameters are the numbers of the box."""
 
     sizes = (1,)
 
@@ -234,7 +235,7 @@ class Boxed(Part):
 
 
 class Group(Part):
-    """A `Tuple` or `Dict`, whose parts' components follow one another."""
+    """A `Tuple` or `Dict`: the components of its parts, one part after another."""
 
     def __init__(self, space: spaces.Tuple | spaces.Dict, parts: Sequence[Part]) -> None:
         self._names = list(space.spaces) if isinstance(space, spaces.Dict) else None
@@ -278,16 +279,17 @@ class Group(Part):
 
 
 class ChoiceForm:
-    """How a choice with parameters of its own is written.
+    """The form in which a space has a choice with parameters of its own.
 
     Attributes:
         discrete: the discrete actions.
         parts: the parameters of each discrete action, or the one box for all.
         is_shared: whether there is one box for all.
-        is_one_of: whether it is a `OneOf`.
-        is_flat: whether the parts stand beside the `Discrete`.
-        names: in a `Dict`, of the `Discrete` and of the parameters (empty if they are flat).
-        part_names: of the parts, if they are entries of a `Dict`, in the order of `parts`.
+        is_one_of: whether the space is a `OneOf`.
+        is_flat: whether the parts stand beside the `Discrete`, as in `Tuple(Discrete(2), Box, Box)`.
+        names: if the space is a `Dict`, the names of the `Discrete` and of the parameters. The second name is empty if
+            the form is flat.
+        part_names: names of the parts, in the order of `parts`, if the parts are entries of a `Dict`.
     """
 
     def __init__(
@@ -299,42 +301,48 @@ class ChoiceForm:
         is_flat: bool = False,
         is_one_of: bool = False,
     ) -> None:
-        self.discrete, self.names, self.is_flat, self.is_one_of = discrete, names, is_flat, is_one_of
+        self.discrete = discrete
+        self.names = names
+        self.is_flat = is_flat
+        self.is_one_of = is_one_of
         self.part_names: list[str] | None = None
         self.is_shared = isinstance(parameters, spaces.Box)
         if isinstance(parameters, spaces.Dict):
             self.part_names = _in_order(list(parameters.spaces))
             self.parts = [parameters.spaces[name] for name in self.part_names]
+        elif isinstance(parameters, spaces.Tuple):
+            self.parts = list(parameters.spaces)
         else:
-            self.parts = list(parameters.spaces) if isinstance(parameters, spaces.Tuple) else [parameters]
+            self.parts = [parameters]
 
 
 def choice_form(space: spaces.Space) -> ChoiceForm | None:
-    """Return how a space is one choice with parameters of its own; None if it is not."""
+    """Return the form of a space that is one choice with parameters of its own; None for any other space."""
     if isinstance(space, spaces.OneOf):
         return ChoiceForm(spaces.Discrete(len(space.spaces)), spaces.Tuple(space.spaces), is_one_of=True)
     if isinstance(space, spaces.Dict) and len(space.spaces) == 2:
-        # Stable: puts the Discrete first, and keeps the order if both or neither are one.
+        # The sort is stable: it puts the Discrete first, and keeps the order if both entries are one, or neither is.
         names = sorted(space.spaces, key=lambda name: not isinstance(space.spaces[name], spaces.Discrete))
         return _form_of_two(space.spaces[names[0]], space.spaces[names[1]], (names[0], names[1]))
     if isinstance(space, spaces.Dict):
         chosen = [(name, part) for name, part in space.spaces.items() if isinstance(part, spaces.Discrete)]
         boxes = [(name, part) for name, part in space.spaces.items() if isinstance(part, spaces.Box)]
-        if len(chosen) == 1 and len(boxes) == len(space.spaces) - 1 == chosen[0][1].n:
+        if len(chosen) == 1 and len(chosen) + len(boxes) == len(space.spaces):
             ((name, discrete),) = chosen
-            return ChoiceForm(discrete, spaces.Dict(boxes), names=(name, ""), is_flat=True)
+            if len(boxes) == discrete.n:
+                return ChoiceForm(discrete, spaces.Dict(boxes), names=(name, ""), is_flat=True)
     elif isinstance(space, spaces.Tuple) and len(space.spaces) == 2:
         return _form_of_two(*space.spaces)
     elif isinstance(space, spaces.Tuple) and len(space.spaces) > 2:
         first, *rest = space.spaces
-        is_flat = isinstance(first, spaces.Discrete) and len(rest) == first.n
-        if isinstance(first, spaces.Discrete) and is_flat and all(isinstance(part, spaces.Box) for part in rest):
+        are_boxes = all(isinstance(part, spaces.Box) for part in rest)
+        if are_boxes and isinstance(first, spaces.Discrete) and len(rest) == first.n:
             return ChoiceForm(first, spaces.Tuple(rest), is_flat=True)
     return None
 
 
 def _form_of_two(first: spaces.Space, second: spaces.Space, names: tuple[str, str] | None = None) -> ChoiceForm | None:
-    """Return the form of a `Discrete` and the parameters of each of its discrete actions; None if they are not that."""
+    """Return the form of a `Discrete` and the parameters of its discrete actions; None if the spaces are not these."""
     if not isinstance(first, spaces.Discrete):
         return None
     is_divided = isinstance(second, spaces.Tuple | spaces.Dict) and len(second.spaces) == first.n
@@ -342,21 +350,21 @@ def _form_of_two(first: spaces.Space, second: spaces.Space, names: tuple[str, st
 
 
 def read_part(space: spaces.Space, *, finds_choices: bool) -> Part:
-    """Return the components of a space.
+    """Return the part that a space is.
 
     Args:
         space: any tree of the accepted spaces.
         finds_choices: whether a `Discrete` and the parameters beside it can be one choice.
 
     Raises:
-        NotAcceptedError: the space has another kind of space in it, or a box whose bounds are not finite.
+        NotAcceptedError: the tree has a space of another kind, or a box whose bounds are not finite.
     """
     if isinstance(space, spaces.OneOf) or (finds_choices and choice_form(space) is not None):
         return Choice(space)
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
-        return Numbers(space)
+        return PlainChoices(space)
     if isinstance(space, spaces.Box):
-        return Boxed(space)
+        return BoxComponent(space)
     if isinstance(space, spaces.Tuple):
         return Group(space, [read_part(part, finds_choices=finds_choices) for part in space.spaces])
     if isinstance(space, spaces.Dict):
@@ -373,7 +381,7 @@ def _write_mask(given: Any, mask: np.ndarray) -> None:
 
 
 def _leaves_of(given: Any, shape: tuple[int, ...]) -> list[Any]:
-    """Return the parts of nested tuples of this shape, one after another."""
+    """Return the innermost parts of nested tuples of this shape, in order. A None stands for all parts below it."""
     if not shape:
         return [given]
     if given is None:
@@ -388,7 +396,7 @@ def _slices(sizes: Sequence[int]) -> list[slice]:
 
 
 def _in_order(names: list[str]) -> list[str]:
-    """Return the names in the order of the numbers at their ends if these all differ, else in the order given."""
+    """Return names that all end in different numbers in the order of these; any other names in the order given."""
     endings = [re.search(r"\d+$", str(name)) for name in names]
     numbers = [int(ending.group()) for ending in endings if ending is not None]
     if len(set(numbers)) < len(names):

@@ -1,11 +1,15 @@
-"""Gymnasium's action spaces: components, each a discrete choice or a box, whose parameters lie side by side.
+"""Read Gymnasium's action spaces as components, each a discrete choice or a box, with all parameters side by side.
 
 Accepted is any tree of `Discrete`, `MultiDiscrete`, `MultiBinary`, `Box`, `Tuple`, `Dict` and `OneOf`. A `Discrete` may
-have any `start`, and a `Box` any shape, floats or whole numbers, and finite bounds.
+have any `start`. A `Box` may have any shape, and floats or integers with finite bounds.
 
-**One choice.** Some spaces are one discrete choice whose discrete actions have parameters of their own: a `Tuple` that
-begins with a `Discrete(K)`, the discrete actions, a `Dict` of a `Discrete(K)` and other entries, with any names, and a
-`OneOf` of K parts. The parameters are one of these:
+**One choice.** Some spaces are one discrete choice among K discrete actions with parameters of their own:
+
+- a `Tuple` of a `Discrete(K)`, which comes first, and the parameters;
+- a `Dict` of a `Discrete(K)` and the parameters, with any names;
+- a `OneOf` of K parts, the parameters of the K discrete actions.
+
+In a `Tuple` or a `Dict`, the parameters are one of these:
 
 - a `Tuple` of K parts, one for each discrete action: `Tuple(Discrete(K), Tuple(Box, ...))` is the field's convention. A
   discrete action without parameters has a box of shape `(0,)`. In a `Tuple` K boxes may also follow the `Discrete`
@@ -13,12 +17,12 @@ begins with a `Discrete(K)`, the discrete actions, a `Dict` of a `Discrete(K)` a
 - a `Dict` of K parts, which belong to the discrete actions in the order of the space (Gymnasium sorts the names of a
   plain dict) or, if all names end in different numbers, in the order of these numbers. K boxes may also be entries
   beside the `Discrete`: `Dict(mode=Discrete(2), a=Box, b=Box)`, where `a` belongs to the first discrete action.
-- one `Box` for all discrete actions. With `parameter_dims` it is split among them, side by side, and always passed as a
-  whole. Without, each discrete action takes the whole box: the vector holds one copy for each, and the chosen action's
-  copy is passed.
+- one `Box` for all discrete actions. With `parameter_dims` its numbers are divided among them, side by side, and the
+  environment always gets the whole box. Without, each discrete action has the whole box: the parameters hold a copy of
+  it for each discrete action, and the environment gets the copy of the chosen one.
 
-A part may be any tree of spaces. Its discrete entries become whole parameters: see
-`hpamdp.env.gymnasium.parameter_trees`, which also says what is done about numbers that float32 cannot hold.
+A part may be any tree of spaces. Its discrete entries become integer parameters: see
+`hpamdp.env.gymnasium.parameter_trees`, which also says how numbers that float32 cannot hold are mapped.
 
 **Several components.** Every other tree has the components of its parts, one after another:
 
@@ -32,6 +36,9 @@ Then only a `OneOf` is a choice with parameters of its own.
 
 A space may have one more entry, a `Discrete`: the option, which the agent chooses less often than the action. It is the
 entry `option` of a `Dict`, or the entry that `option_key` names.
+
+Parameters have two forms. The agent's are float32, within `low` and `high`. The space's own are the numbers that the
+environment gets, float64, within `own_low` and `own_high`.
 """
 
 from __future__ import annotations
@@ -57,24 +64,25 @@ _ACCEPTED = (
 
 
 class ActionSpace:
-    """An action space, and the way from discrete actions and their parameters to the space's own format.
+    """An action space, and the conversion of discrete actions and parameters to the space's own format.
 
     Args:
         space: see the module's docstring.
-        parameter_dims: number of parameters of each discrete action, if one box for all is split among them.
-        form: `auto`: choices with parameters of their own are found; `components`: all parts are independent.
+        parameter_dims: number of parameters of each discrete action, if one box for all is divided among them.
+        form: `auto`: a `Discrete` and the parameters beside it are read as one choice; `components`: all parts are
+            independent.
 
     Attributes:
         component_sizes: number of discrete actions of each component; empty if there is one component.
         num_components: number of components.
         parameter_dims: number of parameters of each discrete action.
-        integer_parameters: which of the agent's parameters are whole numbers; empty if none is.
+        integer_parameters: which of the agent's parameters are integers; empty if all are real numbers.
         low, high: bounds of the agent's parameters, float32 `[sum(parameter_dims)]`.
-        own_low, own_high: bounds of the parameters in the space's own numbers, float64.
-        is_whole: which of these numbers are whole, bool.
+        own_low, own_high: bounds of the space's own parameters, float64 `[sum(parameter_dims)]`.
+        is_whole: which of the space's own parameters are integers, bool `[sum(parameter_dims)]`.
 
     Raises:
-        ValueError: the space is not accepted, or its box cannot be split as `parameter_dims` says.
+        ValueError: the space is not accepted, or its box cannot be divided as `parameter_dims` says.
     """
 
     def __init__(
@@ -126,21 +134,21 @@ class ActionSpace:
             discrete: the discrete actions, counted from 0 in each component, int64 `[M]` if there is one component,
                 else `[M, num_components]`.
             parameters: of all discrete actions, `[M, sum(parameter_dims)]`. Values outside their bounds are clipped;
-                NaN becomes the lower bound. Whole parameters are rounded to the nearest whole number.
-            bounds: narrower bounds in the space's own numbers, float64 `[M, sum(parameter_dims)]` each.
+                NaN becomes the lower bound. Integer parameters are rounded to the nearest integer.
+            bounds: narrower bounds of the space's own parameters, float64 `[M, sum(parameter_dims)]` each.
         """
         if self._choice is not None:
-            return self._choice.of_one(discrete, parameters, bounds)
+            return self._choice.chosen_natives(discrete, parameters, bounds)
         return self._part.natives(discrete.reshape(len(discrete), -1), parameters, bounds)
 
-    def of_agent(self, numbers: np.ndarray) -> np.ndarray:
-        """Return parameters in the space's own numbers `[M, sum(parameter_dims)]` as the agent's, float64."""
+    def to_agent(self, own: np.ndarray) -> np.ndarray:
+        """Return the agent's parameters, float64, given the space's own, `[M, sum(parameter_dims)]`."""
         ends = np.cumsum([tree.size for tree in self._trees])[:-1]
-        parts = np.split(numbers, ends, axis=-1) if self._trees else []
-        own = [tree.of_agent(part) for tree, part in zip(self._trees, parts, strict=True)]
-        return np.concatenate([np.zeros((*numbers.shape[:-1], 0)), *own], axis=-1)
+        parts = np.split(own, ends, axis=-1) if self._trees else []
+        of_trees = [tree.to_agent(part) for tree, part in zip(self._trees, parts, strict=True)]
+        return np.concatenate([np.zeros((*own.shape[:-1], 0)), *of_trees], axis=-1)
 
-    def mask(self, given: Any) -> np.ndarray:
+    def read_mask(self, given: Any) -> np.ndarray:
         """Return a mask as bool, with an entry for each discrete action of all components.
 
         Args:
@@ -154,7 +162,8 @@ class ActionSpace:
         is_flat = numbers is not None and numbers.shape == mask.shape
         is_structured = isinstance(given, tuple | list | Mapping) or isinstance(self._space, spaces.MultiBinary)
         if numbers is not None and not isinstance(self._space, spaces.MultiBinary):
-            # Nested tuples of numbers are two-dimensional, or ragged. Those of one choice have a None, too.
+            # Numbers in nested tuples make an array of two dimensions, and so they have the structure of `sample`. The
+            # structure of one choice also has a None, so it never is an array of numbers.
             is_structured &= numbers.ndim > 1 and self._choice is None
         if is_flat or not is_structured:
             if numbers is None or not is_flat or ((numbers != 0) & (numbers != 1)).any():
@@ -163,12 +172,12 @@ class ActionSpace:
         self._part.fill_mask(given, mask)
         return mask
 
-    def bound(self, given: Any, static: np.ndarray) -> np.ndarray:
-        """Return bounds of the parameters in the space's own numbers, float64 `[sum(parameter_dims)]`.
+    def read_bounds(self, given: Any, static: np.ndarray) -> np.ndarray:
+        """Return lower or upper bounds of the space's own parameters, float64 `[sum(parameter_dims)]`.
 
         Args:
             given: the numbers side by side, or in the structure of the space. Parts may be None or, in a dict, missing.
-            static: the bounds where none are given.
+            static: the bounds of parts that are None or missing, `[sum(parameter_dims)]`.
 
         Raises:
             MisfitError: the bounds have neither form.
@@ -185,18 +194,18 @@ class ActionSpace:
 
 
 class OptionSpace:
-    """The entry of an action space that is the option, taken out of it and put back in.
+    """Takes the option out of an action space, and puts it back into actions.
 
     Args:
         space: of the environment's actions.
-        option_key: the option's name in a `Dict` or its number in a `Tuple`; None: the entry `option` of a `Dict`.
+        option_key: the option's name in a `Dict` or its number in a `Tuple`. If None, the entry `option` of a `Dict`.
 
     Attributes:
         rest: the space without the option.
-        num_options: how many options there are; 0: the space has none.
+        num_options: number of options; 0 if the space has no option.
 
     Raises:
-        ValueError: the space has no such entry, or it is no `Discrete`.
+        ValueError: the space has no such entry, or the entry is not a `Discrete`.
     """
 
     def __init__(self, space: spaces.Space, option_key: int | str | None = None) -> None:
@@ -210,7 +219,7 @@ class OptionSpace:
         self._is_dict = isinstance(space, spaces.Dict)
         if option_key is None:
             others = [entry for name, entry in entries.items() if name != "option"]
-            # If boxes alone are left, or one entry that is no action by itself, `option` is the name of the action.
+            # If only boxes are left, or one entry that is no action by itself, `option` is the discrete action.
             is_action = all(isinstance(other, spaces.Box) for other in others)
             is_action |= len(others) == 1 and not _is_action(others[0])
             if not self._is_dict or len(others) == len(entries) or is_action:

@@ -25,8 +25,8 @@ from hpamdp.env.gymnasium.copies import Copies, Reading
 from hpamdp.env.gymnasium.form import OwnForm, joined
 from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.making import Maker
-from hpamdp.env.gymnasium.masks import MaskSource
-from hpamdp.env.gymnasium.parameter_bounds import of_agent
+from hpamdp.env.gymnasium.masks import MaskSource, as_leaf
+from hpamdp.env.gymnasium.parameter_bounds import agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics, Scaling
 from hpamdp.env.registration import register
@@ -94,7 +94,10 @@ class GymnasiumOptions(Settings):
     raw_observations: list[int | str] | None = None
     """Entries that stay unscaled: names in a `Dict`, numbers in a `Tuple` or of the vector. If None, all are scaled."""
     reward_scaling: PositiveFraction | None = None
-    """Divide rewards in training by the running deviation of the return with this discount. If None, they stay."""
+    """Divide rewards in training by the running standard deviation of the return with this discount.
+
+    If None, rewards are not scaled.
+    """
     out_of_bounds: OutOfBounds = "refuse"
     """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""
     num_workers: NonNegativeInt = 0
@@ -463,7 +466,7 @@ class GymnasiumEnv(PAMDPEnv):
         observation = self._observation
         bounds = {}
         if results.bounds is not None:
-            low, high, seen = of_agent(self._copies.actions, *results.bounds)
+            low, high, seen = agent_bounds(self._copies.actions, *results.bounds)
             observation = np.concatenate([observation, seen], axis=-1)
             bounds = {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
         leaves = {
@@ -474,9 +477,7 @@ class GymnasiumEnv(PAMDPEnv):
             keys.DONE: torch.from_numpy(columns[3]),
         }
         for name, mask in results.masks.items():
-            leaves[name] = torch.from_numpy(mask != 0.0)
-            if name == keys.PAIR_MASK:
-                leaves[name] = leaves[name].unflatten(-1, (len(self.parameter_dims), -1))
+            leaves[name] = as_leaf(name, torch.from_numpy(mask != 0.0), len(self.parameter_dims))
         leaves |= bounds
         if reward is not None:
             leaves[keys.REWARD] = torch.from_numpy(reward[:, None])

@@ -14,8 +14,8 @@ from tensordict import TensorDict, TensorDictBase
 from hpamdp import keys
 from hpamdp.env.gymnasium.action_spaces import written
 from hpamdp.env.gymnasium.copies import Copies, Reading
-from hpamdp.env.gymnasium.masks import Masks
-from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds, of_agent
+from hpamdp.env.gymnasium.masks import Masks, as_leaf
+from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds, agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling
 from hpamdp.env.gymnasium_form import GymnasiumForm, VectorScaling, checked_mask
@@ -56,12 +56,12 @@ class OwnForm(GymnasiumForm):
                 of_row = {name: _of_row(of_row[name], row) for name in in_info if name in of_row}
             masks.keep(row, single, of_row)
             bounds.keep(row, single, of_row)
-        sizes = {keys.ACTION_MASK: actions.component_sizes}
-        rows = {name: checked_mask(name, mask, sizes.get(name, ())) for name, mask in masks.rows.items()}
-        if keys.PAIR_MASK in rows:
-            rows[keys.PAIR_MASK] = rows[keys.PAIR_MASK].unflatten(-1, (len(actions.parameter_dims), -1))
+        rows = {}
+        for name, mask in masks.rows.items():
+            component_sizes = actions.component_sizes if name == keys.ACTION_MASK else ()
+            rows[name] = as_leaf(name, checked_mask(name, mask, component_sizes), len(actions.parameter_dims))
         if bounds.names:
-            low, high, seen = of_agent(actions, bounds.low, bounds.high)
+            low, high, seen = agent_bounds(actions, bounds.low, bounds.high)
             observed = np.concatenate([observed, seen], axis=-1)
             rows |= {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
         pixels = np.stack([self._observations.pixels(single) for single in singles])

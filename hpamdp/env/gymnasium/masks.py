@@ -11,6 +11,7 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env.errors import ProblemError
@@ -49,13 +50,14 @@ class Masks:
         env: one of the copies.
         num_envs: number of copies.
         actions: their action space, without the option.
-        num_options: number of options; 0: there is none to choose.
+        num_options: number of options; 0 without options.
         source: where `action_mask` and `option_mask` are. `info`: they come with the info of every reset and step;
-            `ignore`: they are ignored; None: they are entries of the observation, a `Dict`, if it has them.
+            `ignore`: they are ignored. If None, they are entries of the observation, a `Dict`, if it has them.
         pair_source: the same for `pair_mask`.
 
     Attributes:
-        rows: the masks that are honoured, by name, bool `[N, K]` each; `pair_mask` is flattened, `[N, K K]`.
+        rows: the masks that are read, by name, bool `[N, K]` each; `pair_mask` is flattened, `[N, K * K]`. `as_leaf`
+            gives it its own shape.
         in_observation: names of the masks that come with the observation.
 
     Raises:
@@ -124,7 +126,7 @@ class Masks:
         """Return a mask as bool `[size]`."""
         if name == keys.ACTION_MASK:
             try:
-                return self._actions.mask(given)
+                return self._actions.read_mask(given)
             except MisfitError as error:
                 raise error.named(name, given) from error
         mask = as_numbers(given)
@@ -160,6 +162,11 @@ class Masks:
                 f"gave an {name} as {place}, which is not read; give it as {name} in a Dict of observations, or in the "
                 f"info of every reset and step with {setting}=info; {setting}=ignore ignores it"
             )
+
+
+def as_leaf(name: str, mask: Tensor, num_discrete: int) -> Tensor:
+    """Return one of `Masks.rows` in the shape of its leaf: `[N, K, K]` for `pair_mask`, otherwise as it is."""
+    return mask.unflatten(-1, (num_discrete, num_discrete)) if name == keys.PAIR_MASK else mask
 
 
 def _in_space(space: spaces.Space) -> Iterator[tuple[str, str, Any]]:

@@ -1,4 +1,4 @@
-"""Bounds of the parameters that a Gymnasium environment gives with every state, and what an agent sees of them."""
+"""Bounds of the parameters that a Gymnasium environment gives in every state, and how an agent observes them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from hpamdp.env.gymnasium.values import MisfitError
 from hpamdp.settings import SettingError
 
 _NAMES = (keys.PARAMETER_LOW, keys.PARAMETER_HIGH)
-_ROUNDING = 4.0 * float(np.finfo(np.float32).eps)  # beyond a bound of the space that counts as rounding
+# A bound may exceed those of the space by this fraction of their size. It is then clipped, as a rounding error.
+_ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
 
 
 class ParameterBounds:
@@ -27,13 +28,13 @@ class ParameterBounds:
         env: one of the copies.
         num_envs: number of copies.
         actions: their action space, without the option.
-        source: `info`: the bounds come with the info of every reset and step; `ignore`: they are not read; None: they
-            are entries of the observation, a `Dict`, if it has them.
+        source: `info`: the bounds come with the info of every reset and step; `ignore`: they are not read. If None,
+            they are entries of the observation, a `Dict`, if it has them.
 
     Attributes:
-        names: which of `parameter_low` and `parameter_high` are read; empty if none is.
+        names: those of `parameter_low` and `parameter_high` that are read; empty if the environment gives neither.
         in_observation: whether they come with the observation.
-        low, high: the bounds in the space's own numbers, float64 `[N, num_parameters]`.
+        low, high: the bounds of the space's own parameters, float64 `[N, num_parameters]`.
 
     Raises:
         ValueError: `source` is none of these, or there are no parameters.
@@ -79,7 +80,7 @@ class ParameterBounds:
     def _checked(self, name: str, given: Any, static: np.ndarray) -> np.ndarray:
         actions = self._actions
         try:
-            bound = static if given is None else actions.bound(given, static)
+            bound = static if given is None else actions.read_bounds(given, static)
         except MisfitError as error:
             raise error.named(name, given) from error
         self._refuse_where(~np.isfinite(bound), name, bound, "which is not finite")
@@ -98,25 +99,25 @@ class ParameterBounds:
             raise ProblemError(f"gave {name}={bound[place]:.10g} for parameter {place}, {reason}")
 
 
-def of_agent(actions: ActionSpace, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the bounds of states as an agent gets them.
+def agent_bounds(actions: ActionSpace, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the bounds of the agent's parameters, and the numbers by which it observes them.
 
     Args:
         actions: the action space.
-        low, high: the bounds in the space's own numbers, float64 `[N, num_parameters]` each.
+        low, high: the bounds of the space's own parameters, float64 `[N, num_parameters]` each.
 
     Returns:
-        The bounds of the agent's parameters, float32 `[N, num_parameters]` each: every float32 between them is inside
-        the exact ones. And what the agent observes of them: both, scaled so that the bounds of the space are -1 and 1,
-        float32 `[N, 2 num_parameters]`.
+        The lower and the upper bounds of the agent's parameters, float32 `[N, num_parameters]` each. They are rounded
+        inwards, so every float32 between them is within the exact bounds. Last, all lower and all upper bounds as the
+        agent observes them, float32 `[N, 2 num_parameters]`: scaled so that the bounds of the space are -1 and 1.
     """
-    exact = actions.of_agent(low), actions.of_agent(high)
+    exact = actions.to_agent(low), actions.to_agent(high)
     width = actions.high.astype(np.float64) - actions.low
     seen = np.concatenate([2.0 * (side - actions.low) / width - 1.0 for side in exact], axis=-1)
     lowest, highest = (side.astype(np.float32) for side in exact)
     lowest = np.where(lowest < exact[0], np.nextafter(lowest, np.float32(np.inf)), lowest)
     highest = np.where(highest > exact[1], np.nextafter(highest, np.float32(-np.inf)), highest)
-    is_crossed = lowest > highest  # no float32 lies between
+    is_crossed = lowest > highest  # no float32 lies between the exact bounds
     lowest = np.where(low <= actions.own_low, actions.low, lowest)
     highest = np.where(high >= actions.own_high, actions.high, highest)
     lowest, highest = (side.clip(actions.low, actions.high) for side in (lowest, highest))

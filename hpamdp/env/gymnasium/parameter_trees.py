@@ -1,17 +1,17 @@
-"""Trees of Gymnasium spaces whose numbers are all parameters of one discrete action, or of several side by side.
+"""Trees of Gymnasium spaces whose numbers are all parameters: of one discrete action, or of several side by side.
 
-A `Box` gives one parameter for each number, a `Discrete`, `MultiDiscrete` or `MultiBinary` one whole number for each
-entry. A `OneOf` gives a whole number, the alternative, then the parameters of all alternatives. An entry that allows
-one value alone, such as `Discrete(1)`, gives no parameter.
+A `Box` has one parameter for each number. A `Discrete`, `MultiDiscrete` or `MultiBinary` has one integer parameter for
+each number. A `OneOf` has an integer parameter, the alternative, and then the parameters of all alternatives. A number
+with a single value, as in `Discrete(1)`, is no parameter.
 
-An agent's parameters are float32. Usually they are the numbers of the space. There are three exceptions, in which
-float32 cannot hold these:
+An agent's parameters are float32. Usually they are the numbers of the space. There are three exceptions, where float32
+cannot hold these numbers:
 
-- In some more precise Boxes float32 cannot resolve a millionth of the width, as with times in seconds since 1970. The
-  agent's parameter then lies in [-1, 1], and is mapped to the Box in float64.
-- Whole numbers beyond 16,777,216 are counted from their lower bound.
-- If there are more than 16,777,216 whole numbers between the bounds, the agent's parameter is a real number in [-1, 1].
-  Each whole number has a cell of equal width.
+- A float64 `Box` with large bounds close together, such as times in seconds since 1970: float32 cannot resolve a
+  millionth of its width. The agent's parameter then lies in [-1, 1], and is mapped to the `Box` in float64.
+- Integers beyond 16,777,216. They are counted from their lower bound.
+- More than 16,777,216 integers between the bounds. The agent's parameter is then a real number in [-1, 1], in which
+  each integer has a cell of equal width.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from gymnasium import spaces
 
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers
 
-# Of a parameter, in widths of its Box.
+# The largest distance between neighbouring float32 that counts as fine enough, as a fraction of the width of a Box.
 _RESOLUTION = 1e-6
-_MOST_EXACT = float(1 << 24)  # up to which float32 holds all whole numbers
-_MOST_WHOLE = 1 << 53  # the same for float64
-_WHOLE = np.dtype(np.int64)  # stands for all dtypes of whole numbers
+_MOST_EXACT = float(1 << 24)  # float32 holds all integers up to this one
+_MOST_WHOLE = 1 << 53  # float64 holds all integers up to this one
+_WHOLE = np.dtype(np.int64)  # stands for all integer dtypes
 
-# From parameters by dtype, `[M, size]` each and inside their bounds, to M values of a space.
+# Makes M values of a space from parameters `[M, size]` within their bounds, which are given in each dtype of the space.
 _Build = Callable[[Mapping[np.dtype, np.ndarray]], list[Any]]
 
 
@@ -46,9 +46,8 @@ class _Entry:
     Attributes:
         space: a `Box`, `Discrete`, `MultiDiscrete` or `MultiBinary`.
         low, high: bounds of its numbers, float64 `[numbers]`.
-        is_free: which numbers are parameters; the others have one value, bool `[numbers]`.
-        own: of the parameters.
-        start: number of the first parameter.
+        is_free: which numbers are parameters, bool `[numbers]`. The others have a single value.
+        start: place of the first parameter among those of the tree.
     """
 
     space: spaces.Space
@@ -59,17 +58,17 @@ class _Entry:
 
     @property
     def own(self) -> slice:
-        """The parameters' place."""
+        """Places of the parameters among those of the tree."""
         return slice(self.start, self.start + int(self.is_free.sum()))
 
     @property
     def is_float(self) -> bool:
-        """Whether the numbers are not whole."""
+        """Whether the numbers are floats."""
         return self.space.dtype is not None and np.dtype(self.space.dtype).kind == "f"
 
 
 class ParameterTree:
-    """The parameters of a tree of spaces, and the way from parameters to its values.
+    """The parameters of a tree of spaces, and the conversion of parameters to values of the tree.
 
     Args:
         space: see the module's docstring.
@@ -77,10 +76,10 @@ class ParameterTree:
     Attributes:
         size: number of parameters.
         low, high: bounds of the agent's parameters, float64 `[size]`.
-        is_integer: which of the agent's parameters are whole numbers, bool `[size]`.
+        is_integer: which of the agent's parameters are integers, bool `[size]`.
 
     Raises:
-        NotAcceptedError: the tree has another space in it, or bounds that are not finite.
+        NotAcceptedError: the tree has a space of another kind, or bounds that are not finite.
     """
 
     def __init__(self, space: spaces.Space) -> None:
@@ -98,9 +97,11 @@ class ParameterTree:
             self._bounds[_WHOLE] = (self._lows, self._highs)
         is_many = ~is_float & (self._highs - self._lows >= _MOST_EXACT)
         largest = np.maximum(np.abs(self._lows), np.abs(self._highs))
+        # The agent's parameter lies in [-1, 1].
         self._is_unit = (is_precise & ~_is_resolved(self._lows, self._highs)) | is_many
+        # Integers with too many values for float32, which have cells in [-1, 1].
         self._is_many = is_many
-        # Of whole numbers that float32 holds only if they are counted from the lowest.
+        # Lower bounds of integers that float32 holds only if they are counted from there.
         self._shift = np.where(~is_float & ~is_many & (largest > _MOST_EXACT), self._lows, 0.0)
         self._is_mapped = bool(self._is_unit.any() or self._shift.any())
         self.low = np.where(self._is_unit, -1.0, self._lows - self._shift)
@@ -112,52 +113,56 @@ class ParameterTree:
 
         Args:
             parameters: the agent's, `[M, size]`. Values outside their bounds are clipped, and NaN becomes the lower
-                bound. Whole numbers are rounded to the nearest one.
-            bounds: narrower bounds in the space's own numbers, float64 `[M, size]` each.
+                bound. Integer parameters are rounded to the nearest integer.
+            bounds: narrower bounds of the space's own parameters, float64 `[M, size]` each.
         """
         if self._is_mapped:
             parameters = self._mapped(parameters)
         # Clipped in the space's own precision: its bounds may differ from the float32 ones by rounding. fmax skips NaN.
         clipped = {}
         for dtype, (low, high) in self._bounds.items():
-            values: Any = np.rint(parameters.astype(np.float64)) if dtype == _WHOLE else _cast(parameters, dtype)
-            if bounds is not None:
-                low, high = (side if dtype == _WHOLE else _cast(side, dtype) for side in bounds)
+            if dtype == _WHOLE:
+                values: Any = np.rint(parameters.astype(np.float64))
+                low, high = (low, high) if bounds is None else bounds
+            else:
+                values = _cast(parameters, dtype)
+                low, high = (low, high) if bounds is None else (_cast(bounds[0], dtype), _cast(bounds[1], dtype))
             clipped[dtype] = np.fmin(np.fmax(values, low), high)
         return self._build(clipped)
 
     def _mapped(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the agent's parameters `[M, size]` in the space's own numbers."""
-        share = 0.5 * (np.clip(parameters.astype(np.float64), -1.0, 1.0) + 1.0)
+        """Return the space's own parameters, given the agent's, `[M, size]`."""
+        fraction = 0.5 * (np.clip(parameters.astype(np.float64), -1.0, 1.0) + 1.0)
         width = self._highs - self._lows
-        units = self._lows + np.where(self._is_many, np.floor(share * (width + 1.0)), share * width)
-        return np.where(self._is_unit, units, np.where(self._shift != 0.0, parameters + self._shift, parameters))
+        offset = np.where(self._is_many, np.floor(fraction * (width + 1.0)), fraction * width)
+        shifted = np.where(self._shift != 0.0, parameters + self._shift, parameters)
+        return np.where(self._is_unit, self._lows + offset, shifted)
 
-    def of_agent(self, numbers: np.ndarray) -> np.ndarray:
-        """Return the space's own numbers `[*M, size]` as the agent's parameters, float64."""
-        width = self._highs - self._lows
-        cell = np.where(self._is_many, 0.5, 0.0)
+    def to_agent(self, own: np.ndarray) -> np.ndarray:
+        """Return the agent's parameters, float64, given the space's own, `[*M, size]`."""
+        half_cell = np.where(self._is_many, 0.5, 0.0)
+        width = np.maximum(self._highs - self._lows + 2.0 * half_cell, np.finfo(float).tiny)
         with np.errstate(invalid="ignore"):
-            units = 2.0 * (numbers - self._lows + cell) / np.maximum(width + 2.0 * cell, np.finfo(float).tiny) - 1.0
-        return np.where(self._is_unit, units, numbers - self._shift)
+            unit = 2.0 * (own - self._lows + half_cell) / width - 1.0
+        return np.where(self._is_unit, unit, own - self._shift)
 
     @property
     def own_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """The bounds in the space's own numbers, float64 `[size]` each."""
+        """Lower and upper bounds of the space's own parameters, float64 `[size]` each."""
         return self._lows, self._highs
 
     @property
     def is_whole(self) -> np.ndarray:
-        """Which of the space's own numbers are whole, bool `[size]`."""
+        """Which of the space's own parameters are integers, bool `[size]`."""
         return self.is_integer | self._is_many
 
     def fill(self, given: Any, numbers: np.ndarray) -> None:
-        """Write numbers that are given in the structure of the space into a vector of the space's own numbers.
+        """Write numbers that are given in the structure of the space into a vector of the space's own parameters.
 
         Args:
-            given: as a value of the space, except that parts may be None or, in a dict, missing. They change nothing.
-                So do choices of alternatives.
-            numbers: float64 `[size]`.
+            given: in the structure of a value of the space. Parts may be None or, in a dict, missing; the vector then
+                keeps their numbers. The choice of an alternative is ignored.
+            numbers: the vector, float64 `[size]`.
 
         Raises:
             MisfitError: `given` has another structure.
@@ -194,10 +199,10 @@ class ParameterTree:
 
 
 def bounds_of(space: spaces.Space) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the bounds of a space without parts, float64 `[numbers]` each, and which numbers can vary, bool.
+    """Return the bounds of a space without parts, float64 `[numbers]` each, and which of its numbers can vary, bool.
 
     Raises:
-        NotAcceptedError: the space is of another kind, or its bounds are not finite.
+        NotAcceptedError: the space has parts or is of another kind, or its bounds are not finite.
     """
     if isinstance(space, spaces.Discrete):
         low, high = np.array([space.start], np.int64), np.array([space.start + space.n - 1], np.int64)
@@ -205,7 +210,8 @@ def bounds_of(space: spaces.Space) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         low = np.asarray(space.start, np.int64).ravel()
         high = low + np.asarray(space.nvec, np.int64).ravel() - 1
     elif isinstance(space, spaces.MultiBinary):
-        low, high = np.zeros(int(np.prod(space.shape)), np.int64), np.ones(int(np.prod(space.shape)), np.int64)
+        size = int(np.prod(space.shape))
+        low, high = np.zeros(size, np.int64), np.ones(size, np.int64)
     elif isinstance(space, spaces.Box) and space.dtype.kind in "f":
         return _float_bounds(space)
     elif isinstance(space, spaces.Box) and space.dtype.kind in "iub":
@@ -308,7 +314,7 @@ def _fill_mapping(parts: Mapping[str, Callable[[Any, np.ndarray], None]]) -> Cal
 
 def by_row(values: np.ndarray, shape: tuple[int, ...]) -> list[np.ndarray]:
     """Return the rows of values `[M, size]` as arrays of this shape."""
-    if len(shape) == 1:  # as a rule
+    if len(shape) == 1:  # the usual case, without a reshape
         return list(values)
     rows = values.reshape(len(values), *shape)
     return list(rows) if shape else [rows[row, ...] for row in range(len(rows))]
@@ -317,7 +323,7 @@ def by_row(values: np.ndarray, shape: tuple[int, ...]) -> list[np.ndarray]:
 def _cast(parameters: np.ndarray, dtype: np.dtype) -> np.ndarray:
     if dtype.itemsize >= 4:
         return parameters.astype(dtype, copy=False)
-    with np.errstate(over="ignore"):  # parameters of other boxes
+    with np.errstate(over="ignore"):  # a column of another box may be too large for this dtype; it is not used
         return parameters.astype(dtype)
 
 
