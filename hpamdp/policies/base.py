@@ -469,10 +469,9 @@ class Learner(Level, nn.Module):
 
         Target networks give the value, if the learner has any.
 
-        A learner that can have a memory also takes `memory`, as the next argument, and the keyword `has_seen`. They are
-        passed only if it has a `memory_key`, so learners without a memory need not take them. `memory` is the state of
-        its memory in these states, `[N, size]`; if None, the memory is empty. `has_seen` says whether the memory has
-        seen the observations already, as that of a stored step has.
+        A learner that can have a memory takes two more arguments. `memory`: the memory's states, `[N, size]`; if None,
+        the memory is empty. `has_seen`: whether the memory has seen the observations already, as that of a stored step
+        has. They are passed only to a learner with a `memory_key`, so other learners need not take them.
 
         Args:
             observation: of the states.
