@@ -1,6 +1,7 @@
 """Draw and tabulate every study again from its csv files, and collect all pages in one report.
 
-python experiments/report.py    runs `main([])` of every study.py; renews the tables in the Markdown pages; writes
+python experiments/report.py    runs `main([])` of every study.py; renews the tables in the Markdown pages; says which
+                                numbers in their sentences differ from the csv files (claims.py); writes
                                 report/report.html, and every figure as SVG
 
 In the page of a study, `<!-- table -->` and `<!-- /table -->` enclose all its tables. In the project's README, that of
@@ -74,6 +75,7 @@ def report(experiments: Path, target: Path) -> list[str]:
         if page.exists():
             failures += renew_numbered(page, tables)
     failures += renew_filled(root / "docs")
+    failures += differing_sentences(experiments)
     (target / "report.html").write_text(bind(pages), encoding="utf-8")
     return failures
 
@@ -208,6 +210,12 @@ def renew_filled(docs: Path) -> list[str]:
         if renewed != text:
             page.write_text(renewed, encoding="utf-8")
     return failures
+
+
+def differing_sentences(experiments: Path) -> list[str]:
+    """Return a line for each number in a page's sentence that differs from the csv files; see claims.py."""
+    script = experiments / "claims.py"
+    return _load(script, "claims").differences() if script.exists() else []
 
 
 def to_html(text: str, folder: Path) -> tuple[str, list[str]]:

@@ -1,0 +1,28 @@
+"""Tabulate the hostile inputs of hostile_round.py before and after the checks.
+
+python experiments/reliability/study.py    tabulates the stored hostile.csv
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from hpamdp.analysis.study import read_csv
+
+HERE = Path(__file__).resolve().parent
+OUTCOMES = ("traceback", "silent", "harm")
+
+
+def main(words: Sequence[str]) -> None:
+    """Print a line for each kind of input."""
+    print("| kind | cases | before: traceback | wrong in silence | harm | after: traceback | wrong in silence | harm |")
+    print("|---|---|---|---|---|---|---|---|")
+    for row in read_csv(HERE / "hostile.csv"):
+        counts = [row[f"{outcome}_{when}"] for when in ("before", "after") for outcome in OUTCOMES]
+        print(f"| {row['kind']} | {row['cases']:,} | {' | '.join(map(str, counts))} |")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
