@@ -5,6 +5,7 @@ claims.py has the sentences.
 
 from __future__ import annotations
 
+import math
 import re
 import string
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,10 +16,10 @@ WORDS = [
     *("zero", "one", "two", "three", "four", "five", "six", "seven"),
     *("eight", "nine", "ten", "eleven", "twelve", "thirteen", "fourteen", "fifteen"),
 ]
-# A number as a page writes it, and several: "4,000 to 5,000", "3.577 ± 0.002", "220 and 226", "0, 0, 0".
+# A number as a page writes it, and several: "4,000 to 5,000", "3.577 ± 0.002", "220 and 226", "400, never, 600".
 DIGITS = r"[-\u2212+]?\d+(?:,\d{3})*(?:\.\d+)?"
 WORD = rf"\b(?i:{'|'.join(WORDS)})\b"
-NUMBERS = rf"(?:{DIGITS}|{WORD})(?:(?:\s+to\s+|\s+and\s+|,\s+|\s+±\s+)(?:{DIGITS}|{WORD}))*"
+NUMBERS = rf"(?:{DIGITS}|{WORD}|never)(?:(?:\s+to\s+|\s+and\s+|,\s+|\s+±\s+)(?:{DIGITS}|{WORD}|never))*"
 # What must be in a claim: a number in digits, or a number of seeds in words.
 RESULT = re.compile(rf"(?<![\w.]){DIGITS}(?!\w|\.\d)|{WORD}(?=\s+seeds?\b)")
 # What is no sentence: renewed tables, code, and the addresses of links.
@@ -57,7 +58,9 @@ def spaced(words: str) -> str:
 
 
 def in_prose(value: Any, style: str) -> str:
-    """Return a number as a page writes it, with a minus sign instead of a hyphen."""
+    """Return a number as a page writes it, with a minus sign instead of a hyphen; infinity is never."""
+    if value == math.inf:
+        return "never"
     if style in ("word", "Word"):
         word = WORDS[value] if value < len(WORDS) else f"{value:,}"
         return word.capitalize() if style == "Word" else word
@@ -78,7 +81,7 @@ def compare(claims: Iterable[Claim], root: Path, write: bool = False) -> list[st
         text = page.read_text(encoding="utf-8")
         found = list(claim.pattern.finditer(text))
         if len(found) != 1:
-            lines.append(f"{claim.page}: has {len(found)} times, not once: {claim.sentence}")
+            lines.append(f"{claim.page}: has this {len(found)} times, not once: {claim.sentence}")
             continue
         if not claim.holds:
             lines.append(f"{claim.page}: by the csv files this is not true: {' '.join(found[0][0].split())}")
@@ -86,8 +89,8 @@ def compare(claims: Iterable[Claim], root: Path, write: bool = False) -> list[st
             said, number = " ".join(found[0][place].split()), claim.numbers[place - 1]
             if said != number:
                 start, end = found[0].span(place)
-                before = " ".join(text[:start].split()[-5:])
-                lines.append(f'{claim.page}: "{before} {said}" says {said}, the csv files {number}')
+                until_there = " ".join(text[:end].split()[-7:])
+                lines.append(f'{claim.page}: "{until_there}" says {said}, the csv files {number}')
                 text = text[:start] + number + text[end:]
         if write:
             page.write_text(text, encoding="utf-8")
@@ -122,6 +125,6 @@ def uncovered(
                     missing -= {other} if places else set()
                 for found in RESULT.finditer(text):
                     if not any(start <= found.start() < end for start, end in covered):
-                        before, after = text[: found.start()].split()[-4:], text[found.end() :].split()[:4]
-                        lines.append(f'{name}: "{" ".join([*before, found[0], *after])}": {found[0]} is in no claim')
+                        until_there = " ".join(text[: found.end()].split()[-7:])
+                        lines.append(f'{name}: "{until_there}": {found[0]} is in no claim')
     return [*lines, *(f"{other!r} is in none of the pages' parts" for other in sorted(missing))]

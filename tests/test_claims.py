@@ -58,6 +58,7 @@ def test_a_sentence_that_agrees_has_no_line_and_its_page_stays(sentences, page):
         ({"score": "3.578 ± 0.002"}, '"It scores 3.577 ± 0.002" says 3.577 ± 0.002, the csv files 3.578 ± 0.002'),
         ({"seeds": 10}, "says three, the csv files ten"),
         ({"presses": "4,000"}, "says 4,000 to 5,000, the csv files 4,000"),
+        ({"before": float("inf")}, "says −1.1, the csv files never"),  # noqa: RUF001
         ({"before": 0.04}, "says −1.1, the csv files 0.0"),  # noqa: RUF001
     ],
 )
@@ -79,9 +80,9 @@ def test_a_sentence_that_is_gone_or_there_twice_or_no_longer_true_is_told(senten
     ]
     text = page.read_text()
     page.write_text(text.replace("scores", "returns"))
-    assert "has 0 times, not once: It scores {score}" in sentences.compare([claim(sentences)], page.parent)[0]
+    assert "has this 0 times, not once: It scores {score}" in sentences.compare([claim(sentences)], page.parent)[0]
     page.write_text(text * 2)
-    assert "has 2 times, not once: It scores {score}" in sentences.compare([claim(sentences)], page.parent)[0]
+    assert "has this 2 times, not once: It scores {score}" in sentences.compare([claim(sentences)], page.parent)[0]
 
 
 @pytest.mark.parametrize(
