@@ -841,6 +841,7 @@ def hybrid_control() -> list[Claim]:
     independent, autoregressive = runs("lunar_lander", "independent"), runs("lunar_lander", "autoregressive")
     early = groups(rows("hybrid_control/curves.csv", problem="gymnasium", frames=20480), "variant")
     numbers = dict(
+        bar=200,
         early=[mean(early[variant,]) for variant in ("independent", "autoregressive", "one choice")],
         independent=mean(independent),
         autoregressive=mean(autoregressive),
@@ -851,21 +852,23 @@ def hybrid_control() -> list[Claim]:
     return [
         Claim(
             page("hybrid_control"),
-            "both independent and autoregressive heads land on average ({independent:.0f} and {autoregressive:.0f}), "
-            "and {seeds:word} seeds tell no difference.",
+            "the mean return of both independent and autoregressive heads is above {bar} ({independent:.0f} and "
+            "{autoregressive:.0f}), the return of a solved episode. {seeds:Word} seeds show no difference between "
+            "them.",
             numbers,
-            holds=not difference(column(autoregressive, "score"), column(independent, "score")).is_clear,
+            holds=min(mean(independent), mean(autoregressive)) > numbers["bar"]
+            and not difference(column(autoregressive, "score"), column(independent, "score")).is_clear,
         ),
         Claim(
             page("hybrid_control"),
-            "autoregressive heads come within {below:.0f} % of the best return. Independent heads reach "
+            "Autoregressive heads come within {below:.0f} % of the best return there. Independent heads reach "
             "{reached:.0f} % of it,",
             numbers,
         ),
         Claim(
             page("hybrid_control"),
-            "at 20,480 steps independent heads get {early[0]:.1f}, autoregressive heads {early[1]:.1f} and one choice "
-            "{early[2]:.1f}.",
+            "at 20,480 steps the return is {early[0]:.1f} with independent heads, {early[1]:.1f} with autoregressive "
+            "heads and {early[2]:.1f} with one choice.",
             numbers,
         ),
     ]
@@ -887,12 +890,14 @@ def lengths() -> list[Claim]:
     return [
         Claim(
             page("lengths"),
-            "On Crossing, with {seeds:word} seeds each, no. Lengths that the selector chooses reach {chosen} % of the "
-            "best return, learned terminations {learned:.0f} %.",
+            "On Crossing, with {seeds:word} seeds each: better than a fixed length, but not as good as learned "
+            "terminations. Lengths that the selector chooses reach {chosen} % of the best return, and learned "
+            "terminations {learned:.0f} %.",
             numbers,
-            holds=max(chosen) < learned,
+            holds=100.0 * mean(runs("steps"), "share") < min(chosen) <= max(chosen) < learned,
         ),
-        Claim(page("lengths"), "On Rooms there is {rooms_seeds:word} seed, with {rooms:.0f} %,", numbers),
+        Claim(page("lengths"), "On Rooms only {rooms_seeds:word} seed was run, without a comparison.", numbers),
+        Claim(page("lengths"), "It reaches {rooms:.0f} %.", numbers),
     ]
 
 
@@ -973,6 +978,8 @@ def options() -> list[Claim]:
         pets_seed=pets["seed"],
         pets_crossing=mean(crossing["pets", "meta_critic"], "share"),
         dlpa_crossing=mean(crossing["dlpa", "meta_critic"], "share"),
+        changing=100.0 * changing["share"],
+        meta_critic_rooms=span([mean(rooms[low, "meta_critic"], "share") for low in ("hppo", "pdqn")], ".2f"),
     )
     return [
         Claim(
@@ -1011,6 +1018,16 @@ def options() -> list[Claim]:
         Claim(
             "docs/learners/pets.md",
             "On Crossing, under the meta-critic, it reaches {pets_crossing:.2f} of the best return with them",
+            numbers,
+        ),
+        Claim(
+            "docs/selectors/meta_critic.md",
+            "On Rooms it reaches {meta_critic_rooms} of the best return over H-PPO and P-DQN",
+            numbers,
+        ),
+        Claim(
+            "docs/selectors/meta_critic.md",
+            "With a boat that may be changed for 0.1 s of fuel it reaches {changing:.1f} % of the ceiling.",
             numbers,
         ),
     ]
