@@ -68,6 +68,17 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 140
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/usage.md"])
+def test_a_page_with_the_choices_of_the_groups_names_each_of_them(page):
+    text = (ROOT / page).read_text()
+    choices = {
+        path.stem
+        for group in ("env", "high", "low", "data", "collector", "logger")
+        for path in (ROOT / "conf" / group).glob("*.yaml")
+    }
+    assert not {name for name in choices - {"auto"} if f"`{name}`" not in text}
+
+
 def test_the_page_of_the_architecture_is_short():
     assert len((ROOT / "docs/architecture.md").read_text().splitlines()) <= 160
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
+from itertools import chain
 from typing import Any, Literal
 
 import gymnasium
@@ -115,12 +116,13 @@ class Masks:
         for name, masks in self.rows.items():
             given = (observation if name in self.in_observation else info).get(name)
             if given is None and name == keys.OPTION_MASK:
-                self._refuse([*_in_mapping("info", info)], ProblemError, {name: masks.shape[1]})
+                self._refuse([*in_mapping("info", info, _meaning)], ProblemError, {name: masks.shape[1]})
                 masks[row] = True
                 continue
             masks[row] = self._flat(name, given, masks.shape[1])
         if self._unread and not (_is_plain(info) and _is_plain(observation)):
-            self._refuse([*_in_mapping("info", info), *_in_mapping("observation", observation)], ProblemError)
+            places = in_mapping("info", info, _meaning), in_mapping("observation", observation, _meaning)
+            self._refuse([*chain(*places)], ProblemError)
 
     def _flat(self, name: str, given: Any, size: int) -> np.ndarray:
         """Return a mask as bool `[size]`."""
@@ -155,7 +157,9 @@ class Masks:
         unread = self._unread if unread is None else unread
         for place, entry, value in places:
             name = _meaning(entry)
-            if name is None or name not in unread or (_is_vague(entry) and not _is_like_mask(value, unread[name])):
+            if name is None or name not in unread or _cannot_be_mask(value):
+                continue
+            if _is_vague(entry) and not _is_like_mask(value, unread[name]):
                 continue
             setting = _SETTINGS[name]
             raise error(
@@ -176,14 +180,24 @@ def _in_space(space: spaces.Space) -> Iterator[tuple[str, str, Any]]:
             yield f"{leaf.what} of the observation", str(entry), np.zeros(leaf.space.shape or ())
 
 
-def _in_mapping(place: str, values: Any, depth: int = _DEPTH) -> Iterator[tuple[str, str, Any]]:
-    """Yield the entries of nested dictionaries that may be masks: place, name and value."""
+def in_mapping(
+    place: str, values: Any, meaning: Callable[[str], str | None], depth: int = _DEPTH
+) -> Iterator[tuple[str, str, Any]]:
+    """Yield the entries of nested dictionaries whose names have a meaning: place, name and value.
+
+    Args:
+        place: what the place of `values` is called.
+        values: a dictionary; anything else has no entries.
+        meaning: returns what a name suggests, or None.
+        depth: how many dictionaries inside each other are searched.
+    """
     if not isinstance(values, Mapping) or depth == 0:
         return
     for entry, value in values.items():
-        if isinstance(entry, str) and _meaning(entry) is not None and not _cannot_be_mask(value):
+        if isinstance(entry, str) and meaning(entry) is not None:
             yield f"{place}[{entry!r}]", entry, value
-        yield from _in_mapping(f"{place}[{entry!r}]", value, depth - 1)
+        if isinstance(value, Mapping):
+            yield from in_mapping(f"{place}[{entry!r}]", value, meaning, depth - 1)
 
 
 def _is_plain(values: Any) -> bool:
