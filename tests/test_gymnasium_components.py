@@ -389,6 +389,18 @@ def test_the_mask_of_a_state_may_be_a_dict_of_masks_in_a_vector_of_states():
         form.read(np.zeros(2, np.float32), {"action_mask": [1, 1, 0, 0, 0]})
 
 
+def test_the_infos_of_gymnasiums_vector_environments_are_read_row_by_row():
+    low, high = {"leg": (None, [0.5], [0.2, 20.0], None)}, {"arm": (None, ([0.5], None))}
+    said = ({"parameter_low": low}, {"parameter_high": high}, {"parameter_low": low, "parameter_high": high})
+    vector = gymnasium.vector.SyncVectorEnv([lambda each=each: Said("two choices", each) for each in said])
+    form = saying("two choices", said[0], parameter_bounds="info").gymnasium_form()
+    rows, is_batch = form.read(*vector.reset(seed=0))
+    singles = [form.read(np.zeros(2, np.float32), each)[0] for each in said]
+    assert is_batch
+    for name in (keys.PARAMETER_LOW, keys.PARAMETER_HIGH):
+        torch.testing.assert_close(rows[name], torch.cat([single[name] for single in singles]))
+
+
 @pytest.mark.parametrize("form_of", [GymnasiumEnv.gymnasium_form, VectorForm], ids=["own", "vector"])
 @pytest.mark.parametrize("tree", TREES)
 def test_the_gymnasium_forms_give_actions_of_their_spaces(tree, form_of):

@@ -75,7 +75,7 @@ def read_saved(
         settings = ", ".join(f"{setting}={as_json(value)}" for setting, value in found.items())
         raise ConfigError(
             f"{settings}: set by {file}, and can run code, read files or reach servers; set {' and '.join(found)} on "
-            "the command line, or add trust=true if you trust the file"
+            "the command line, or add trust=true if you trust the file; in Python, give env or trust=True"
         )
     return config
 

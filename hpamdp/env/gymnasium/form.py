@@ -53,7 +53,8 @@ class OwnForm(GymnasiumForm):
         for row, single in enumerate(singles if masks.rows or bounds.names else ()):
             of_row = info or {}
             if num is not None:
-                of_row = {name: _of_row(of_row[name], row) for name in in_info if name in of_row}
+                flags = [f"_{name}" for name in in_info]
+                of_row = _of_row({name: of_row[name] for name in (*in_info, *flags) if name in of_row}, row)
             masks.keep(row, single, of_row)
             bounds.keep(row, single, of_row)
         rows = {}
@@ -85,9 +86,15 @@ class OwnForm(GymnasiumForm):
 
 
 def _of_row(batch: Any, row: int) -> Any:
-    """Return one row of a batch of arrays, in tuples and dicts of any depth."""
+    """Return one row of a batch of arrays, in tuples and dicts of any depth.
+
+    An array `_name` beside an entry `name` says which rows have it, as in the infos of Gymnasium's vector environments.
+    """
     if isinstance(batch, Mapping):
-        return {name: _of_row(part, row) for name, part in batch.items()}
+        flags = {name: batch[f"_{name}"] for name in batch if f"_{name}" in batch}
+        missing = {name for name, has_entry in flags.items() if not has_entry[row]}
+        left_out = {*missing, *(f"_{name}" for name in flags)}
+        return {name: _of_row(part, row) for name, part in batch.items() if name not in left_out}
     if isinstance(batch, tuple):
         return tuple(_of_row(part, row) for part in batch)
     return None if batch is None else batch[row]
