@@ -86,6 +86,9 @@ TREES: dict[str, Tree] = {
         (2, 3),
         (1, 0, 1, 2, 0),
     ),
+    "choice beside a choice": Tree(
+        Dict(van=Discrete(2), way=Tuple([Discrete(3), Tuple([UNIT, NONE, PAIR])])), (2, 3), (0, 0, 1, 0, 2)
+    ),
     "two boxes": Tree(Dict(a=PAIR, b=COUNTS), (1, 1), (2, 2), (2, 3)),
     "choice and an order": Tree(
         Tuple([OneOf([UNIT, NONE]), Tuple([Discrete(2), Tuple([COUNTS, Discrete(7)])]), MultiBinary(1)]),

@@ -145,6 +145,16 @@ def test_values_that_are_no_pixels_are_refused_in_one_line():
         env.reset()
 
 
+def test_a_scaled_picture_is_refused_even_if_all_its_pixels_are_whole():
+    class Scaled(Camera):
+        def observation(self):
+            return (self.picture() // 255).astype(np.float32)
+
+    env = GymnasiumEnv(1, make=Scaled, max_steps=5)
+    with pytest.raises(ProblemError, match="has pixels from 0 to 1, but its space has 0 to 255; give the picture unsc"):
+        env.reset()
+
+
 def test_flattened_pictures_are_scaled_numbers_as_any_others():
     env = GymnasiumEnv(2, make=Mixed, max_steps=5, seed=3, flatten_pictures=True)
     steps = rollout(env)

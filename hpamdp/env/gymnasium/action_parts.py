@@ -346,7 +346,15 @@ def _form_of_two(first: spaces.Space, second: spaces.Space, names: tuple[str, st
     if not isinstance(first, spaces.Discrete):
         return None
     is_divided = isinstance(second, spaces.Tuple | spaces.Dict) and len(second.spaces) == first.n
-    return ChoiceForm(first, second, names=names) if is_divided or isinstance(second, spaces.Box) else None
+    if is_divided and not _is_conventional(second):
+        return ChoiceForm(first, second, names=names)
+    return ChoiceForm(first, second, names=names) if isinstance(second, spaces.Box) else None
+
+
+def _is_conventional(space: spaces.Space) -> bool:
+    """Return whether a space is a `Discrete(K)` and the `Tuple` or `Dict` of its K parts, a choice by itself."""
+    form = choice_form(space)
+    return form is not None and not (form.is_shared or form.is_flat)
 
 
 def read_part(space: spaces.Space, *, finds_choices: bool) -> Part:

@@ -29,7 +29,7 @@ A part may be any tree of spaces. Its discrete entries become integer parameters
 - a `Discrete` is a component without parameters, and so is every entry of a `MultiDiscrete` or `MultiBinary`;
 - a `Box` is a component of one discrete action, whose parameters are its numbers;
 - a `Tuple` or `Dict` that has one of the forms above by itself is one component. Otherwise it has the components of its
-  parts.
+  parts. A `Discrete(2)` and `Tuple(Discrete(K), Tuple(K parts))` are two components, since the latter is a choice.
 
 If a space looks like one choice but has independent parts, `form="components"` reads it as the components of its parts.
 Then only a `OneOf` is a choice with parameters of its own.

@@ -174,6 +174,17 @@ class Leaf:
             return self._box(numbers).ravel()
         return self._one_hot(numbers, cure)
 
+    def picture(self, observation: Any) -> np.ndarray:
+        """Return the leaf's picture as a vector, as `flat` does.
+
+        Raises:
+            ProblemError: the picture is missing, not in the space, or made of floats from 0 to 1.
+        """
+        numbers = as_numbers(self._find(observation))
+        if numbers is not None and numbers.dtype.kind == "f" and 0.0 < numbers.max(initial=0.0) <= 1.0:
+            raise self._problem("has pixels from 0 to 1, but its space has 0 to 255; give the picture unscaled")
+        return self.flat(observation)
+
     def _find(self, observation: Any) -> Any:
         value = observation
         for entry, length in zip(self.path, self._lengths, strict=True):

@@ -78,7 +78,10 @@ class Masks:
             if given not in (None, "info", "ignore"):
                 raise SettingError(f"{setting}={given}: must be info, ignore or null")
         if pair_source == "info" and actions.num_components == 1:
-            raise SettingError("pair_mask=info: the action has one component, so there are no pairs; use null")
+            raise SettingError(
+                "pair_mask=info: the action has one component, so there are no pairs; use null, or "
+                "env.action_form=components if its parts are independent"
+            )
         self._actions = actions
         space = env.observation_space
         entries = space.spaces if isinstance(space, spaces.Dict) else {}

@@ -137,7 +137,7 @@ class ObservationSpace:
         pixels = np.empty(self.num_pixels, np.uint8)
         for leaf, own in zip(self._pictures, self._picture_slices, strict=True):
             if not leaf.pixel_writer(pixels[own])(observation):
-                pixels[own] = leaf.flat(observation)
+                pixels[own] = leaf.picture(observation)
         return pixels
 
     def writer(self, vector: np.ndarray, pixels: np.ndarray) -> Callable[[Any], bool]:
