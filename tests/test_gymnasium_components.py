@@ -273,6 +273,7 @@ def test_a_pair_mask_says_what_goes_together(place):
         ),
         ("two discretes", {"pair_mask": np.ones(25)}, {"pair_mask": "info"}, "must be 5 rows of 5 numbers, 0 or 1"),
         ("nested", {}, {"pair_mask": "info"}, "pair_mask=info: the action has one component, so there are no pairs"),
+        ("nested", {"pair_mask": np.ones((3, 3))}, {}, r"gave a pair_mask as info\['pair_mask'\], which is not read"),
         ("nested", {}, {"pair_mask": "there"}, "pair_mask=.*must be info, ignore or null|pair_mask"),
     ],
 )

@@ -86,15 +86,14 @@ class Masks:
         space = env.observation_space
         entries = space.spaces if isinstance(space, spaces.Dict) else {}
         num = len(actions.parameter_dims)
-        sizes = {keys.ACTION_MASK: num, keys.OPTION_MASK: num_options}
-        if actions.num_components > 1:
-            sizes[keys.PAIR_MASK] = num * num
+        sizes = {keys.ACTION_MASK: num, keys.OPTION_MASK: num_options, keys.PAIR_MASK: num * num}
+        has_pairs = actions.num_components > 1
         sources = {keys.ACTION_MASK: source, keys.OPTION_MASK: source, keys.PAIR_MASK: pair_source}
         sizes = {name: size for name, size in sizes.items() if size > 0 and sources[name] != "ignore"}
         self.rows = {
             name: np.ones((num_envs, size), bool)
             for name, size in sizes.items()
-            if sources[name] == "info" or name in entries
+            if (sources[name] == "info" or name in entries) and (has_pairs or name != keys.PAIR_MASK)
         }
         self.in_observation = frozenset(name for name in self.rows if sources[name] is None)
         self._unread = {name: size for name, size in sizes.items() if name not in self.rows}
@@ -164,10 +163,10 @@ class Masks:
                 continue
             if _is_vague(entry) and not _is_like_mask(value, unread[name]):
                 continue
-            setting = _SETTINGS[name]
+            setting, article = _SETTINGS[name], "a" if name == keys.PAIR_MASK else "an"
             raise error(
-                f"gave an {name} as {place}, which is not read; give it as {name} in a Dict of observations, or in the "
-                f"info of every reset and step with {setting}=info; {setting}=ignore ignores it"
+                f"gave {article} {name} as {place}, which is not read; give it as {name} in a Dict of observations, or "
+                f"in the info of every reset and step with {setting}=info; {setting}=ignore ignores it"
             )
 
 
