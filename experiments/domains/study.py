@@ -9,7 +9,7 @@ python experiments/domains/study.py              draws and tabulates the stored 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,6 @@ from hpamdp.analysis.study import (
     curve,
     difference,
     finished,
-    first_at,
     groups,
     interquartile_mean,
     mean_interval,
@@ -53,9 +52,12 @@ BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the
 MIN_SEEDS_COMPARED = 3  # least seeds of both learners for a probability of improvement
 MIN_SEEDS_MIDDLE = 5  # least seeds for an interquartile mean beside the mean
 FIRST_STEPS = 700  # start of the curves' axes, before any evaluation
-CPU_LIMIT = 600.0  # seconds, of the table within ten minutes
+PLANNERS = ("dlpa", "pets")
 AUGMENTED = "_augment"  # follows a learner's name if it learns from steps mapped by the problem's symmetries
 KEY = ("domain", "learner", "frames", "seed")
+# Seeds from here on ran once, with settings that were frozen before. Those of earlier runs informed settings.
+FIRST_SEED = 100
+EARLIER = "†"  # marks the number of earlier seeds
 
 
 def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
@@ -69,11 +71,29 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
             name
             | {"score": round(summary["score"], 4), "success": round(summary["success"], 4)}
             | {"cpu_s": round(summary["cpu_s"], 1), "wall_s": round(summary["wall_s"], 1)}
+            | given(run)
         )
         for row in run.evaluations():
             at = {"at_frames": row["frames"], "at_wall_s": round(row["wall_s"], 1)}
             curves.append(name | at | {what: round(row[f"eval/{what}"], 4) for what in ("score", "success")})
     return results, curves
+
+
+def given(run: Run) -> dict[str, Any]:
+    """Return what the learner was given beside the problem, as text or number by name."""
+    low, name = run.config["low"], str(run.summary["low"])
+    symmetry = ["mapped steps"] if low.get("augment", False) is True else []
+    symmetry += ["canonical frame"] if name == "pets" else []
+    symmetry += ["vector products"] if low.get("vector_products", False) else []
+    variations = low.get("greedy_samples") or 0
+    search = "planning" if name in PLANNERS else f"{variations} variations" if variations else "none"
+    return {
+        "initial_parameters": low.get("initial_parameters", "none"),
+        "symmetry": ", ".join(symmetry) or "none",
+        "gamma": low["gamma"],
+        "search": search,
+        "reward_scale": low.get("reward_scale", 1.0),
+    }
 
 
 def domain(run: Run) -> str:
@@ -102,32 +122,28 @@ def merged(stored: Rows, new: Rows) -> Rows:
     """Return the stored rows, with rows of repeated runs replaced by the new rows, by domain and learner."""
     made_anew = {tuple(str(row[name]) for name in KEY) for row in new}
     kept = [row for row in stored if tuple(str(row[name]) for name in KEY) not in made_anew]
-    rows = kept + new
+    columns = dict.fromkeys(name for row in [*new, *kept] for name in row)
+    rows = [{name: row.get(name, "") for name in columns} for row in kept + new]
     order = {name: number for number, name in enumerate(DOMAINS)}
     return sorted(
         rows, key=lambda row: (order[row["domain"]], row["learner"], float(row["frames"]), float(row["seed"]))
     )
 
 
+def scored_once(results: Rows) -> Rows:
+    """Return each learner's runs with seeds that ran once on each domain, or its earlier runs if there are none."""
+    chosen: Rows = []
+    for rows in groups(results, "domain", "learner").values():
+        chosen += [row for row in rows if row["seed"] >= FIRST_SEED] or rows
+    return chosen
+
+
 def at_published_steps(results: Rows) -> Rows:
     """Return each learner's longest runs on each domain that do not exceed the published number of steps."""
-
-    def is_allowed(rows: Rows) -> bool:
-        return rows[0]["frames"] <= DOMAINS[rows[0]["domain"]][0] * (1.0 + BATCH_TOLERANCE)
-
-    return _longest(results, is_allowed)
-
-
-def within_cpu_limit(results: Rows) -> Rows:
-    """Return each learner's longest runs on each domain whose mean CPU time is within the limit."""
-    return _longest(results, lambda rows: np.mean([row["cpu_s"] for row in rows]) <= CPU_LIMIT)
-
-
-def _longest(results: Rows, is_allowed: Callable[[Rows], bool]) -> Rows:
-    """Return each learner's longest allowed runs on each domain; runs of equal length are allowed together."""
     chosen: Rows = []
-    for cell in groups(results, "domain", "learner").values():
-        allowed = [rows for rows in groups(cell, "frames").values() if is_allowed(rows)]
+    for (name, _), cell in groups(results, "domain", "learner").items():
+        most = DOMAINS[name][0] * (1.0 + BATCH_TOLERANCE)
+        allowed = [rows for (steps,), rows in groups(cell, "frames").items() if steps <= most]
         chosen += max(allowed, key=lambda rows: rows[0]["frames"], default=[])
     return chosen
 
@@ -145,7 +161,7 @@ def table(results: Rows, published: Rows, references: Rows) -> str:
     ]
     cells = groups(results, "domain", "learner")
     for name in learners:
-        values = [_cell(_values(cells.get((column, name), []))) for column in DOMAINS]
+        values = [_cell(cells.get((column, name), [])) for column in DOMAINS]
         lines.append(f"| **{name}** | " + " | ".join(values) + " |")
     for (method, source), rows in groups(published, "method", "source").items():
         lines.append(_line(f"{method} ({source})", rows))
@@ -163,12 +179,13 @@ def _values(rows: Rows) -> list[float]:
     return [row[DOMAINS[row["domain"]][1]] for row in rows]
 
 
-def _cell(values: list[float]) -> str:
+def _cell(rows: Rows) -> str:
     """Return mean ± deviation, the number of seeds and, with `MIN_SEEDS_MIDDLE` seeds, the interquartile mean."""
+    values = _values(rows)
     if not values:
         return ""
     middle = f", IQM {interquartile_mean(values)[0]:.3f}" if len(values) >= MIN_SEEDS_MIDDLE else ""
-    return f"{spread(values)} ({len(values)}){middle}"
+    return f"{spread(values)} ({len(values)}{EARLIER if rows[0]['seed'] < FIRST_SEED else ''}){middle}"
 
 
 def best_table(results: Rows, published: Rows) -> str:
@@ -197,7 +214,7 @@ def best_table(results: Rows, published: Rows) -> str:
             name,
             best,
             len(values),
-            f"{_cell(values[best])} {'return' if what == 'score' else 'success'}",
+            f"{_cell(cells[(best,)])} {'return' if what == 'score' else 'success'}",
             "" if np.isnan(low) else f"{low:.3f} to {high:.3f}",
             second,
             improvement,
@@ -229,24 +246,18 @@ def cost_table(results: Rows) -> str:
     return "\n".join(lines)
 
 
-def steps_table(curves: Rows, published: Rows) -> str:
-    """Return a line for each learner, domain and length of runs with the steps to the best published score."""
+def given_table(results: Rows) -> str:
+    """Return a line for each learner and what it was given, with the domains where it was given that."""
     lines = [
-        "| domain | learner | steps | best published | steps to it, each seed | a tenth of the published steps |",
-        "|---|---|---|---|---|---|",
+        "| learner | domains | initial parameters | symmetry | discount | search when scored | reward scale |",
+        "|---|---|---|---|---|---|---|",
     ]
-    for (name, low, frames), rows in groups(curves, "domain", "learner", "frames").items():
-        published_steps, what = DOMAINS[name]
-        best = best_published(published, name)
-        if best is None:
-            continue
-        reached = [first_at(run, what, best["score"]) for run in groups(rows, "seed").values()]
-        steps = sorted(row["at_frames"] for row in reached if row is not None)
-        if steps:
-            words = ", ".join([f"{each:,.0f}" for each in steps] + ["never"] * (len(reached) - len(steps)))
-            lines.append(
-                f"| {name} | {low} | {frames:,.0f} | {best['score']:g} | {words} | {published_steps / 10:,.0f} |"
-            )
+    known = [row for row in results if row.get("search")]
+    columns = ("initial_parameters", "symmetry", "gamma", "search", "reward_scale")
+    for (name, *values), rows in groups(known, "learner", *columns).items():
+        where = ", ".join(dict.fromkeys(row["domain"] for row in rows))
+        shown = [value if isinstance(value, str) else f"{value:g}" for value in values]
+        lines.append(f"| {name} | {where} | {' | '.join(shown)} |")
     return "\n".join(lines)
 
 
@@ -304,16 +315,14 @@ def main(folders: Sequence[str]) -> None:
         tables = {"results": results, "curves": curves}
         stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in tables}
         write_tables(HERE, {name: merged(stored[name], rows) for name, rows in tables.items()})
-    results = read_csv(HERE / "results.csv")
-    curves = read_csv(HERE / "curves.csv")
+    results, curves = (scored_once(read_csv(HERE / f"{name}.csv")) for name in ("results", "curves"))
     published = read_csv(HERE / "published.csv")
     references = read_csv(HERE / "references.csv")
     draw(curves, published, HERE / "curves.png")
     print(
         best_table(at_published_steps(results), published),
         table(at_published_steps(results), published, references),
-        table(within_cpu_limit(results), published, references),
-        steps_table(curves, published),
+        given_table(at_published_steps(results)),
         cost_table(results),
         sep="\n\n",
     )
