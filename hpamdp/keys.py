@@ -27,6 +27,9 @@ EPISODE_RETURN, EPISODE_STEPS = "episode_return", "episode_steps"
 # Written by the agent with agent.termination=chosen: after how many steps the option ends.
 OPTION_LENGTH = "option_length"
 
+# Written by the selector with agent.termination=learned: under `held`, the choice that was held before this step.
+HELD = "held"
+
 # Written by the agent for its learners if there is `option_ended`: the option that holds in the next state.
 NEXT_OPTION = ("next", "option")
 

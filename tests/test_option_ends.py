@@ -69,7 +69,16 @@ def collect(agent: HierarchicalAgent, env: Crossing, num_steps: int, batch_steps
     collector.shutdown()
 
 
-def test_options_that_the_selector_ends_have_the_right_accounts_and_are_heard_of_once():
+def account(decision: TensorDict) -> tuple:
+    """Return what a selector learns of a decision, given the last step of its option."""
+    after = decision["next"]
+    numbers = [decision[keys.OPTION], after[keys.OPTION_RETURN], after[keys.OPTION_STEPS], after[keys.DONE]]
+    places = [after[name].argmax().item() for name in (keys.DECISION_OBSERVATION, keys.OBSERVATION)]
+    return tuple(number.item() for number in numbers) + tuple(places)
+
+
+@pytest.mark.parametrize("batch_steps", [5, 1])
+def test_options_that_the_selector_ends_have_the_right_accounts_and_are_heard_of_once(batch_steps):
     heard_steps, heard_decisions = [], []
 
     class Listener(Moody):
@@ -85,7 +94,7 @@ def test_options_that_the_selector_ends_have_the_right_accounts_and_are_heard_of
     torch.manual_seed(0)
     agent = ending(Listener(SPECS), [Hearing(SPECS), Stepper(SPECS)])
     rows = []
-    for batch in collect(agent, Toll(4, start=6.0), 60, 5, 4):
+    for batch in collect(agent, Toll(4, start=6.0), 60, batch_steps, 4):
         rows.append(batch.clone())
         agent.learn(batch)
     rows = torch.cat(rows, 1)
@@ -103,20 +112,19 @@ def test_options_that_the_selector_ends_have_the_right_accounts_and_are_heard_of
             assert row["next", keys.OPTION_STEPS] == steps
             assert torch.equal(row["next", keys.DECISION_OBSERVATION], decided_at)
             done = bool(row["next", keys.DONE])
-            if t % 5 < 4:
-                ended = bool(rows[e, t + 1][keys.IS_DECISION]) and not done
+            ended = t < 59 and bool(rows[e, t + 1][keys.IS_DECISION]) and not done
+            num_ended += ended
+            if (t + 1) % batch_steps:
                 assert bool(heard[e, t]["next", keys.OPTION_ENDED]) == ended
-                num_ended += ended
                 if not done:
                     assert heard[e, t][keys.NEXT_OPTION] == rows[e, t + 1][keys.OPTION]
             else:
-                ended = False
                 assert heard[e, t]["next", keys.OPTION_ENDED], "learners must not go on past what they know"
             if ended or done:
-                expected.append(round(total, 4))
+                expected.append(account(row))
     assert num_ended > 30
     decisions = torch.cat(heard_decisions)
-    assert sorted(expected) == [round(x, 4) for x in sorted(decisions["next", keys.OPTION_RETURN].flatten().tolist())]
+    assert sorted(expected) == sorted(account(decision) for decision in decisions)
 
 
 def test_the_same_option_is_held_where_the_selector_does_not_end_it():
@@ -128,16 +136,20 @@ def test_the_same_option_is_held_where_the_selector_does_not_end_it():
     assert torch.equal(rows[keys.OPTION][:, 1:][goes_on], rows[keys.OPTION][:, :-1][goes_on])
 
 
-def train(selector, num_batches: int) -> HierarchicalAgent:
+def train(selector, batch_steps: int = 10) -> HierarchicalAgent:
     agent = ending(selector)
-    for batch in collect(agent, Crossing(50, start=6.0), 10 * num_batches, 10, 50):
+    for batch in collect(agent, Crossing(50, start=6.0), 180, batch_steps, 50):
         agent.learn(batch)
     return agent
 
 
-@pytest.mark.parametrize("make", [make_critic, make_meta_critic], ids=["option_critic", "meta_critic"])
-def test_options_end_where_another_one_is_better(make):
-    agent = train(make(), 18)
+@pytest.mark.parametrize(
+    ("make", "batch_steps"),
+    [(make_critic, 10), (make_meta_critic, 10), (make_meta_critic, 1)],
+    ids=["option_critic", "meta_critic", "meta_critic_one_step_a_batch"],
+)
+def test_options_end_where_another_one_is_better(make, batch_steps):
+    agent = train(make(), batch_steps)
     assert earned(agent, GAMMA, math.inf) >= 0.95 * best_value(GAMMA, 1)
     place = torch.eye(SPECS.observation_dim)[[2, 20]]  # on land, in water
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -149,7 +161,7 @@ def test_options_end_where_another_one_is_better(make):
 
 
 def test_a_deliberation_cost_makes_options_last():
-    agent = train(make_critic(deliberation_cost=0.02, termination_lr=1e-2), 18)
+    agent = train(make_critic(deliberation_cost=0.02, termination_lr=1e-2))
     assert earned(agent, GAMMA, math.inf) >= 0.95 * best_value(GAMMA, 1)
     place = torch.eye(SPECS.observation_dim)[[4, 20]]
     beta = agent.selector.beta(place, torch.tensor([0, 1]), None)

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner, Level, Selector, is_greedy
+from hpamdp.policies.base import Learner, Level, Selector, finished_decisions, is_greedy
 from hpamdp.policies.masks import allowed_or_first
 from hpamdp.policies.option_lengths import OptionLengths, PairSelector
 from hpamdp.specs import PAMDPSpecs
@@ -276,7 +276,7 @@ class AgentNextOptions:
 
         The selector decides on an end one step later. So the next batch will show whether an option ends with the last
         step. Until then learners take it as ended (`option_ended`), possibly followed by itself. The selector does not
-        (`is_decision`).
+        (`is_decision`), and hears of it with the next batch (`with_steps_before`).
         """
         done = batch.get(("next", keys.DONE))
         is_ended = batch.get(keys.IS_DECISION).roll(-1, -2) & ~done
@@ -286,6 +286,20 @@ class AgentNextOptions:
         is_ended = is_ended.clone()
         is_ended[..., -1, :] = True
         return batch.set(("next", keys.OPTION_ENDED), is_ended)
+
+    def with_steps_before(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return a batch `[*B, T]` behind the steps before it, `[*B, T + 1]`, for a selector that decides on ends.
+
+        The batch shows whether an option ended with the step before it. What is known of this step is the choice that
+        was held and, in the first root of the batch, what followed. All steps get these entries only.
+        """
+        root = batch[..., :1]
+        after = root.select(*batch.get("next").keys(True, True), strict=False)
+        # Where an episode begins, the one before it was reported as finished, or was given up.
+        goes_on = root.get(keys.EPISODE_STEPS) > 0
+        after.set(keys.IS_DECISION, root.get(keys.IS_DECISION) & goes_on)
+        before = root.get(keys.HELD).copy().set("next", after)
+        return torch.cat([before, batch.select(*before.keys(True, True))], -1)
 
     def with_next_option(self, batch: TensorDictBase) -> TensorDictBase:
         """Return a shallow copy of a batch `[*B, T]` in which `("next", "option")` holds in the next state, `[*B, T]`.
@@ -372,6 +386,9 @@ class HierarchicalAgent(nn.Module):
         self.next_options: AgentNextOptions | None = None
         if selector is not None:
             selector.decides_ends = selector_ends_options
+            if selector_ends_options:
+                held: list[NestedKey] = [(keys.HELD, key) for key in selector.out_keys]
+                self.policy.out_keys = [*self.policy.out_keys, *held]
             if selector.asks_learners:
                 selector.option_values = OptionValues(learners, specs.num_options)
             self.next_options = AgentNextOptions(selector, learners, specs.num_options, is_shared, self.pairs)
@@ -394,14 +411,14 @@ class HierarchicalAgent(nn.Module):
         """Let both levels learn from a collected batch `[*B, T]`; return scalars named `high/...` and `low/...`."""
         scalars: dict[str, float] = {}
         self.frames += batch.numel()
-        if self.selector is not None:
-            if self.selector.decides_ends and self.next_options is not None:
+        if self.selector is not None and self.next_options is not None:
+            if self.next_options.decides_ends:
                 batch = self.next_options.with_ends(batch)
             self._set_is_uniform()
             seen = self._seen_by_selector(batch)
             self._set_pending(self.selector, seen)
-            decisions = _finished_decisions(seen)
-            learned = self.selector.learn(decisions) if len(decisions) else {}
+            steps = self.next_options.with_steps_before(seen) if self.next_options.decides_ends else seen
+            learned = self.selector.learn_from_options(steps)
             learned = {**learned, **self.selector.learn_from_steps(seen), **self._mean_length(batch)}
             scalars.update({f"high/{name}": value for name, value in learned.items()})
         if self.is_frozen:
@@ -419,7 +436,7 @@ class HierarchicalAgent(nn.Module):
             decisions: `[*B, K]` for the selector. If None, the decisions in the batch.
         """
         if self.selector is not None and self.pairs is None and "offline" in self.selector.modes:
-            self.selector.add_demonstrations(_finished_decisions(batch if decisions is None else decisions))
+            self.selector.add_demonstrations(finished_decisions(batch if decisions is None else decisions))
         for _, learner, rows, mask in self._batches_of_learners(batch):
             learner.add_demonstrations(rows, mask)
 
@@ -539,9 +556,3 @@ class HierarchicalAgent(nn.Module):
         is_held = ~last.get(("next", keys.IS_DECISION)).squeeze(-1)
         held = last.get(keys.OPTION)[is_held]
         selector.pending.copy_(torch.bincount(held, minlength=selector.specs.num_options))
-
-
-def _finished_decisions(batch: TensorDictBase) -> TensorDictBase:
-    """Return the last step of every option that ended in a batch `[*B, T]`, `[N]`, oldest first."""
-    is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
-    return batch.transpose(0, -1)[is_end.transpose(0, -1)]

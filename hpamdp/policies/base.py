@@ -47,6 +47,12 @@ def option_ends(batch: TensorDictBase) -> Tensor:
     return is_end | batch.get(("next", keys.OPTION_ENDED), False)
 
 
+def finished_decisions(steps: TensorDictBase) -> TensorDictBase:
+    """Return the last step of every option that ended in steps `[*B, T]`, `[N]`, oldest first."""
+    is_end = steps.get(("next", keys.IS_DECISION)).squeeze(-1)
+    return steps.transpose(0, -1)[is_end.transpose(0, -1)]
+
+
 class NextOptions(Protocol):
     """Which options follow the one that ended, and what they are worth; the agent gives it to its learners.
 
@@ -307,14 +313,27 @@ class Selector(Level, TensorDictModuleBase):
     def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
         """Learn from every step of a collected batch `[*B, T]`, in the form of `Learner.learn`; return scalars to log.
 
-        Called after `learn`. Override it if the selector learns within options.
+        Called after `learn_from_options`. Override it if the selector learns within options.
         """
         return {}
+
+    def learn_from_options(self, steps: TensorDictBase) -> dict[str, float]:
+        """Learn from the options that ended in steps `[*B, T]`, and return scalars to log as `high/<name>`.
+
+        The default passes them to `learn`. Override it if decisions must be told apart by environment.
+
+        Args:
+            steps: the last step of an option is marked by `("next", "is_decision")`, bool `[*B, T, 1]`. For the entries
+                of such a step see `learn`.
+        """
+        decisions = finished_decisions(steps)
+        return self.learn(decisions) if len(decisions) else {}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Learn from finished decisions `[N]`, oldest first, and return scalars to log as `high/<name>`.
 
-        Called after each collected batch in which an option ended, before the learners learn from the batch.
+        Called after each collected batch in which an option ended, before the learners learn from the batch. If the
+        selector decides where options end, an option that ended with a batch is reported with the next batch.
 
         A decision is represented by the last step of its option:
 
@@ -325,7 +344,8 @@ class Selector(Level, TensorDictModuleBase):
         - `("next", "observation")` `[N, observation_dim]`: the state in which it ended;
         - `("next", "done")` bool `[N, 1]`: whether its episode ended there, too.
 
-        `observation`, without `next`, belongs to the option's last step. The choice was not based on it.
+        `observation`, without `next`, belongs to the option's last step. The choice was not based on it. It is missing
+        if the selector decides where options end.
         """
         return {}
 
@@ -364,18 +384,26 @@ class Selector(Level, TensorDictModuleBase):
         return {}
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write `out_keys`: a fresh choice if `is_decision` is true, else what `td` already holds."""
+        """Write `out_keys`: a fresh choice if `is_decision` is true, else what `td` already holds.
+
+        If the selector decides where options end, what `td` held before is kept under `held`: the choice whose option
+        has ended here. Where an episode begins, nothing was held, and the entries mean nothing.
+        """
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
         held = {key: td.get(key, None) for key in self.out_keys}
         nothing_held = any(value is None for value in held.values())
         if self.decides_ends and not nothing_held:
             is_decision = is_decision | self.ends(td)
             td.set(keys.IS_DECISION, is_decision.unsqueeze(-1))
+            for key, value in held.items():
+                td.set((keys.HELD, key), value)
         if not nothing_held and not is_decision.any():
             return td
         explores_uniformly = bool(self.is_uniform) and not is_greedy()
         fresh = self.choose_uniformly(td) if explores_uniformly else self.choose(td)
         for key, value in fresh.items():
+            if self.decides_ends and nothing_held:
+                td.set((keys.HELD, key), value)
             is_fresh = is_decision.reshape(*is_decision.shape, *[1] * (value.ndim - is_decision.ndim))
             td.set(key, value if nothing_held else torch.where(is_fresh, value, held[key]))
         return td

@@ -121,18 +121,18 @@ class Actor(OnPolicy, RemembersDecisions):
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Gather decisions; as soon as there is a minibatch of them, make `epochs` passes over them."""
-        return {} if self.perception.is_recurrent else self._learn(self.rows(decisions))
+        return self._learn(self.rows(decisions))
 
-    def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
-        """Do as `learn` does if the memory is recurrent, since sequences need the decisions of each environment."""
-        is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
+    def learn_from_options(self, steps: TensorDictBase) -> dict[str, float]:
+        """Do as `learn` does. With a recurrent memory, sequences need the decisions of each environment."""
+        is_end = steps.get(("next", keys.IS_DECISION)).squeeze(-1)
         if not self.perception.is_recurrent or not is_end.any():
-            return {}
-        decisions = batch[is_end]
+            return super().learn_from_options(steps)
+        decisions = steps[is_end]
         rows = self.rows(decisions)
         rows["memory"] = self.held(decisions)
         rows["begins"] = self.begins(decisions)
-        rows["starts"] = sequence_starts(self.begins(batch), is_end, self.options.sequence_length)
+        rows["starts"] = sequence_starts(self.begins(steps), is_end, self.options.sequence_length)
         return self._learn(rows)
 
     def _learn(self, new: TensorDict) -> dict[str, float]:

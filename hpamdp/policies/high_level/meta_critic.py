@@ -148,16 +148,16 @@ class MetaCritic(RemembersDecisions):
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Store finished decisions and, after the warm-up, make the updates that are due."""
-        return {} if self.links is not None else self._learn(self._rows(decisions))
+        return self._learn(self._rows(decisions))
 
-    def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
-        """Do as `learn` does if the memory is recurrent, since sequences need the decisions of each environment."""
-        is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
+    def learn_from_options(self, steps: TensorDictBase) -> dict[str, float]:
+        """Do as `learn` does. With a recurrent memory, sequences need the decisions of each environment."""
+        is_end = steps.get(("next", keys.IS_DECISION)).squeeze(-1)
         if self.links is None or not is_end.any():
-            return {}
-        begins = self.begins(batch)
+            return super().learn_from_options(steps)
+        begins = self.begins(steps)
         previous = self.links(begins, is_end, self.buffer.write_count)
-        rows = self._rows(batch[is_end])
+        rows = self._rows(steps[is_end])
         rows["begins"], rows["previous"] = begins[is_end], previous[is_end]
         return self._learn(rows)
 
