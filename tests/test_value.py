@@ -1,7 +1,10 @@
 """The selector that asks the learners what they expect, and PETS as a learner that can say."""
 
+from functools import partial
+
 import pytest
 import torch
+from conftest import global_generators_unmoved
 from tensordict import TensorDict
 from test_pets import OPTIONS
 from torch import nn
@@ -12,7 +15,11 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.high_level.value import Value
+from hpamdp.policies.low_level.hyar import HyAR
+from hpamdp.policies.low_level.paddpg import PADDPG
+from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.policies.low_level.pets.learner import PETS
+from hpamdp.policies.low_level.td3_bc import TD3BC
 from hpamdp.specs import PAMDPSpecs
 
 CPU = torch.device("cpu")
@@ -100,6 +107,16 @@ def test_plans_choose_the_boat(is_shared):
         value = agent.selector.option_values(observation)
     assert value.shape == (16, 2) and value.isfinite().all()
     assert len(value.argmax(-1).unique()) == 2 or not is_shared, "another boat for another layout"
+
+
+@pytest.mark.parametrize("make", [PDQN, HyAR, partial(PADDPG, twin=True), TD3BC])
+def test_values_are_free_of_the_noise_that_smooths_targets(make):
+    learner = make(BOATS, target_smoothing=0.5, target_smoothing_clip=1.0)
+    states = torch.randn(50, BOATS.observation_dim)
+    with global_generators_unmoved():
+        value = learner.value(states)
+    assert torch.equal(learner.value(states), value)
+    assert not torch.equal(learner.target_value(states), value)
 
 
 @pytest.mark.parametrize("end_values", [False, True])

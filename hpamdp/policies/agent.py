@@ -160,12 +160,11 @@ def _value(
     memory: TensorDictBase | None,
     has_seen: bool,
 ) -> Tensor:
-    """Return a learner's values `[N]`, see `NextOptions.value`."""
-    given = [] if action_mask is None else [action_mask]
+    """Return a learner's values `[N]` for a target, see `NextOptions.value`."""
     held = None if memory is None or learner.memory_key is None else memory.get(learner.memory_key, None)
     if held is None:
-        return learner.value(observation, *given)
-    return learner.value(observation, *given, memory=held, has_seen=has_seen)  # type: ignore[call-arg]
+        return learner.target_value(observation, action_mask)
+    return learner.target_value(observation, action_mask, memory=held, has_seen=has_seen)
 
 
 class HeldOption(TensorDictModuleBase):

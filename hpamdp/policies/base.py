@@ -507,6 +507,14 @@ class Learner(Level, nn.Module):
         """
         raise NotImplementedError(f"{type(self).__name__} has no value to bootstrap from")
 
+    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
+        """Return the values `[N]` of states for a target; arguments as for `value`.
+
+        They are those of `value`. Override it if a target needs others, as with the target smoothing of TD3.
+        """
+        given = [] if action_mask is None else [action_mask]
+        return self.value(observation, *given, **memory)
+
     def is_untrained(self) -> bool:
         """Return whether parameters and buffers show that `value` still comes from untrained networks.
 

@@ -198,14 +198,18 @@ class PADDPG(ReplayLearner):
         return loss, {"actor": loss}
 
     @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return min Q'(s, a), `[B]`, with a the target actor's output, smoothed with `twin`."""
+    def value(self, observation: Tensor, action_mask: Tensor | None = None, *, smoothing: float = 0.0) -> Tensor:
+        """Return min Q'(s, a), `[B]`, with a the target actor's output, plus noise of the deviation `smoothing`."""
         output = self.target_actor(observation)
         if self.options.twin:
-            output = with_clipped_noise(output, self.options.target_smoothing, self.options.target_smoothing_clip)
+            output = with_clipped_noise(output, smoothing, self.options.target_smoothing_clip)
             output = self.target_actor.in_cells(output)
         output = with_lowest_scores(output, self.specs.allowed(observation, action_mask))
         return q_values(self.target_critics, observation, output).amin(0)
+
+    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
+        """Return `value` with target smoothing, if the learner is twin."""
+        return self.value(observation, action_mask, **memory, smoothing=self.options.target_smoothing)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the rows to store, with all scores."""

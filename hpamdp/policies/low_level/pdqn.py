@@ -21,14 +21,16 @@ Differs from the source:
 - with `layer_norm` the critics' layers are normalised (Ball et al. 2023, arXiv 2302.02948);
 - critic updates compute only the chosen action's pass, and all passes share the state's part of the first layer;
 - networks start as PyTorch's, not as Kaiming et al. proposed;
+- executed and stored parameters are clipped to their bounds; the code of Bester et al. stores what the actor gave;
 - the defaults add what TD3 adds to DDPG: twin critics, target smoothing and a delayed actor. The actor, too, increases
   the minimum of both critics; TD3's actor uses the first one;
-- the defaults squash parameters by tanh, do not clip gradients, and add Gaussian noise to the parameters of actions
-  that are not random. Both networks have one learning rate and one target rate. `pdqn_published.yaml` has the settings
-  of Bester et al. instead.
+- the defaults squash parameters by tanh, do not clip gradients, draw the parameters of random actions uniformly, and
+  add Gaussian noise to the others. Both networks have one learning rate and one target rate. `pdqn_published.yaml` has
+  the settings of Bester et al. instead.
 
 TorchRL's DQNLoss does not fit: its value network sees the observation alone. Here Q and its target also take the
-parameters, which come from a network with a target and a loss of its own.
+parameters, which come from a network with a target and a loss of its own. Its OrnsteinUhlenbeckProcessModule does not
+fit either: it adds noise to an action in the environment's units and begins again with each episode.
 """
 
 from __future__ import annotations
@@ -291,8 +293,8 @@ class PDQN(ReplayLearner):
     def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared TD error, summed over the critics.
 
-        The target is r + discount * V(s'), where V is `value`. A subclass may override `target`, which returns it as
-        `[B]`, given a sample with `state`, `discrete`, `unit` (the executed parameters in [-1, 1]), `reward`,
+        The target is r + discount * V(s'), where V is `target_value`. A subclass may override `target`, which returns
+        it as `[B]`, given a sample with `state`, `discrete`, `unit` (the executed parameters in [-1, 1]), `reward`,
         `next_state` and `discount`. `sample` also has the masks if the problem has any, and the options.
         """
         q = self.critics.of_discrete(self.features(sample), sample["discrete"], sample["unit"])
@@ -307,15 +309,16 @@ class PDQN(ReplayLearner):
         memory: Tensor | None = None,
         *,
         has_seen: bool = False,
+        smoothing: float = 0.0,
     ) -> Tensor:
         """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`; the sum over the components.
 
         With `double_q`, the learned critics choose k instead of the target critics. `Learner.value` explains `memory`
-        and `has_seen`.
+        and `has_seen`; `smoothing` is the standard deviation of noise on x'(s).
         """
-        smoothing = self.options.target_smoothing, self.options.target_smoothing_clip
         state = self.target_perception(observation, memory, has_seen=has_seen)
-        unit_parameters = with_clipped_noise(self.target_actor(state), *smoothing)
+        clip = self.options.target_smoothing_clip
+        unit_parameters = with_clipped_noise(self.target_actor(state), smoothing, clip)
         q = self.target_critics(state, unit_parameters).amin(0)
         choosing_q = q
         if self.options.double_q:
@@ -324,6 +327,10 @@ class PDQN(ReplayLearner):
         choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
         components = self.specs.components
         return components.total(components.of_choice(q, components.best(choosing_q)))
+
+    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
+        """Return `value` with target smoothing."""
+        return self.value(observation, action_mask, **memory, smoothing=self.options.target_smoothing)
 
     def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return minus the sum of the allowed discrete actions' values; only the actor gets its gradient."""

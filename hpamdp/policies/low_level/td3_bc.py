@@ -194,12 +194,17 @@ class TD3BC(ReplayLearner):
         return loss, {"actor": loss}
 
     @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`."""
-        unit_parameters = self.target_actor(observation)
-        unit_parameters = with_clipped_noise(
-            unit_parameters, self.options.target_smoothing, self.options.target_smoothing_clip
-        )
+    def value(self, observation: Tensor, action_mask: Tensor | None = None, *, smoothing: float = 0.0) -> Tensor:
+        """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`.
+
+        With `smoothing`, noise of this standard deviation is added to x'(s).
+        """
+        clip = self.options.target_smoothing_clip
+        unit_parameters = with_clipped_noise(self.target_actor(observation), smoothing, clip)
         q = self.target_critics(observation, unit_parameters).amin(0)
         is_refused = self.policy.is_refused(observation, self.specs.allowed(observation, action_mask))
         return q.masked_fill(is_refused, -torch.inf).amax(-1)
+
+    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
+        """Return `value` with target smoothing."""
+        return self.value(observation, action_mask, **memory, smoothing=self.options.target_smoothing)

@@ -78,7 +78,7 @@ class ReplayLearner(Learner):
     be able to trace it in one piece, with dicts in place of TensorDicts. A subclass whose losses cannot be traced has
     to refuse it.
 
-    The `target` of a value is `reward + discount * next_value(sample)`, which asks `value`.
+    The `target` of a value is `reward + discount * next_value(sample)`, which asks `target_value`.
 
     Attributes:
         perception: what the networks see of an observation, if `set_perception` was called; its target copy beside it.
@@ -335,7 +335,7 @@ class ReplayLearner(Learner):
         masks = [sample["next_action_mask"]] if self.specs.has_action_mask else []
         memory = self.last_memory(sample)
         remembered: dict[str, Any] = {} if memory is None else {"memory": memory}
-        value = self.value(state, *masks, **remembered)
+        value = self.target_value(state, *masks, **remembered)
         if "option_ended" not in sample.keys():
             return value
         is_ended = sample["option_ended"] | self.next_options.decides_ends
