@@ -183,6 +183,35 @@ def test_the_greedy_policy_samples_nothing_and_the_exploring_one_varies_the_whol
     assert 0.08 < moved.std() < 0.12
 
 
+def test_random_actions_keep_the_actors_parameters_only_if_told_so():
+    moved = {}
+    for form in ("uniform", "actor"):
+        torch.manual_seed(0)
+        learner, td = make(random_parameters=form, parameter_noise=0.0), states(500)
+        taken = learner.policy(td.clone())
+        assert taken[keys.DISCRETE].unique().tolist() == [0, 1, 2]
+        moved[form] = SPECS.to_unit(taken[keys.PARAMETERS]) - learner.actor(td[keys.OBSERVATION]).detach()
+    torch.testing.assert_close(moved["actor"], torch.zeros(500, 3), atol=1e-6, rtol=0.0)
+    assert moved["uniform"].std() > 0.4
+
+
+def test_ornstein_uhlenbeck_noise_goes_on_from_step_to_step():
+    torch.manual_seed(0)
+    learner, td = make(noise_process="ornstein_uhlenbeck", parameter_noise=0.05), states(500)
+    learner.policy.epsilon.zero_()
+    before, steps = torch.zeros(500, 3), []
+    own = learner.actor(td[keys.OBSERVATION]).detach()
+    for _ in range(40):
+        td = learner.policy(td)
+        noise = SPECS.to_unit(td[keys.PARAMETERS]) - own
+        steps.append(noise - 0.85 * before)
+        before = noise
+    assert torch.stack(steps).std() == pytest.approx(0.05, rel=0.03)
+    assert before.std() == pytest.approx(0.05 / (1.0 - 0.85**2) ** 0.5, rel=0.05)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        torch.testing.assert_close(SPECS.to_unit(learner.policy(td)[keys.PARAMETERS]), own)
+
+
 @pytest.mark.parametrize("multipass", [True, False])
 def test_the_greedy_policy_takes_the_best_allowed_action_of_the_actor_and_its_variations(multipass):
     torch.manual_seed(0)
@@ -379,8 +408,10 @@ def test_the_published_recipe_has_the_published_settings_and_runs_where_there_ar
     settings = make_config(["low=pdqn_published", "high=none", "env=platform"]).low.settings
     expected = dict(
         bounding="inverting_gradients", max_grad_norm=10.0, critic_lr=1e-3, actor_lr=1e-4, critic_tau=0.1,
-        actor_tau=0.001, epsilon_final=0.01, epsilon_episodes=1000, parameter_noise=0.0, twin=False,
-        target_smoothing=0.0, policy_delay=1, initial_parameters="domain", multipass=True,
+        actor_tau=0.001, epsilon_final=0.01, epsilon_episodes=1000, parameter_noise=1e-4, twin=False,
+        target_smoothing=0.0, policy_delay=1, initial_parameters="domain", multipass=True, random_parameters="actor",
+        noise_process="ornstein_uhlenbeck", hidden_dims=(128,), gamma=0.9, warmup_steps=500, buffer_size=10_000,
+        batch_size=128, n_step=1, double_q=False, updates_per_step=1.0,
     )  # fmt: skip
     assert {name: settings[name] for name in expected} == expected
     learner = make(**{name: value for name, value in settings.items() if name != "budget"})

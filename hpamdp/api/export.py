@@ -28,7 +28,7 @@ from hpamdp.env.decisions import OptionLength
 from hpamdp.env.gymnasium_form import VectorScaling
 from hpamdp.files import replacing
 from hpamdp.policies.agent import HierarchicalAgent, OptionRouter, with_option
-from hpamdp.policies.base import Level, Selector
+from hpamdp.policies.base import Learner, Level, Selector
 from hpamdp.specs import PAMDPSpecs
 
 # An ONNX graph has each name once, so the option that comes in is not called as the one that goes out.
@@ -225,8 +225,10 @@ def _check_levels(agent: HierarchicalAgent) -> None:
         raise ConfigError(
             f"export: {_names(agent)} cannot be exported: the problem has {what}, which files cannot read"
         )
-    if agent.router.state_keys:
-        raise ConfigError(f"export: {_names(agent)} cannot be exported: it remembers {agent.router.state_keys}")
+    exploring = {key for level in _levels(agent) if isinstance(level, Learner) for key in level.exploring_keys}
+    remembered = [key for key in agent.router.state_keys if key not in exploring]
+    if remembered:
+        raise ConfigError(f"export: {_names(agent)} cannot be exported: it remembers {remembered}")
 
 
 def _traced(step: GreedyStep, about: Mapping[str, Any]) -> bytes:

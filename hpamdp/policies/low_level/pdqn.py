@@ -7,7 +7,8 @@ Source: Xiong et al., *Parametrized Deep Q-Networks Learning: Reinforcement Lear
 Action Space*, 2018, arXiv 1810.06394, algorithm 1. Multi-pass: Bester, James and Konidaris, *Multi-Pass Q-Networks for
 Deep Reinforcement Learning with Parameterised Action Spaces*, 2019, arXiv 1905.04388. Twin critics, target smoothing,
 delayed actor: Fujimoto, van Hoof and Meger 2018, arXiv 1802.09477 (TD3). Double Q: van Hasselt, Guez and Silver 2016,
-arXiv 1509.06461. Inverting gradients: Hausknecht and Stone 2016, arXiv 1511.04143. Penalty on preactivations:
+arXiv 1509.06461. Inverting gradients: Hausknecht and Stone 2016, arXiv 1511.04143. Ornstein-Uhlenbeck noise: Lillicrap
+et al. 2016, arXiv 1509.02971, with the form and the constant of Bester et al.'s code. Penalty on preactivations:
 Andrychowicz et al. 2017, arXiv 1707.01495, appendix A. Towards the best of random actions: Neumann et al. 2023,
 *Greedy Actor-Critic*, arXiv 1810.09103.
 
@@ -76,6 +77,9 @@ from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.settings import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
+PROCESS = "noise_process"  # the last step's noise, if it is a process, float32 [*B, num_parameters]
+_PULL = 0.15  # fraction of the process that is lost in a step
+
 # Numbers that the critics evaluate at once for the greedy policy: bounds the memory if there are many discrete actions.
 _MAX_NUMBERS = 1 << 22
 
@@ -99,8 +103,19 @@ class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
     """Fraction of the way to the critics that their target networks move at each actor update."""
     max_grad_norm: PositiveFloat | None = None
     """Largest gradient norm of a gradient step; if null, there is no limit."""
+    random_parameters: Literal["uniform", "actor"] = "uniform"
+    """Parameters of a random action: drawn uniformly from their bounds, or those of the actor, with its noise."""
+    noise_process: Literal["gaussian", "ornstein_uhlenbeck"] = "gaussian"
+    """The noise on parameters: independent at each step, or a process that returns to 0 by 0.15 of its size a step.
+
+    With `ornstein_uhlenbeck`, `parameter_noise` is the standard deviation of what is added in a step. The process goes
+    on from episode to episode.
+    """
     epsilon_episodes: PositiveInt | None = None
-    """Episodes of the whole run within which the probability of a random action falls, in place of `epsilon_steps`."""
+    """Episodes that end with the learner's own steps, within which the probability of a random action falls.
+
+    They are counted from the start and take the place of `epsilon_steps`.
+    """
 
     @model_validator(mode="after")
     def _check_pdqn(self) -> Self:
@@ -178,8 +193,13 @@ class PDQNPolicy(TensorDictModuleBase):
         options: PDQNOptions,
     ) -> None:
         super().__init__()
-        self.in_keys = perception.in_keys
+        self.in_keys = list(perception.in_keys)
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS, *perception.out_keys]
+        self.has_process = options.noise_process == "ornstein_uhlenbeck"
+        if self.has_process:
+            self.in_keys.append(PROCESS)
+            self.out_keys.append(PROCESS)
+        self.draws_parameters = options.random_parameters == "uniform"
         self.perception = perception
         self.actor = actor
         self.critics = critics
@@ -202,15 +222,29 @@ class PDQNPolicy(TensorDictModuleBase):
             discrete = self.specs.components.best(values)
         if not is_greedy():
             is_random = torch.rand(len(discrete), device=discrete.device, dtype=torch.float32) < self.epsilon
-            noisy = with_exploring_noise(unit_parameters, self.noise)
-            random_parameters = 2.0 * torch.rand_like(unit_parameters) - 1.0
-            unit_parameters = torch.where(is_random.unsqueeze(-1), random_parameters, noisy)
+            noisy = self._with_noise(unit_parameters, td)
+            if self.draws_parameters:
+                random_parameters = 2.0 * torch.rand_like(unit_parameters) - 1.0
+                noisy = torch.where(is_random.unsqueeze(-1), random_parameters, noisy)
+            unit_parameters = noisy
             random_actions = random_discrete(self.specs, is_random.shape, allowed, discrete.device)
             is_random = is_random.reshape(-1, *[1] * (discrete.ndim - 1))
             discrete = torch.where(is_random, random_actions, discrete)
         td.set(keys.DISCRETE, discrete.reshape((*td.batch_size, *discrete.shape[1:])))
         unit_parameters = unit_parameters.reshape((*td.batch_size, self.specs.num_parameters))
+        if self.has_process and td.get(PROCESS, None) is None:
+            td.set(PROCESS, torch.zeros_like(unit_parameters))
         return td.set(keys.PARAMETERS, self.specs.from_unit(unit_parameters, td))
+
+    def _with_noise(self, unit_parameters: Tensor, td: TensorDictBase) -> Tensor:
+        """Return parameters `[B, num_parameters]` with the exploring noise of a step, and keep the process in `td`."""
+        if not self.has_process:
+            return with_exploring_noise(unit_parameters, self.noise)
+        before = td.get(PROCESS, None)
+        before = torch.zeros_like(unit_parameters) if before is None else before.reshape(unit_parameters.shape)
+        process = (1.0 - _PULL) * before + self.noise * torch.randn_like(unit_parameters)
+        td.set(PROCESS, process.reshape(*td.batch_size, self.specs.num_parameters))
+        return (unit_parameters + process).clamp(-1.0, 1.0)
 
     def _best_variation(self, state: Tensor, unit_parameters: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the discrete actions `[B]` and the parameters `[B, P]` that are best among x(s) and its variations."""
@@ -237,6 +271,7 @@ class PDQN(ReplayLearner):
     Options = PDQNOptions
     takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
     takes_pictures = True
+    exploring_keys = frozenset({PROCESS})
 
     options: PDQNOptions
     policy: PDQNPolicy
