@@ -208,6 +208,17 @@ def test_exp3_weights_rewards_by_the_probability_of_their_choice():
     torch.testing.assert_close(td[PROBABILITY], expected[td[keys.OPTION]])
 
 
+@every_memory
+def test_the_gains_of_exp3_are_those_of_the_range_seen_so_far(memory):
+    options, rewards = torch.tensor([0, 1, 1, 0, 1, 0]), torch.tensor([4.0, 2.0, 3.0, 40.0, -10.0, 5.0])
+    probability = torch.tensor([0.8, 0.2, 0.25, 0.5, 0.5, 0.6])
+    at_once, one_by_one = make("exp3", memory), make("exp3", memory)
+    at_once.learn(paid(options.tolist(), rewards.tolist(), **{PROBABILITY: probability}))
+    for i in range(6):
+        one_by_one.learn(paid([options[i].item()], [rewards[i].item()], **{PROBABILITY: probability[i : i + 1]}))
+    torch.testing.assert_close(one_by_one.probabilities, at_once.probabilities)
+
+
 # What the bandits achieve.
 
 

@@ -3,7 +3,7 @@
 Source: Auer, Cesa-Bianchi, Freund and Schapire 2002, *The nonstochastic multiarmed bandit problem*, figure 1.
 
 Differs from the source:
-- rewards are scaled to [0, 1] by the range seen so far;
+- rewards are scaled to [0, 1] by the range seen so far. When it grows, the earlier rewards are scaled by the new range;
 - gains may be discounted or limited to a window (see `RewardStatistics`), whereas Exp3.S mixes the weights;
 - many decisions are due at the same time; each reward is divided by the probability of its choice.
 """
@@ -44,28 +44,37 @@ class Exp3(Bandit):
     def __init__(self, specs: PAMDPSpecs, options: Exp3Options | None = None, **settings: Any) -> None:
         super().__init__(specs, options, **settings)
         self.out_keys = [*self.out_keys, PROBABILITY]
-        # `statistics` holds the rewards, `gains` the scaled rewards divided by their probabilities.
-        self.gains = RewardStatistics(specs.num_options, self.options)
+        # `statistics` holds the rewards. Of these, rewards divided by their probabilities, and the divisors' inverses:
+        # the range is not part of them, since it grows.
+        self.weighted = RewardStatistics(specs.num_options, self.options)
+        self.inverse = RewardStatistics(specs.num_options, self.options)
         self.register_buffer("low", torch.tensor(torch.inf, dtype=torch.float64))
         self.register_buffer("high", torch.tensor(-torch.inf, dtype=torch.float64))
+
+    @property
+    def gains(self) -> Tensor:
+        """Sum of each option's scaled rewards, each divided by the probability of its choice, `[num_options]`."""
+        if not self.high > self.low:
+            return torch.zeros_like(self.weighted.sums)
+        return (self.weighted.sums - self.low * self.inverse.sums) / (self.high - self.low)
 
     @property
     def probabilities(self) -> Tensor:
         """Probabilities of an exploring choice, `[num_options]`."""
         num = self.specs.num_options
         exploration = self.options.exploration
-        weights = (exploration / num * self.gains.sums).softmax(0)
+        weights = (exploration / num * self.gains).softmax(0)
         return (1.0 - exploration) * weights + exploration / num
 
     @property
     def greedy_values(self) -> Tensor:
         """The gains, which order the options as their weights do."""
-        return self.gains.sums
+        return self.gains
 
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
         """Return `num` choices, with the probabilities of the allowed options in proportion."""
         if num == 0:  # which `multinomial` refuses
-            return torch.zeros(0, dtype=torch.long, device=self.gains.sums.device)
+            return torch.zeros(0, dtype=torch.long, device=self.low.device)
         probabilities = self.probabilities if allowed is None else self.probabilities * allowed
         return probabilities.multinomial(num, replacement=True)
 
@@ -97,8 +106,9 @@ class Exp3(Bandit):
         rewards = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1).double()
         self.low = torch.minimum(self.low, rewards.min())
         self.high = torch.maximum(self.high, rewards.max())
-        scaled = (rewards - self.low) / (self.high - self.low).clamp(min=1e-12)
-        self.gains.add(decisions.get(keys.OPTION), scaled / decisions.get(PROBABILITY))
+        option, inverse = decisions.get(keys.OPTION), 1.0 / decisions.get(PROBABILITY).double()
+        self.weighted.add(option, rewards * inverse)
+        self.inverse.add(option, inverse)
         for name, probability in zip(self.specs.option_names, self.probabilities.tolist(), strict=True):
             scalars[f"probability_{name}"] = probability
         return scalars
