@@ -13,6 +13,7 @@ from hpamdp import keys
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent, with_option
 from hpamdp.policies.base import Selector
+from hpamdp.policies.high_level.actor import Actor
 from hpamdp.policies.high_level.fixed import Fixed
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.specs import PAMDPSpecs
@@ -238,6 +239,40 @@ def test_a_replayed_step_is_followed_by_the_option_that_the_selector_would_choos
         option = int(state[i, 0] > 0.0) if is_ended[i] else 0
         expected.append(value(agent, option, state[i : i + 1]))
     assert agent.learners[0].next_value(sample).tolist() == pytest.approx(expected, abs=1e-6)
+
+
+class Softly(OfSign):
+    """Choose the second option with a probability that the first entry gives."""
+
+    def probabilities(self, td: TensorDict) -> torch.Tensor:
+        second = td[keys.OBSERVATION][..., 0].sigmoid()
+        return torch.stack([1.0 - second, second], -1)
+
+
+@pytest.mark.parametrize("is_shared", [False, True], ids=["per_option", "shared"])
+def test_a_replayed_step_is_worth_the_mean_over_the_options_of_a_stochastic_selector(is_shared):
+    words = [*LEARNERS["pdqn"], "low.target_smoothing=0"]
+    agent = make_agent("pdqn", Softly(SPECS), is_shared=is_shared, words=words)
+    state = torch.rand(20, 2) * 2 - 1
+    seen = torch.cat([state, torch.tensor([[1.0, 0.0]]).expand(20, 2)], -1) if is_shared else state
+    is_ended = torch.rand(20) < 0.7
+    held = torch.zeros(20, dtype=torch.long)
+    sample = TensorDict({"next_state": seen, "option_ended": is_ended, "next_option": held, "option": held}, [20])
+    expected = []
+    for i in range(20):
+        second = float(state[i, 0].sigmoid()) if is_ended[i] else 0.0
+        first_value, second_value = (value(agent, option, state[i : i + 1]) for option in range(2))
+        expected.append((1.0 - second) * first_value + second * second_value)
+    assert agent.learners[0].next_value(sample).tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_actor_and_uniform_choices_state_the_probabilities_of_their_options():
+    torch.manual_seed(0)
+    is_due = torch.ones(1, 1, dtype=torch.bool)
+    td = TensorDict({keys.OBSERVATION: torch.rand(1, 2), keys.IS_DECISION: is_due}, [1]).expand(4000)
+    for selector in (Actor(SPECS), Uniform(SPECS)):
+        often = selector.choose(td)[keys.OPTION].bincount(minlength=2) / 4000
+        torch.testing.assert_close(selector.probabilities(td)[0], often, atol=0.03, rtol=0.0)
 
 
 def test_a_replayed_step_is_followed_by_the_option_of_that_time_if_the_selector_needs_more_than_the_observation():

@@ -282,6 +282,9 @@ class Asked:
     def choose(self, observation, option, held):
         return option
 
+    def probabilities(self, observation):
+        return None
+
     def value(self, observation, option, action_mask=None, memory=None, *, has_seen=False):
         self.memories.append(memory["gru_8"])
         return torch.zeros(len(observation))

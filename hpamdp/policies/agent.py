@@ -255,6 +255,18 @@ class AgentNextOptions:
         return self.greedy(TensorDict(seen, [len(observation)]), held)
 
     @torch.no_grad()
+    def probabilities(self, observation: Tensor) -> Tensor | None:
+        """Return the probabilities of the options `[N, num_options]`, see `NextOptions.probabilities`."""
+        if not self.sees_observation_alone:
+            return None
+        is_decision = torch.ones(len(observation), 1, dtype=torch.bool, device=observation.device)
+        seen = {keys.OBSERVATION: self._without_option(observation), keys.IS_DECISION: is_decision}
+        probabilities = self.selector.probabilities(TensorDict(seen, [len(observation)]))
+        if probabilities is None or self.pairs is None:
+            return probabilities
+        return probabilities.unflatten(-1, (self.num_options, -1)).sum(-1)
+
+    @torch.no_grad()
     def greedy(self, td: TensorDictBase, held: Tensor) -> Tensor:
         """Return the selector's greedy options `[N]`; a held option goes on if the selector decides so.
 

@@ -99,6 +99,16 @@ class NextOptions(Protocol):
         """
         ...
 
+    def probabilities(self, observation: Tensor) -> Tensor | None:
+        """Return with which probability the selector would choose each option now, `[N, num_options]`.
+
+        None if it would take one for sure, or needs more than the observation: see `choose`.
+
+        Args:
+            observation: of the states in which an option has ended, `[N, observation_dim]`.
+        """
+        ...
+
 
 class Level:
     """What a checkpoint and an export need from a selector or a learner; a base of both.
@@ -289,6 +299,14 @@ class Selector(Level, TensorDictModuleBase):
         Override it instead of `select` if there is more to return than the option.
         """
         return {keys.OPTION: self.select(td)}
+
+    def probabilities(self, td: TensorDictBase) -> Tensor | None:
+        """Return the probabilities of the options at a decision, `[*B, num_options]`; None if one is chosen for sure.
+
+        They are those of the policy that the selector follows or learns, without exploration. Off-policy learners
+        bootstrap from the mean of the options' values with these weights. Override it if that policy is stochastic.
+        """
+        return None
 
     def greedy_choice(self) -> Callable[[TensorDictBase], Tensor]:
         """Return the function from a step `[*B]` to the greedy option of each environment, int64 `[*B]`, for an export.

@@ -107,6 +107,11 @@ class Actor(OnPolicy, RemembersDecisions):
         num_allowed = self.specs.num_options if mask is None else mask.sum(-1)
         return {**chosen, LOG_PROB: log_prob, WEIGHT: log_prob.exp() * num_allowed, **self._allowed(td)}
 
+    @torch.no_grad()
+    def probabilities(self, td: TensorDictBase) -> Tensor:
+        """Return the policy's probabilities of the options, `[*B, num_options]`."""
+        return self._log_probs(td).exp()
+
     def _log_probs(self, td: TensorDictBase) -> Tensor:
         """Return the policy's log-probabilities `[*B, num_options]`."""
         logits = masked_logits(self.logits(self.seen(td)), td.get(keys.OPTION_MASK, None))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -20,3 +21,10 @@ class Uniform(Selector):
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
         mask = td.get(keys.OPTION_MASK, None)
         return random_choice(is_decision.shape, self.specs.num_options, mask, is_decision.device)
+
+    def probabilities(self, td: TensorDictBase) -> Tensor:
+        """Return the probabilities of the options, `[*B, num_options]`: the same for all allowed ones."""
+        mask = td.get(keys.OPTION_MASK, None)
+        if mask is None:
+            mask = torch.ones(*td.batch_size, self.specs.num_options, dtype=torch.bool, device=self.is_uniform.device)
+        return mask / mask.sum(-1, keepdim=True)

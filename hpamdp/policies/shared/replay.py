@@ -329,7 +329,7 @@ class ReplayLearner(Learner):
         """Return the values `[B]` of a sample's next states.
 
         Where an option has ended, it is the value under the option that the selector would choose now, by that option's
-        learner: the selector has learned since.
+        learner: the selector has learned since. If the selector's policy is stochastic, it is the expected value.
         """
         state = sample["next_state"]
         masks = [sample["next_action_mask"]] if self.specs.has_action_mask else []
@@ -342,9 +342,19 @@ class ReplayLearner(Learner):
         if is_ended.any():
             state, held = state[is_ended], sample["option"][is_ended]
             mask = masks[0][is_ended] if masks else None
-            option = self.next_options.choose(state, sample["next_option"][is_ended], held)
-            begun = None if memory is None else self._memory_of_next(memory[is_ended], option == held)
-            value[is_ended] = self.next_options.value(state, option, mask, begun)
+            memory = None if memory is None else memory[is_ended]
+
+            def value_under(option: Tensor) -> Tensor:
+                begun = None if memory is None else self._memory_of_next(memory, option == held)
+                return self.next_options.value(state, option, mask, begun)
+
+            probabilities = self.next_options.probabilities(state)
+            if probabilities is None:
+                value[is_ended] = value_under(self.next_options.choose(state, sample["next_option"][is_ended], held))
+            else:
+                options = (torch.full_like(held, i) for i in range(probabilities.shape[-1]))
+                values = torch.stack([value_under(option) for option in options], -1)
+                value[is_ended] = (probabilities * values).sum(-1)
         return value
 
     def last_memory(self, sample: TensorDictBase) -> Tensor | None:
