@@ -218,12 +218,12 @@ def test_a_window_does_not_go_on_in_an_environment_that_was_started_anew():
 
 
 def test_the_elites_define_the_next_distribution_separately_for_each_discrete_action():
-    planner = Planner(None, SPECS, **{**SEARCH, "horizon": 1, "num_samples": 5, "num_elites": 4, "temperature": 0.5})
+    planner = Planner(None, SPECS, **{**SEARCH, "horizon": 1, "num_samples": 5, "num_elites": 4})
     plan = Plan(torch.tensor([[[0.2, 0.3, 0.5]]]), torch.full((1, 1, 3), 0.1), torch.full((1, 1, 3), 0.7))
     discrete = torch.tensor([0, 0, 2, 0, 1]).view(1, 5, 1)
     unit = torch.tensor([0.5, -0.5, 0.9, 0.3, 0.9]).view(1, 5, 1, 1).expand(1, 5, 1, 3)
     returns = torch.tensor([[1.0, 0.5, 0.2, 0.8, -3.0]])
-    new = planner.re_estimate(plan, discrete, unit, returns)
+    new = planner.re_estimate(plan, discrete, unit, returns, torch.tensor([0.5]))
     weight = (torch.tensor([1.0, 0.5, 0.2, 0.8]) / 0.5).exp()
     weight = weight / weight.sum()
     own = weight[[0, 1, 3]] / weight[[0, 1, 3]].sum()
@@ -234,6 +234,19 @@ def test_the_elites_define_the_next_distribution_separately_for_each_discrete_ac
     torch.testing.assert_close(new.probability[0, 0], 0.1 * plan.probability[0, 0] + 0.9 * share)
     torch.testing.assert_close(new.mean[0, 0], torch.tensor([0.1 * 0.1 + 0.9 * mean, 0.1, 0.1]))
     torch.testing.assert_close(new.deviation[0, 0], torch.tensor([0.1 * 0.7 + 0.9 * deviation, 0.7, 0.7]))
+
+
+def test_the_scale_of_rewards_leaves_a_plan_as_it_is():
+    def planned(scale: float) -> Plan:
+        def model(state, discrete, unit):
+            reward = scale * (unit[:, 0] - 0.4 * discrete - state[:, 0]).sin().expand(2, -1)
+            return Prediction(state + 0.1, reward, reward - scale, unit[:, 1].expand(2, -1))
+
+        torch.manual_seed(0)
+        return Planner(model, SPECS, **SEARCH).plan(torch.linspace(-1.0, 1.0, 12).view(3, 4))
+
+    for one, other in zip(planned(1.0), planned(50.0), strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
 
 
 def test_a_return_weights_later_rewards_by_the_probability_of_reaching_them():

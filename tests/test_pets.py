@@ -11,7 +11,14 @@ from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.pets.policy import MEMBER
 from hpamdp.policies.shared.end_values import EndValueOptions, EndValues
-from hpamdp.policies.shared.planning import PlannedAction, Prediction, SequenceSearch, discounted_return, elite_weights
+from hpamdp.policies.shared.planning import (
+    PlannedAction,
+    Prediction,
+    SequenceSearch,
+    absolute_temperature,
+    discounted_return,
+    elite_weights,
+)
 from hpamdp.policies.shared.scales import scale_of
 from hpamdp.specs import PAMDPSpecs
 
@@ -225,9 +232,28 @@ def test_a_return_weights_rewards_by_the_end_of_the_episode():
 
 
 def test_elites_are_the_best_weighted_by_their_returns():
-    place, weight = elite_weights(torch.tensor([[0.1, 3.0, 2.0, -1.0]]), 2, 0.5)
-    assert place.tolist() == [[1, 2]]
-    torch.testing.assert_close(weight[0, 0] / weight[0, 1], torch.tensor(2.0).exp())
+    returns = torch.tensor([[0.1, 3.0, 2.0, -1.0], [2.0, 2.0, 2.0, 2.0]])
+    temperature = absolute_temperature(0.5, returns)
+    place, weight = elite_weights(returns, 2, temperature.unsqueeze(-1))
+    assert place[0].tolist() == [1, 2]
+    spread = returns[0].std(correction=0)
+    torch.testing.assert_close(weight[0, 0] / weight[0, 1], (2.0 / spread).exp())
+    assert weight[1].tolist() == [0.5, 0.5], "equal returns have equal weights"
+
+
+def test_the_scale_of_rewards_leaves_a_plan_as_it_is():
+    def planned(scale: float) -> PlannedAction:
+        def returns(steps):
+            total = sum(step.own.sum(-1).sin() - 0.3 * step.discrete.unsqueeze(-1) for step in steps[-1:])
+            return scale * total
+
+        torch.manual_seed(0)
+        search = SequenceSearch((1, 2), horizon=2, num_kept=2)
+        return search(returns, 3, torch.device("cpu"))
+
+    one, other = planned(1.0), planned(50.0)
+    assert torch.equal(one.discrete, other.discrete)
+    torch.testing.assert_close(one.own, other.own, atol=1e-4, rtol=1e-4)
 
 
 # The model.

@@ -30,7 +30,10 @@ class SearchOptions(Settings):
     num_iterations: PositiveInt = 5
     """Iterations of the search."""
     temperature: PositiveFloat = 0.1
-    """Elites are weighted by exp(return / temperature)."""
+    """Elites are weighted by exp(return / (temperature * spread)), so the scale of rewards does not matter.
+
+    The spread is the standard deviation of the returns of the plan's first samples. On boats it is about 1.
+    """
     min_deviation: NonNegativeFloat = 0.02
     """Smallest standard deviation of a parameter."""
 
@@ -118,13 +121,24 @@ def discounted_return(
     return total
 
 
-def elite_weights(returns: Tensor, num_elites: int, temperature: float) -> tuple[Tensor, Tensor]:
+def elite_weights(returns: Tensor, num_elites: int, temperature: Tensor) -> tuple[Tensor, Tensor]:
     """Return of candidates' returns `[*B, S]` the best ones' places and their weights, `[*B, num_elites]` each.
 
     The weights are exp(return / temperature), normalised.
+
+    Args:
+        returns: of the candidates.
+        num_elites: how many of them are the best ones.
+        temperature: positive, of a shape that broadcasts with `returns`.
     """
     best, place = returns.topk(num_elites, -1)
-    return place, (best / temperature).softmax(-1)
+    return place, ((best - best[..., :1]) / temperature).softmax(-1)
+
+
+def absolute_temperature(temperature: float, returns: Tensor) -> Tensor:
+    """Return a plan's temperature in units of returns, given those of its first samples `[N, ...]`: `[N]`, positive."""
+    spread = returns.flatten(1).std(-1, correction=0)
+    return (temperature * spread).clamp(min=torch.finfo(spread.dtype).tiny)
 
 
 class SequenceStep(NamedTuple):
@@ -251,6 +265,7 @@ class SequenceSearch:
         is_last = self.options.num_iterations == 1
         value = returns(steps) if first_returns is None or is_last else first_returns(steps)
         is_allowed = None if allowed is None else self._are_allowed(steps, allowed)
+        temperature = absolute_temperature(self.options.temperature, value)
         value = _without_forbidden(value, is_allowed)
         kept = self._best_sequences(value, self.options.num_kept)
         value = value.take_along_dim(kept.unsqueeze(-1), 1)
@@ -268,7 +283,7 @@ class SequenceSearch:
                 is_allowed = None if is_allowed is None else is_allowed.gather(1, kept)
                 discrete = discrete.take_along_dim(kept.unsqueeze(-1), 1)
                 unit_parameters = unit_parameters.take_along_dim(kept[..., None, None, None], 1)
-            mean, deviation = self._gaussians(value, unit_parameters, self._lower_bound(refinement))
+            mean, deviation = self._gaussians(value, unit_parameters, temperature, self._lower_bound(refinement))
             best = _best_samples(value, unit_parameters)
             normal = torch.special.ndtri(_stratified(unit_parameters.shape, device))
             unit_parameters = mean.unsqueeze(2) + deviation.unsqueeze(2) * normal
@@ -292,9 +307,14 @@ class SequenceSearch:
         fraction = refinement / max(1, self.options.num_iterations - 2)
         return self.options.first_min_deviation ** (1.0 - fraction) * self.options.min_deviation**fraction
 
-    def _gaussians(self, value: Tensor, unit_parameters: Tensor, lower_bound: float) -> tuple[Tensor, Tensor]:
-        """Return mean and deviation `[N, Q, H, D]` of the elites, of returns `[N, Q, S]` of `[N, Q, S, H, D]`."""
-        place, weight = elite_weights(value, self.options.num_elites, self.options.temperature)
+    def _gaussians(
+        self, value: Tensor, unit_parameters: Tensor, temperature: Tensor, lower_bound: float
+    ) -> tuple[Tensor, Tensor]:
+        """Return mean and deviation `[N, Q, H, D]` of the elites, of returns `[N, Q, S]` of `[N, Q, S, H, D]`.
+
+        `temperature` is `[N]`, in units of returns.
+        """
+        place, weight = elite_weights(value, self.options.num_elites, temperature[:, None, None])
         elites = unit_parameters.take_along_dim(place[..., None, None], 2)
         weight = weight[..., None, None]
         mean = (weight * elites).sum(2)

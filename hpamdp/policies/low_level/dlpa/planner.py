@@ -14,7 +14,7 @@ from pydantic import Field, NonNegativeFloat, model_validator
 from torch import Tensor
 from typing_extensions import Self
 
-from hpamdp.policies.shared.planning import Prediction, discounted_return, elite_weights
+from hpamdp.policies.shared.planning import Prediction, absolute_temperature, discounted_return, elite_weights
 from hpamdp.policies.shared.planning_policy import PlanningOptions
 from hpamdp.specs import PAMDPSpecs
 
@@ -101,9 +101,13 @@ class Planner:
             probability = torch.cat([part / part.sum(-1, keepdim=True) for part in parts], -1)
         mean = state.new_zeros(*shape, self.specs.num_parameters)
         plan = Plan(probability, mean, torch.ones_like(mean))
+        temperature: Tensor | None = None
         for _ in range(self.options.num_iterations):
             discrete, unit_parameters = self.sample(plan)
-            plan = self.re_estimate(plan, discrete, unit_parameters, self.returns(state, discrete, unit_parameters))
+            returns = self.returns(state, discrete, unit_parameters)
+            if temperature is None:
+                temperature = absolute_temperature(self.options.temperature, returns)
+            plan = self.re_estimate(plan, discrete, unit_parameters, returns, temperature)
         return plan
 
     def sample(self, plan: Plan) -> tuple[Tensor, Tensor]:
@@ -136,14 +140,23 @@ class Planner:
             value = value - self.options.pessimism * total.std(0, correction=0)
         return value.unflatten(0, discrete.shape[:2])
 
-    def re_estimate(self, plan: Plan, discrete: Tensor, unit_parameters: Tensor, returns: Tensor) -> Plan:
+    def re_estimate(
+        self, plan: Plan, discrete: Tensor, unit_parameters: Tensor, returns: Tensor, temperature: Tensor
+    ) -> Plan:
         """Return the distribution of the elites.
 
         The parameters of a discrete action are estimated from the elites that choose it; they stay as they were if
         there are none.
+
+        Args:
+            plan: from which the sequences were sampled.
+            discrete: as `sample` returns them.
+            unit_parameters: as `sample` returns them.
+            returns: of the sequences, `[N, S]`.
+            temperature: in units of returns, `[N]`.
         """
         options = self.options
-        elite, elite_weight = elite_weights(returns, options.num_elites, options.temperature)
+        elite, elite_weight = elite_weights(returns, options.num_elites, temperature.unsqueeze(-1))
         discrete = discrete.take_along_dim(elite.reshape(*elite.shape, *[1] * (discrete.ndim - 2)), 1)
         unit_parameters = unit_parameters.take_along_dim(elite[..., None, None], 1)
         discrete_weight = elite_weight[..., None, None] * self.components.is_chosen(discrete)
