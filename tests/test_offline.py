@@ -306,6 +306,16 @@ def test_behaviour_cloning_finds_the_mean_parameter_of_the_data():
     assert parameter == pytest.approx(0.55, abs=0.05)
 
 
+@pytest.mark.parametrize(("num_updates", "fraction"), [(1, 1.0), (6, 0.5), (11, 0.0), (12, 0.0)])
+def test_the_policys_learning_rate_of_iql_falls_along_a_cosine_if_told_so(num_updates, fraction):
+    learner = IQL(SPECS, **{**IQL_OPTIONS, "actor_lr_updates": 10})
+    batch = one_step_batch()
+    learner.add_demonstrations(batch, torch.ones(batch.shape, dtype=torch.bool))
+    learner.update(num_updates)
+    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in learner.optimizers.items()}
+    assert rates == pytest.approx({"actor": 3e-3 * fraction, "state_value": 3e-3, "critics": 3e-3})
+
+
 @pytest.mark.parametrize(("learner", "options"), [(IQL, IQL_OPTIONS), (TD3BC, TD3BC_OPTIONS)], ids=["iql", "td3_bc"])
 def test_offline_learners_find_the_better_actions_of_the_data(learner, options):
     discrete, parameter = greedy_action(learner(SPECS, device=torch.device("cpu"), **options), 600)

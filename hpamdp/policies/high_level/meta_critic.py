@@ -46,7 +46,10 @@ class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
     exploration: Literal["epsilon", "ucb"] = "epsilon"
     """A random option with a decaying probability, or the option with the highest upper confidence bound."""
     epsilon_decisions: NonNegativeInt = 1000
-    """Decisions after the warm-up over which the probability of a random option falls from 1 to `epsilon_final`."""
+    """Finished decisions, after the warm-up, over which the probability of a random option falls.
+
+    It falls linearly from 1 to `epsilon_final`. Decisions of a data set do not count.
+    """
     ucb_width: NonNegativeFloat = 2.0
     """Width of the upper confidence bound, in standard deviations over the critics."""
     updates_per_decision: PositiveFloat = 0.5

@@ -54,7 +54,10 @@ class OptionCriticOptions(SelectorStackOptions, OptionValueOptions):
     initial_termination: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.3
     """Probability that an untrained option ends at a step; it stays part of exploration."""
     epsilon_steps: NonNegativeInt = 20_000
-    """Steps after the warm-up over which the probability of a random option falls from 1 to `epsilon_final`."""
+    """Steps of all environments, after the warm-up, over which the probability of a random option falls.
+
+    It falls linearly from 1 to `epsilon_final`.
+    """
     updates_per_step: PositiveFloat = 0.02
     """Updates for each step."""
     warmup_steps: NonNegativeInt = 2000

@@ -70,11 +70,11 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     min_scale: PositiveFloat = 0.06
     """Smallest standard deviation at the start."""
     min_scale_final: PositiveFloat = 0.02
-    """Smallest standard deviation at the end; the limit is annealed from `min_scale` to this value."""
+    """Smallest standard deviation after `anneal_steps`; the limit falls from `min_scale` to this value."""
     max_scale: PositiveFloat = 1.0
     """Largest standard deviation at the start."""
     max_scale_final: PositiveFloat | None = None
-    """Largest standard deviation at the end; the limit is annealed from `max_scale` to this value. None keeps it.
+    """Largest standard deviation after `anneal_steps`; the limit falls from `max_scale` to this value. None keeps it.
 
     Where noise on a parameter costs little, its standard deviation stays large. Then the means are never tried alone,
     but evaluations use them alone.
@@ -88,7 +88,7 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     lr: LearningRate = 1e-3
     """Learning rate of actors and critic at the start."""
     lr_final: Fraction = 1e-4
-    """Learning rate at the end; the rate is annealed from `lr` to this value."""
+    """Learning rate after `anneal_steps`; it falls linearly from `lr` to this value."""
     critic_weight: PositiveFloat = 0.5
     """Weight of the critic's squared error beside the surrogates."""
     discrete_entropy: NonNegativeFloat = 0.01
@@ -96,9 +96,13 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     parameter_entropy: NonNegativeFloat = 0.0
     """Weight of the entropy bonus of the parameters."""
     entropy_final: Fraction = 0.1
-    """Fraction of both entropy bonuses that is left at the end."""
+    """Fraction of both entropy bonuses that is left after `anneal_steps`; they fall linearly."""
     anneal_steps: PositiveInt = 200_000
-    """Steps of the whole run over which learning rate, `min_scale`, `max_scale` and entropy bonuses are annealed."""
+    """Steps of the whole run over which learning rate, `min_scale`, `max_scale` and entropy bonuses are annealed.
+
+    Steps of other options' learners count, too. So a learner whose option is seldom chosen ends its exploration with
+    the others.
+    """
     max_grad_norm: PositiveFloat = 1.0
     """Largest gradient norm, of actors and critic together."""
     credit: Credit = "joint"

@@ -132,9 +132,9 @@ class HyAROptions(TargetRateOptions, SearchingActorOptions):
     The means lie on a line in the latent space. Off that line, where the actor goes, only samples teach the critics.
     """
     lr_final: PositiveFraction = 0.1
-    """Fraction of the three learning rates that is left at the end; 1 keeps them constant."""
+    """Fraction of the three learning rates that is left after `lr_steps`; 1 keeps them constant."""
     epsilon_steps: NonNegativeInt = 15_000
-    """Steps after the warm-up within which the probability of a random action falls."""
+    """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
 
 
 class HybridCodec(nn.Module):

@@ -7,9 +7,12 @@ action that is not in the data.
 Source: Kostrikov, Nair and Levine 2021, *Offline Reinforcement Learning with Implicit Q-Learning*, arXiv 2110.06169,
 equations 5 to 7.
 
-Differs from the source: an action is a discrete action and its own parameters. So the policy is H-PPO's (Fan et al.
-2019, arXiv 1903.01344). Q sees only the chosen action's own parameters, as in MP-DQN (Bester et al. 2019, arXiv
-1905.04388).
+Differs from the source:
+- An action is a discrete action and its own parameters. So the policy is H-PPO's (Fan et al. 2019, arXiv 1903.01344). Q
+  sees only the chosen action's own parameters, as in MP-DQN (Bester et al. 2019, arXiv 1905.04388).
+- The policy's learning rate is constant. The source's code lets it fall along a cosine, within the million updates of a
+  run: `actor_lr_updates=1000000`.
+- The learning rates are 1e-3, not 3e-4, and the temperature is 10. The source has 3 on locomotion and 10 on mazes.
 
 TorchRL's IQLLoss does not fit: it reads a single action leaf.
 """
@@ -26,8 +29,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions
+from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions, set_learning_rates
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
+from hpamdp.policies.shared.exploration import cosine_schedule
 from hpamdp.policies.shared.gradients import expectile_loss
 from hpamdp.policies.shared.hybrid_actor import HeadOptions, HybridActor, HybridPolicy, ScaleOptions
 from hpamdp.policies.shared.networks import HybridCritics, JointCritics, mlp, polyak_update
@@ -41,6 +45,8 @@ class IQLOptions(HeadOptions, ActorCriticOptions, TargetRateOptions, ScaleOption
 
     hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
     """Hidden layers of the actor, the state value and the critics."""
+    actor_lr_updates: NonNegativeInt = 0
+    """Updates within which the actor's learning rate falls to 0 along a cosine; with 0 it is constant."""
     critic_lr: LearningRate = 1e-3
     """Learning rate of the critics and of the state value."""
     tau: PositiveFraction = 0.005
@@ -100,6 +106,9 @@ class IQL(ReplayLearner):
         of_value = self.gradient_step("state_value", self.value_loss, sample["state"], q)
         scalars = self.gradient_step("critics", self.critic_loss, sample) | of_value | {"q": q.mean()}
         polyak_update(self.target_critics, self.critics, self.options.tau)
+        if self.options.actor_lr_updates > 0:
+            fraction = cosine_schedule(int(self.updates) - 1, self.options.actor_lr_updates)
+            set_learning_rates(self.optimizers, {"actor": self.options.actor_lr}, fraction)
         return scalars | self.gradient_step("actor", self.actor_loss, sample, self.allowed(sample), q)
 
     def value_loss(self, state: Tensor, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

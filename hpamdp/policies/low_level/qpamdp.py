@@ -109,7 +109,7 @@ class QPAMDPOptions(Settings):
     temperature_final: PositiveFloat = 0.01
     """Smallest temperature."""
     temperature_decay: PositiveFraction = 1.0
-    """Factor on the temperature for every episode that ends while the values are learned. Published: 0.995."""
+    """Factor on the temperature for each of the learner's episodes while the values are learned. Published: 0.995."""
     samples_in_parameter_phase: bool = True
     """Sample discrete actions also while the parameters are learned; if false, as published, take the best ones."""
     parameter_updates: PositiveInt | None = 10
@@ -136,7 +136,7 @@ class QPAMDPOptions(Settings):
     sigma_final: PositiveFloat = 0.04
     """Smallest standard deviation of the parameters."""
     sigma_decay: PositiveFraction = 0.99
-    """Factor on the standard deviation at each parameter update. Published: 1."""
+    """Factor on the standard deviation at each parameter update of the learner. Published: 1."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -7,7 +7,8 @@ on the critics of MP-DQN (Bester et al. 2019, arXiv 1905.04388) with the twin cr
 
 Differs from the sources:
 - Every discrete action has its own parameters. So the actor increases the values of all discrete actions, each weighted
-  by its frequency in the data. The distance from the data is that of the recorded action's own parameters.
+  by its frequency in the data. The distance from the data is that of the recorded action's own parameters, summed over
+  them; the source takes the mean. With n parameters the distance weighs n times as much.
 - The actor increases the minimum of both critics, not the first one's value.
 - States are not normalised, as problems scale their observations.
 - By default the values weigh twice as much: `behaviour_weight` is 1 / alpha, 0.2 where the source has alpha = 2.5, that

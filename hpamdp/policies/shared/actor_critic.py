@@ -51,9 +51,9 @@ class AnnealedRateOptions(Settings):
     """Learning rates that fall linearly."""
 
     lr_final: PositiveFraction = 1.0
-    """Fraction of the learning rates that is left at the end; 1 keeps them constant."""
+    """Fraction of the learning rates that is left after `lr_steps`; 1 keeps them constant."""
     lr_steps: NonNegativeInt = 100_000
-    """Steps after the warm-up within which the learning rates fall."""
+    """The learner's own steps, after its warm-up, within which the learning rates fall."""
 
 
 def set_learning_rates(

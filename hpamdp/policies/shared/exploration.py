@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor
@@ -20,9 +22,9 @@ class EpsilonOptions(ParameterNoiseOptions):
     """Exploration by noise on the parameters and by random actions."""
 
     epsilon_final: Fraction = 0.05
-    """Probability of a random action at the end; it falls linearly from 1 to this value."""
+    """Probability of a random action after `epsilon_steps`; it falls linearly from 1 to this value."""
     epsilon_steps: NonNegativeInt = 40_000
-    """Steps after the warm-up within which the probability of a random action falls."""
+    """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
 
 
 def with_exploring_noise(unit_actions: Tensor, deviation: float) -> Tensor:
@@ -31,5 +33,10 @@ def with_exploring_noise(unit_actions: Tensor, deviation: float) -> Tensor:
 
 
 def linear_schedule(time: int, over: int, final: float) -> float:
-    """Return a fraction that falls linearly from 1 to `final` within a time `over`, in steps or decisions."""
+    """Return a fraction that falls linearly from 1 to `final` within a time `over`, both in the same unit."""
     return 1.0 + (final - 1.0) * min(1.0, time / max(1, over))
+
+
+def cosine_schedule(time: int, over: int) -> float:
+    """Return a fraction that falls from 1 to 0 along half a cosine within a time `over`, both in the same unit."""
+    return 0.5 * (1.0 + math.cos(math.pi * min(1.0, time / max(1, over))))

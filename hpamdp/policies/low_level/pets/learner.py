@@ -27,7 +27,7 @@ Differs from the sources:
 - some entries of the state change linearly with others, such as a target's offset with the agent's own place. They are
   derived from these instead of predicted;
 - members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
-- weight decay falls with the number of steps, as the weight of a prior does;
+- weight decay falls with the number of stored steps, as the weight of a prior does;
 - each sequence of discrete actions has its own search for parameters (`policies.shared.planning`);
 - with `end_values` a plan also counts the value of its last state (`policies.shared.end_values`).
 """
@@ -60,7 +60,7 @@ class PETSOptions(PETSPolicyOptions):
     weight_decay: NonNegativeFloat = 1.0
     """Weight decay of AdamW. With much less, the networks overfit a few hundred steps, with overconfident errors."""
     weight_decay_steps: PositiveInt = 256
-    """With more steps than these, the decay falls as 1 / steps, so that it does not blur the edges of targets."""
+    """With more stored steps than these, the decay falls as 1 / steps, so that it blurs no edges of targets."""
     transition_weight: PositiveFloat = 2.0
     """Weight of the change's error in the loss; those of termination and rewards are 1."""
     warmup_steps: PositiveInt = 64
