@@ -152,7 +152,12 @@ def test_a_killed_run_with_worker_processes_resumes_to_the_last_bit(high, tmp_pa
 
 @pytest.mark.parametrize("collector", ["single", pytest.param("multi", marks=pytest.mark.slow)])
 def test_options_that_end_with_the_last_batch_before_a_stop_are_learned_from(collector, tmp_path, monkeypatch):
-    given = [*words_of("meta_critic", "random"), "agent.termination=learned", f"collector={collector}"]
+    given = [
+        *words_of("meta_critic", "random"),
+        "agent.termination=learned",
+        "env.switch_cost=0.2",
+        f"collector={collector}",
+    ]
     given[given.index("steps_per_batch=4")] = "steps_per_batch=1"
     stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
 
