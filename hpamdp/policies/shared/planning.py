@@ -32,7 +32,7 @@ class SearchOptions(Settings):
     temperature: PositiveFloat = 0.1
     """Elites are weighted by exp(return / (temperature * spread)), so the scale of rewards does not matter.
 
-    The spread is the standard deviation of the returns of the plan's first samples. On boats it is about 1.
+    The spread is the standard deviation of the returns of the plan's first samples.
     """
     min_deviation: NonNegativeFloat = 0.02
     """Smallest standard deviation of a parameter."""
