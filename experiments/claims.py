@@ -671,6 +671,7 @@ def domains() -> list[Claim]:
 def learners_on_domains() -> list[Claim]:
     results, curves, published = domain_runs()
     hppo, patd3, vectors = results["platform", "hppo"], results["platform", "patd3"], results["catch_point", "hppo"]
+    pictures = rows("domains/pictures.csv")
     hard_moves = {num: results[f"hard_move_{num}", "hppo"] for num in (4, 6, 8, 10)}
     pets = [
         steps_to(published[domain], run, "success", "at_frames")
@@ -704,6 +705,13 @@ def learners_on_domains() -> list[Claim]:
         pdqn_moving=mean(results["moving", "pdqn"]),
         pets_fewest=min(thousands),
         pets_most=max(thousands),
+        pictures_steps=mean(pictures, "frames"),
+        pictures_return=spread(column(pictures, "score"), 2),
+        pictures_success=mean_and_deviation(pictures, "success"),
+        pictures_cpu=mean(pictures, "cpu_s"),
+        pictures_seeds=seeds(pictures),
+        of_success=100.0 * mean(pictures, "success") / mean(vectors, "success"),
+        of_return=100.0 * mean(pictures) / mean(vectors),
         vector_steps=mean(vectors, "frames"),
         vector_seeds=seeds(vectors),
         vector_return=spread(column(vectors, "score"), 2),
@@ -746,6 +754,18 @@ def learners_on_domains() -> list[Claim]:
             "it reaches the best published score after {pets_fewest:word} to {pets_most:word} thousand steps",
             numbers,
             holds=len(thousands) == len(pets),
+        ),
+        Claim(
+            "docs/domains/catch_point.md",
+            "| picture | {pictures_steps:,.0f} | {pictures_seeds} | {pictures_return} | {pictures_success} | "
+            "{pictures_cpu:.0f} s |",
+            numbers,
+        ),
+        Claim(
+            "docs/domains/catch_point.md",
+            "H-PPO reaches {of_success:.0f} % of the success and {of_return:.0f} % of the return that it reaches from "
+            "vectors.",
+            numbers,
         ),
         Claim(
             "docs/domains/catch_point.md",
