@@ -244,7 +244,7 @@ def test_a_replayed_step_is_followed_by_the_option_that_the_selector_would_choos
 class Softly(OfSign):
     """Choose the second option with a probability that the first entry gives."""
 
-    def probabilities(self, td: TensorDict) -> torch.Tensor:
+    def option_probabilities(self, td: TensorDict) -> torch.Tensor:
         second = td[keys.OBSERVATION][..., 0].sigmoid()
         return torch.stack([1.0 - second, second], -1)
 
@@ -272,7 +272,7 @@ def test_the_actor_and_uniform_choices_state_the_probabilities_of_their_options(
     td = TensorDict({keys.OBSERVATION: torch.rand(1, 2), keys.IS_DECISION: is_due}, [1]).expand(4000)
     for selector in (Actor(SPECS), Uniform(SPECS)):
         often = selector.choose(td)[keys.OPTION].bincount(minlength=2) / 4000
-        torch.testing.assert_close(selector.probabilities(td)[0], often, atol=0.03, rtol=0.0)
+        torch.testing.assert_close(selector.option_probabilities(td)[0], often, atol=0.03, rtol=0.0)
 
 
 def test_a_replayed_step_is_followed_by_the_option_of_that_time_if_the_selector_needs_more_than_the_observation():

@@ -257,11 +257,11 @@ class AgentNextOptions:
     @torch.no_grad()
     def probabilities(self, observation: Tensor) -> Tensor | None:
         """Return the probabilities of the options `[N, num_options]`, see `NextOptions.probabilities`."""
-        if not self.sees_observation_alone:
+        if self.decides_ends or not self.sees_observation_alone:
             return None
         is_decision = torch.ones(len(observation), 1, dtype=torch.bool, device=observation.device)
         seen = {keys.OBSERVATION: self._without_option(observation), keys.IS_DECISION: is_decision}
-        probabilities = self.selector.probabilities(TensorDict(seen, [len(observation)]))
+        probabilities = self.selector.option_probabilities(TensorDict(seen, [len(observation)]))
         if probabilities is None or self.pairs is None:
             return probabilities
         return probabilities.unflatten(-1, (self.num_options, -1)).sum(-1)

@@ -102,7 +102,7 @@ class NextOptions(Protocol):
     def probabilities(self, observation: Tensor) -> Tensor | None:
         """Return with which probability the selector would choose each option now, `[N, num_options]`.
 
-        None if it would take one for sure, or needs more than the observation: see `choose`.
+        None if it would take one for sure, decides where options end, or needs more than the observation: see `choose`.
 
         Args:
             observation: of the states in which an option has ended, `[N, observation_dim]`.
@@ -300,7 +300,7 @@ class Selector(Level, TensorDictModuleBase):
         """
         return {keys.OPTION: self.select(td)}
 
-    def probabilities(self, td: TensorDictBase) -> Tensor | None:
+    def option_probabilities(self, td: TensorDictBase) -> Tensor | None:
         """Return the probabilities of the options at a decision, `[*B, num_options]`; None if one is chosen for sure.
 
         They are those of the policy that the selector follows or learns, without exploration. Off-policy learners

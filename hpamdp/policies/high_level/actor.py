@@ -108,7 +108,7 @@ class Actor(OnPolicy, RemembersDecisions):
         return {**chosen, LOG_PROB: log_prob, WEIGHT: log_prob.exp() * num_allowed, **self._allowed(td)}
 
     @torch.no_grad()
-    def probabilities(self, td: TensorDictBase) -> Tensor:
+    def option_probabilities(self, td: TensorDictBase) -> Tensor:
         """Return the policy's probabilities of the options, `[*B, num_options]`."""
         return self._log_probs(td).exp()
 

@@ -22,7 +22,7 @@ class Uniform(Selector):
         mask = td.get(keys.OPTION_MASK, None)
         return random_choice(is_decision.shape, self.specs.num_options, mask, is_decision.device)
 
-    def probabilities(self, td: TensorDictBase) -> Tensor:
+    def option_probabilities(self, td: TensorDictBase) -> Tensor:
         """Return the probabilities of the options, `[*B, num_options]`: the same for all allowed ones."""
         mask = td.get(keys.OPTION_MASK, None)
         if mask is None:
