@@ -29,6 +29,7 @@ from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 from hpamdp.observation_entries import ObservationEntry, is_picture_shape, packed, unpacked
 from hpamdp.policies.encoders.base import Encoder, JoinedEncoders
 from hpamdp.policies.encoders.cnn import CNN
+from hpamdp.policies.high_level.meta_critic import MetaCritic
 from hpamdp.policies.low_level.hppo import HPPO
 from hpamdp.policies.low_level.hsac import HSAC
 from hpamdp.policies.low_level.pdqn import PDQN
@@ -205,6 +206,29 @@ def test_replay_holds_bytes_and_samples_what_was_stored(name, make):
     assert sample["state"].dtype == everything.dtype
     assert all((everything == state).all(-1).any() for state in sample["state"])
     learner.check_rows(learner.buffer[:], learner.replay_rows(batch)["buffer"])
+    env.close()
+
+
+@pytest.mark.parametrize("memory", ["none", "gru"])
+def test_a_selectors_replay_holds_bytes_and_samples_what_was_stored(memory):
+    env = GymnasiumEnv(2, make=Mixed, max_steps=5)
+    batch = with_decisions(env).rollout(12, break_when_any_done=False)
+    specs = replace(PAMDPSpecs.from_env(env), option_names=("a", "b"), encoder=tiny)
+    selector = MetaCritic(specs, warmup_decisions=0, batch_size=4, buffer_size=64, memory=memory)
+    observation = batch[keys.OBSERVATION]
+    batch.set(keys.OPTION, torch.zeros(batch.shape, dtype=torch.long))
+    batch.set(("next", keys.DECISION_OBSERVATION), observation)
+    if memory == "gru":
+        batch.set(selector.memory_key, torch.zeros(*batch.shape, selector.options.memory_size))
+        selector.learn_from_steps(batch)
+    else:
+        selector.learn(batch.flatten())
+    stored = selector.buffer[:]["state"]
+    assert stored.dtype == torch.uint8 and stored.shape[-1] <= specs.observation_dim + 3 * 21
+    sample = selector._sample()
+    everything = observation.reshape(-1, specs.observation_dim)
+    assert all((everything == state).all(-1).any() for state in sample["state"])
+    selector.check_rows(selector.buffer[:], selector.replay_rows(batch)["buffer"])
     env.close()
 
 

@@ -32,7 +32,7 @@ from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.option_values import OptionValueOptions
-from hpamdp.policies.shared.replay import first_multiple
+from hpamdp.policies.shared.replay import first_multiple, packed_states, unpacked_states
 from hpamdp.policies.shared.selector_memory import RemembersDecisions, SelectorReplayMemoryOptions
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
 from hpamdp.specs import PAMDPSpecs
@@ -100,7 +100,11 @@ class MetaCritic(RemembersDecisions):
         if self.links is not None:
             rows["begins"] = self.begins(batch)
             rows["previous"] = torch.zeros_like(rows["option"])
-        return {"buffer": rows.flatten()}
+        return {"buffer": packed_states(rows.flatten(), self.specs)}
+
+    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
+        """Refuse invalid saved rows `[N]`; see `Level.check_rows`."""
+        super().check_rows(unpacked_states(rows.copy(), self.specs), example)
 
     def exported(self) -> dict[str, Any] | None:
         """Return the critics, unless they see features: see `hpamdp.policies.shared.exported_policy`."""
@@ -165,7 +169,7 @@ class MetaCritic(RemembersDecisions):
         return self._learn(rows)
 
     def _learn(self, rows: TensorDict) -> dict[str, float]:
-        self.buffer.extend(rows)
+        self.buffer.extend(packed_states(rows, self.specs))
         before = int(self.num_decisions)
         now = before + len(rows)
         self.num_decisions = self.num_decisions + len(rows)
@@ -176,7 +180,7 @@ class MetaCritic(RemembersDecisions):
 
     def add_demonstrations(self, decisions: TensorDictBase) -> None:
         """Store the decisions. They do not count for the warm-up or the decay of epsilon."""
-        self.buffer.extend(self._rows(decisions))
+        self.buffer.extend(packed_states(self._rows(decisions), self.specs))
 
     def update(self, num_updates: int) -> dict[str, float]:
         """Make updates from the stored decisions."""
@@ -186,8 +190,9 @@ class MetaCritic(RemembersDecisions):
     def _sample(self) -> TensorDictBase:
         size = self.options.batch_size
         if self.links is None:
-            return self.buffer.sample(size)
-        return sample_with_past(self.buffer, size, self.options.burn_in + self.options.sequence_length)
+            return unpacked_states(self.buffer.sample(size), self.specs)
+        num_past = self.options.burn_in + self.options.sequence_length
+        return unpacked_states(sample_with_past(self.buffer, size, num_past), self.specs)
 
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
         """Return what is stored of decisions `[*B]`: states as the critics see them, unless the memory is recurrent."""

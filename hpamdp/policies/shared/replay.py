@@ -125,8 +125,6 @@ class ReplayLearner(Learner):
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(options.buffer_size, device=device))
         self.descent = Descent()
         self.links = None
-        # Pictures beside vectors come as float32. As bytes they take a quarter of the memory.
-        self._packs = specs.has_pictures and specs.observation_dtype == torch.float32
 
     def set_perception(self, options: ReplayMemoryOptions) -> None:
         """Make the perception and its target copy; call it before the networks, which are built from its specs."""
@@ -235,10 +233,7 @@ class ReplayLearner(Learner):
             begins = self.perception.begins(batch)
             rows["begins"] = begins
             rows["previous"] = self.links(begins, mask, self.buffer.write_count)
-        rows = rows[mask]
-        if self._packs:
-            for name in _STATES:
-                rows[name] = packed(rows[name], self.specs.entries)
+        rows = packed_states(rows[mask], self.specs)
         if self.stores_own_parameters:
             rows["unit"] = rows["unit"].gather(-1, self.slots[rows["discrete"]])
         self.buffer.extend(rows)
@@ -261,22 +256,14 @@ class ReplayLearner(Learner):
         num = num_batches * self.options.batch_size
         drawn = self.buffer.sample(num) if self.links is None else sample_with_past(self.buffer, num, self.num_past)
         for sample in drawn.split(self.options.batch_size):
-            if self._packs:
-                sample = self._unpacked(sample)
+            sample = unpacked_states(sample, self.specs)
             if self.stores_own_parameters:
                 sample = sample.set("unit", self._all_parameters(sample["discrete"], sample["unit"]))
             yield self.augmented(sample)
 
     def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
         """Refuse invalid saved rows `[N]`; see `Level.check_rows`."""
-        super().check_rows(self._unpacked(rows.copy()) if self._packs else rows, example)
-
-    def _unpacked(self, rows: TensorDictBase) -> TensorDictBase:
-        """Return stored rows with their states as float32."""
-        for name in (*_STATES, "past"):
-            if name in rows.keys():
-                rows.set(name, unpacked(rows[name], self.specs.entries))
-        return rows
+        super().check_rows(unpacked_states(rows.copy(), self.specs), example)
 
     def augmented(self, sample: TensorDictBase) -> TensorDictBase:
         """Return a sample `[N, *]` with each row mapped by a random symmetry of the problem, if `augment` is set."""
@@ -401,6 +388,30 @@ class ReplayLearner(Learner):
     def pairs(self, sample: TensorDictBase) -> Tensor | None:
         """Return which discrete actions go together in a sample's states, as in `pair_mask`. If None, all do."""
         return sample.get("pair_mask", None)
+
+
+def packed_states(rows: TensorDictBase, specs: PAMDPSpecs) -> TensorDictBase:
+    """Return rows with their states in the form to store; they are changed in place.
+
+    Pictures beside vectors come as float32. As bytes they take a quarter of the memory.
+    """
+    if _packs(specs):
+        for name in _STATES:
+            rows.set(name, packed(rows[name], specs.entries))
+    return rows
+
+
+def unpacked_states(rows: TensorDictBase, specs: PAMDPSpecs) -> TensorDictBase:
+    """Return stored rows with their states as observations; they are changed in place."""
+    if _packs(specs):
+        for name in (*_STATES, "past"):
+            if name in rows.keys():
+                rows.set(name, unpacked(rows[name], specs.entries))
+    return rows
+
+
+def _packs(specs: PAMDPSpecs) -> bool:
+    return specs.has_pictures and specs.observation_dtype == torch.float32
 
 
 def first_multiple(updates_per_step: float) -> int:
