@@ -8,10 +8,13 @@ from 0 within its component.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, combinations
 
 import torch
 from torch import Tensor
+
+# A `pair_mask` is checked against every combination, so there may be at most this many.
+MAX_PAIRED = 65_536
 
 
 @dataclass(frozen=True)
@@ -97,8 +100,8 @@ class Components:
     ) -> Tensor | None:
         """Return which discrete actions a component may choose after those before it, bool `[*B, size]`; if None, all.
 
-        A choice that would leave nothing to a later component is left out. With three or more components, two choices
-        that leave something each may together leave nothing, so a `pair_mask` must allow a choice after each such pair.
+        With a `pair_mask` it may choose what the later components can complete. So no sequence of such choices ends
+        where nothing is left.
 
         Args:
             number: of the component that chooses.
@@ -113,8 +116,19 @@ class Components:
         allowed = (pair_mask | ~is_chosen.unsqueeze(-1)).all(-2)
         if mask is not None:
             allowed = allowed & mask
-        own = allowed[..., begin : begin + size]
-        follows = pair_mask[..., begin : begin + size, :] & allowed.unsqueeze(-2)
-        for start, later in zip(self.starts[number + 1 :], self.sizes[number + 1 :], strict=True):
-            own = own & follows[..., start : start + later].any(-1)
-        return own
+        # All ways to choose in this and the later components, as places among all discrete actions, `[J, components]`.
+        ranges = [torch.arange(size, device=allowed.device) for size in self.sizes[number:]]
+        starts = torch.tensor(self.starts[number:], device=allowed.device)
+        places = torch.cartesian_prod(*ranges).reshape(-1, len(ranges)) + starts
+        is_possible = allowed[..., places].all(-1)
+        for earlier, later in combinations(places.unbind(-1), 2):
+            is_possible = is_possible & pair_mask[..., earlier, later]
+        return is_possible.unflatten(-1, (size, -1)).any(-1)
+
+    def leaves_any(self, mask: Tensor, pair_mask: Tensor | None = None) -> Tensor:
+        """Return whether any choice is allowed, bool `[*B]`; arguments as for `allowed_next`."""
+        if pair_mask is None:
+            return self.any_of_each(mask)
+        first = self.allowed_next(0, torch.zeros_like(mask), mask, pair_mask)
+        assert first is not None
+        return first.any(-1)

@@ -36,6 +36,8 @@ class PAMDPSpecs:
         integer_parameters: whether each parameter is a whole number; empty if none is.
         has_parameter_bounds: whether the environment writes bounds of the current state, `parameter_low` and
             `parameter_high`.
+        bounds_place: place in the observation from which the lower and then the upper bounds of all parameters stand,
+            both on one scale. None if they are not there.
         initial_weight: rows `[num_parameters, observation_dim]` of the linear map from an observation to the published
             initial parameters in [-1, 1]; None if the problem has none.
         initial_bias: bias of this map, `num_parameters` entries.
@@ -67,6 +69,7 @@ class PAMDPSpecs:
     component_sizes: tuple[int, ...] = ()
     integer_parameters: tuple[bool, ...] = ()
     has_parameter_bounds: bool = False
+    bounds_place: int | None = None
     has_pair_mask: bool = False
     symmetries: Symmetries | None = field(default=None, compare=False, repr=False)
     geometry: PlaneGeometry | None = field(default=None, compare=False, repr=False)
@@ -180,6 +183,20 @@ class PAMDPSpecs:
         low, high = (step[name].to(like.dtype) for name in (keys.PARAMETER_LOW, keys.PARAMETER_HIGH))
         return low, high
 
+    def is_fixed(self, observation: Tensor) -> Tensor | None:
+        """Return which parameters have equal bounds in a state, and so a single value, bool `[*B, num_parameters]`.
+
+        `to_unit` maps them to 0. If None, the observation does not tell.
+
+        Args:
+            observation: `[*B, observation_dim]`.
+        """
+        if self.bounds_place is None:
+            return None
+        seen = observation[..., self.bounds_place : self.bounds_place + 2 * self.num_parameters]
+        low, high = seen.chunk(2, -1)
+        return low >= high
+
     def in_cells(self, unit_parameters: Tensor) -> Tensor:
         """Return parameters `[*B, num_parameters]` in [-1, 1] with whole numbers in the middle of their cells.
 
@@ -271,6 +288,7 @@ class PAMDPSpecs:
         return replace(
             self,
             observation_dim=len(entries),
+            bounds_place=self.bounds_place if len(entries) == self.observation_dim else None,
             initial_weight=None if weight is None else tuple(tuple(row[entry] for entry in entries) for row in weight),
             symmetries=None if symmetries is None else symmetries.with_entries(entries),
             geometry=None if geometry is None else geometry.with_entries(entries),
@@ -322,6 +340,7 @@ class PAMDPSpecs:
             component_sizes=tuple(env.component_sizes) if len(env.component_sizes) > 1 else (),
             integer_parameters=tuple(env.integer_parameters) if any(env.integer_parameters) else (),
             has_parameter_bounds=has_parameter_bounds,
+            bounds_place=env.bounds_place if has_parameter_bounds else None,
             initial_weight=weight,
             initial_bias=bias,
             has_action_mask=has_action_mask,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
+from itertools import combinations, product
 
 import pytest
 import torch
@@ -31,6 +33,7 @@ from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.qpamdp import QPAMDP
 from hpamdp.policies.low_level.random import Random
 from hpamdp.policies.low_level.td3_bc import TD3BC
+from hpamdp.policies.masks import random_discrete
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.settings import SettingError
@@ -168,6 +171,102 @@ def test_a_pair_off_the_marginals_is_reached_by_autoregressive_policies_alone(le
     assert (reward > 0.95) if reaches else (0.4 < reward < 0.55)
 
 
+@pytest.mark.parametrize("autoregressive", [False, True])
+def test_the_best_pair_of_random_data_is_reached_by_autoregressive_policies_alone(autoregressive):
+    """The weights are clipped, so all good pairs have similar probabilities; the best pair has the highest."""
+    torch.manual_seed(0)
+    env = OneStep(pays="climbing")
+    settings = {"hidden_dims": (32,), "batch_size": 128, "tau": 0.02}
+    learner = IQL(PAMDPSpecs.from_env(env), autoregressive=autoregressive, **settings)
+    data = random_steps(env, 3000)
+    learner.add_demonstrations(data, torch.ones(data.shape, dtype=torch.bool))
+    learner.update(450)
+    reward = greedy_reward(learner, pays="climbing")
+    assert reward > 0.9 if autoregressive else reward < 0.55
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("autoregressive", [False, True])
+def test_soft_values_of_pairs_off_the_marginals_are_reached_by_autoregressive_policies_alone(autoregressive):
+    torch.manual_seed(0)
+    specs = PAMDPSpecs.from_env(OneStep())
+    learner = HSAC(specs, **SMALL, batch_size=64, autoregressive=autoregressive)
+    train(learner, OneStep(32, pays="climbing"), 60)
+    reward = greedy_reward(learner, pays="climbing")
+    assert reward > 0.95 if autoregressive else 0.4 < reward < 0.55
+
+
+def test_the_greedy_action_of_autoregressive_heads_is_the_most_probable_together():
+    torch.manual_seed(0)
+    specs = PAMDPSpecs(2, (), (1, 0, 0, 0, 2, 0, 0), (-1.0,) * 3, (1.0,) * 3, component_sizes=(2, 3, 2))
+    actor = AutoregressiveActor(specs, (8,), (0.1, 1.0))
+    with torch.no_grad():
+        for head in actor.heads:
+            head[-1].weight.normal_(0.0, 2.0)
+    state, mask = torch.randn(200, 2), torch.rand(200, 7) < 0.8
+    mask[:, [0, 2, 5]] = True
+    choices = torch.tensor(list(product(range(2), range(3), range(2))))
+
+    def log_prob(choice):
+        parts = iter(choice)
+        forced = actor.act(lambda part: (next(parts).expand(200), part.mode()[1]), state, mask, None)
+        return forced[2].log_prob(*forced[:2])[0].sum(-1)
+
+    log_probs = torch.stack([log_prob(choice) for choice in choices], -1)
+    discrete, raw = actor.most_probable(state, mask, None)
+    assert discrete.equal(choices[log_probs.argmax(-1)])
+    one_by_one, _, _ = actor.act(HybridDistribution.mode, state, mask, None)
+    assert 0 < (one_by_one != discrete).any(-1).sum() < 100
+    parts = iter(zip(discrete.unbind(-1), raw.split(actor.parameter_sizes, -1), strict=True))
+    _, _, distribution = actor.act(lambda _: next(parts), state, mask, None)
+    torch.testing.assert_close(raw, distribution.mean)
+
+
+def test_every_sequence_of_choices_that_a_mask_of_pairs_offers_can_be_completed():
+    """Three choices that go together by twos may leave nothing to the fourth component."""
+    torch.manual_seed(0)
+    components = Components((2, 3, 2, 2))
+    specs = PAMDPSpecs(1, (), (0,) * 9, (), (), component_sizes=components.sizes, has_pair_mask=True)
+    mask, pair_mask = torch.rand(2000, 9) < 0.9, torch.rand(2000, 9, 9) < 0.6
+    places = components.places(torch.tensor(list(product(*map(range, components.sizes)))))
+    is_allowed = mask[:, places].all(-1)
+    for earlier, later in combinations(places.unbind(-1), 2):
+        is_allowed &= pair_mask[:, earlier, later]
+    has_any = is_allowed.any(-1)
+    assert 500 < has_any.sum() < 1500
+    assert components.leaves_any(mask, pair_mask).equal(has_any)
+    mask, pair_mask, is_allowed = mask[has_any], pair_mask[has_any], is_allowed[has_any]
+    actor = AutoregressiveActor(specs, (8,), (0.1, 1.0))
+    state = torch.randn(len(mask), 1)
+    for discrete in (
+        random_discrete(specs, mask.shape[:1], mask, mask.device, pair_mask),
+        actor.act(HybridDistribution.sample, state, mask, pair_mask)[0],
+        actor.most_probable(state, mask, pair_mask)[0],
+    ):
+        number = (discrete * torch.tensor([12, 4, 2, 1])).sum(-1, keepdim=True)
+        assert is_allowed.gather(-1, number).all()
+
+
+def test_an_option_without_a_pair_that_goes_together_is_not_possible():
+    env = OneStep(4, forbids_pairs=True)
+    env.group_actions({"matches": [0, 1, 2, 3], "never matches": [0, 3, 4]})
+    assert with_decisions(env).reset()[keys.OPTION_MASK].tolist() == [[True, False]] * 4
+
+
+def test_a_mask_of_pairs_of_too_many_combinations_is_refused_in_one_line():
+    class Long(OneStep):
+        parameter_dims = (0,) * 34
+        component_sizes = (2,) * 17
+
+        def _read(self, *, is_over):
+            td = super()._read(is_over=is_over)
+            return td.set(keys.PAIR_MASK, torch.ones(*self.batch_size, 34, 34, dtype=torch.bool))
+
+    env = Long(2, forbids_pairs=True)
+    with pytest.raises(ProblemError, match="takes at most 65,536 combinations of components, but there are 131,072"):
+        with_decisions(env).reset()
+
+
 def test_autoregressive_heads_and_random_agents_never_choose_a_pair_that_is_forbidden():
     torch.manual_seed(0)
     env = OneStep(200, forbids_pairs=True)
@@ -254,6 +353,30 @@ def test_updates_in_bfloat16_have_nearly_the_same_likelihoods(learner):
     assert all(part.dtype == torch.float32 for part in parts)
     for part, expected in zip(parts, [*exact.log_prob(discrete, raw), *exact.entropy()], strict=True):
         torch.testing.assert_close(part, expected, atol=0.03, rtol=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize(
+    ("learner", "forbids_pairs"),
+    [
+        (lambda specs: HPPO(specs, **FAST, autoregressive=True), True),
+        (lambda specs: IQL(specs, warmup_steps=64, updates_per_step=0.05, autoregressive=True), True),
+        (lambda specs: HSAC(specs, warmup_steps=64, updates_per_step=0.05, autoregressive=True), False),
+        (lambda specs: HSAC(specs, warmup_steps=64, updates_per_step=0.05), False),
+        (lambda specs: PDQN(specs, warmup_steps=64, updates_per_step=0.05), False),
+    ],
+    ids=["hppo", "iql", "hsac autoregressive", "hsac", "pdqn"],
+)
+def test_updates_of_several_components_can_be_compiled(learner, forbids_pairs):
+    torch.manual_seed(0)
+    env = OneStep(64, forbids_pairs=forbids_pairs)
+    learner = learner(PAMDPSpecs.from_env(env))
+    before = [parameter.clone() for parameter in learner.actor.parameters()]
+    learner.compile_updates()
+    train(learner, env, 3)
+    assert any(not one.equal(other) for one, other in zip(before, learner.actor.parameters(), strict=True))
+    assert env.violations == 0
 
 
 def test_independent_heads_refuse_a_mask_of_pairs():

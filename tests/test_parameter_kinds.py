@@ -30,6 +30,7 @@ from hpamdp.specs import PAMDPSpecs
 
 SPECS = PAMDPSpecs(1, (), (2, 1), (2.0, -1.0, 0.0), (6.0, 1.0, 9.0), integer_parameters=(True, False, True))
 REPLAY = {"warmup_steps": 16, "batch_size": 8, "hidden_dims": (8,), "updates_per_step": 0.25}
+BOUNDS = (keys.PARAMETER_LOW, keys.PARAMETER_HIGH)
 PLANS = {"warmup_steps": 16, "updates_per_step": 0.25, "horizon": 1, "num_iterations": 2, "num_elites": 2}
 LEARNERS = {
     Random: {},
@@ -182,3 +183,45 @@ def test_relative_numbers_move_with_the_bounds_of_the_state():
     assert all(low < high for low, high in pairwise(parameters.flatten().tolist()))
     with pytest.raises(ValueError, match="pass the step"):
         specs.from_unit(torch.zeros(3, 1))
+
+
+@pytest.mark.parametrize(
+    ("learner_class", "settings"),
+    [
+        (PDQN, {}),
+        (PDQN, {"search_samples": 4, "greedy_samples": 4, "memory": "stack"}),
+        (HSAC, {}),
+        (HSAC, {"autoregressive": True}),
+        (PADDPG, {"twin": True}),
+        (TD3BC, {}),
+    ],
+)
+def test_critics_are_asked_about_zero_where_a_parameter_has_a_single_value(learner_class, settings):
+    """So what critics make of the other numbers, which they never saw there, changes nothing."""
+    torch.manual_seed(0)
+    env = GymnasiumEnv(32, make=Stock, max_steps=1)
+    learner = learner_class(PAMDPSpecs.from_env(env), **REPLAY | {"warmup_steps": 32} | settings)
+    batch = rollout(learner, env, 1)
+    learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
+    empty = batch[(batch[keys.PARAMETER_HIGH][..., 0] == 0.0).squeeze(-1)]
+    rows = learner.transitions(empty).flatten()
+    assert len(rows) > 5
+
+    def results():
+        torch.manual_seed(0)
+        memory = {"memory": rows["memory"]} if "memory" in rows.keys() else {}
+        value = learner.value(rows["state"], **memory)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            action = learner.policy(empty.select(*learner.policy.in_keys, *BOUNDS).clone())[keys.ACTION]
+        given = (rows, None) if learner_class is TD3BC else (rows["state"], None)
+        if learner_class in (PDQN, HSAC):
+            given = learner.detached(rows), None, learner.fixed(rows)
+        return [value, action["discrete"], action["parameters"], learner.actor_loss(*given)[0]]
+
+    before = results()
+    with torch.no_grad():
+        for critics in (learner.critics, learner.target_critics):
+            net = critics if learner_class is PADDPG else critics.net
+            net.layers[0].weight[:, -2] += 5.0
+    for one, other in zip(before, results(), strict=True):
+        torch.testing.assert_close(one, other)

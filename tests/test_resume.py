@@ -49,7 +49,9 @@ def assert_same(one: object, other: object, where: str = "") -> None:
         assert one == other, where
 
 
-def stop_and_resume(given: list[str], tmp_path: Path, monkeypatch, *numbers: int) -> None:
+def stop_and_resume(
+    given: list[str], tmp_path: Path, monkeypatch, *numbers: int, on_resuming: tuple[str, ...] = ()
+) -> None:
     """Run once as a whole, and for each signal once with a resumption after it; assert that all are the same."""
     assert run(compose_config(given), tmp_path / "whole", given) == 0
     whole = members_of(tmp_path / "whole")
@@ -59,7 +61,7 @@ def stop_and_resume(given: list[str], tmp_path: Path, monkeypatch, *numbers: int
             patch.setattr(Recorder, "take", signalled(number))
             stop = kill if number == signal.SIGKILL else interrupt
             stop(given, stopped)
-        words = [f"resume={stopped}"]
+        words = [f"resume={stopped}", *on_resuming]
         torch.manual_seed(1234)  # nothing of another process's generators may matter
         assert run(compose_config(words), resumed, words) == 0
         assert rows_of(resumed) == rows_of(tmp_path / "whole")
@@ -166,3 +168,14 @@ def test_options_that_end_with_the_last_batch_before_a_stop_are_learned_from(col
 def test_other_problems_resume_to_the_last_bit(env, tmp_path, monkeypatch):
     given = [*words_of("none", "pdqn"), f"env={env}", "env.max_steps=12"]
     stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
+
+
+@pytest.mark.parametrize(
+    ("low", "collector"), [("iql", "single"), pytest.param("hppo", "multi", marks=pytest.mark.slow)]
+)
+def test_several_components_resume_to_the_last_bit(low, collector, tmp_path, monkeypatch):
+    """Of an environment whose new episodes are all the same, as a Gymnasium environment's state is not saved."""
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[1] / "examples" / "spaces")
+    given = [*words_of("none", low), "low.autoregressive=true", "env=gymnasium", "env.entry_point=shop:Tour"]
+    given += ["env.max_steps=1", "env.pair_mask=info", f"collector={collector}"]
+    stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM, on_resuming=("trust=true",))

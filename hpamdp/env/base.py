@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -14,7 +15,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategoric
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
-from hpamdp.components import Components
+from hpamdp.components import MAX_PAIRED, Components
 from hpamdp.env.errors import ProblemError as ProblemError  # part of what a problem may use
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium_form import GymnasiumForm, VectorForm
@@ -81,6 +82,8 @@ class PAMDPEnv(EnvBase):
     parameter_dims: tuple[int, ...]  # number of parameters of each discrete action
     component_sizes: tuple[int, ...] = ()  # number of discrete actions of each component; empty: one component
     integer_parameters: tuple[bool, ...] = ()  # whether each parameter is a whole number; empty: none is
+    # Place in the observation from which `parameter_low` and then `parameter_high` stand, both on one scale.
+    bounds_place: int | None = None
     max_steps: int  # steps of the longest episode
     result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads
 
@@ -188,10 +191,14 @@ class PAMDPEnv(EnvBase):
             tensordict.set(name, mask | is_empty.unsqueeze(-1))
         pair_mask = tensordict.get(keys.PAIR_MASK, None)
         if pair_mask is not None:
-            action_mask = tensordict.get(keys.ACTION_MASK, None)
-            first = self.components.allowed_next(0, torch.zeros_like(pair_mask[..., 0]), action_mask, pair_mask)
-            assert first is not None
-            is_empty = ~first.any(-1)
+            components = self.components
+            if (num := math.prod(components.sizes)) > MAX_PAIRED:
+                raise ProblemError(
+                    f"{self.title}: a {keys.PAIR_MASK} takes at most {MAX_PAIRED:,} combinations of components, but "
+                    f"there are {num:,}"
+                )
+            mask = tensordict.get(keys.ACTION_MASK, torch.ones_like(pair_mask[..., 0]))
+            is_empty = ~components.leaves_any(mask, pair_mask)
             is_stuck = is_empty & ~tensordict.get(keys.DONE).squeeze(-1)
             if is_stuck.any():
                 row = int(is_stuck.nonzero()[0])

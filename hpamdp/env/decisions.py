@@ -173,14 +173,19 @@ class DecisionTracker(Transform):
         Raises:
             ProblemError: none has one where the episode goes on.
         """
-        allowed = option_actions & tensordict.get(keys.ACTION_MASK).unsqueeze(-2)
-        has_action = allowed.any(-1) if self.components is None else self.components.any_of_each(allowed)
+        allowed = option_actions.expand(*tensordict.batch_size, *option_actions.shape)
+        if (action_mask := tensordict.get(keys.ACTION_MASK, None)) is not None:
+            allowed = allowed & action_mask.unsqueeze(-2)
+        pair_mask = tensordict.get(keys.PAIR_MASK, None)
+        pairs = None if pair_mask is None else pair_mask.unsqueeze(-3)
+        has_action = allowed.any(-1) if self.components is None else self.components.leaves_any(allowed, pairs)
         possible = has_action | tensordict.get(keys.DONE)
         is_stuck = ~possible.any(-1)
         if is_stuck.any():
             row = int(is_stuck.flatten().nonzero()[0])
+            masks = " and ".join(name for name in (keys.ACTION_MASK, keys.PAIR_MASK) if name in tensordict.keys())
             raise ProblemError(
-                f"environment {row}: its action_mask leaves none of the options an action; give them more actions"
+                f"environment {row}: its {masks} leaves none of the options an action; give them more actions"
             )
         return possible
 
@@ -213,7 +218,8 @@ class DecisionEnv(TransformedEnv):
 def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLength = None) -> DecisionTracker:
     """Return a tracker for this environment; arguments as for `DecisionTracker`."""
     option_actions = None
-    if env.option_actions is not None and keys.ACTION_MASK in env.observation_spec.keys():
+    observed = env.observation_spec.keys()
+    if env.option_actions is not None and (keys.ACTION_MASK in observed or keys.PAIR_MASK in observed):
         option_actions = torch.tensor(env.option_actions, device=env.device)
     keeps_observation = env.has_choice or not env.observation_entries
     return DecisionTracker(

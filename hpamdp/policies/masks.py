@@ -66,6 +66,18 @@ def random_discrete(
     return torch.stack(drawn, -1)
 
 
+def with_fixed(unit_parameters: Tensor, is_fixed: Tensor | None) -> Tensor:
+    """Return parameters `[*B, num_parameters]` in [-1, 1] with 0 for those that have a single value in their state.
+
+    They are stored as 0, so critics have seen no other number there.
+
+    Args:
+        unit_parameters: the parameters.
+        is_fixed: see `PAMDPSpecs.is_fixed`. If None, no parameter is.
+    """
+    return unit_parameters if is_fixed is None else unit_parameters.masked_fill(is_fixed, 0.0)
+
+
 def allowed_or_first(choice: Tensor, mask: Tensor) -> Tensor:
     """Return the choices `[*B]`, or the first allowed choice where one is forbidden."""
     is_allowed = mask.gather(-1, choice.unsqueeze(-1)).squeeze(-1)

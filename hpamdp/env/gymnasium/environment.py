@@ -177,6 +177,7 @@ class GymnasiumEnv(PAMDPEnv):
             raise SettingError(f"{self._name}: {error}") from error
         self.option_names = self._names_of_options()
         self.observation_entries = self._copies.observations.entries(2 * self._copies.layout.num_bounded)
+        self.bounds_place = self._copies.layout.dim if self._copies.layout.num_bounded else None
         self._make_specs()
         gamma = options.reward_scaling
         self._reward_scaling = None if gamma is None else RewardScaling(num_envs, gamma)

@@ -143,7 +143,6 @@ def agent_bounds(actions: ActionSpace, low: np.ndarray, high: np.ndarray) -> tup
     """
     exact = actions.to_agent(low), actions.to_agent(high)
     width = actions.high.astype(np.float64) - actions.low
-    seen = np.concatenate([2.0 * (side - actions.low) / width - 1.0 for side in exact], axis=-1)
     lowest, highest = (side.astype(np.float32) for side in exact)
     lowest = np.where(lowest < exact[0], np.nextafter(lowest, np.float32(np.inf)), lowest)
     highest = np.where(highest > exact[1], np.nextafter(highest, np.float32(-np.inf)), highest)
@@ -152,4 +151,7 @@ def agent_bounds(actions: ActionSpace, low: np.ndarray, high: np.ndarray) -> tup
     highest = np.where(high >= actions.own_high, actions.high, highest)
     lowest, highest = (side.clip(actions.low, actions.high) for side in (lowest, highest))
     highest = np.where(is_crossed | (lowest > highest), lowest, highest)
+    # Equal bounds look equal, see `PAMDPEnv.bounds_place`.
+    observed = exact[0], np.where(lowest == highest, exact[0], exact[1])
+    seen = np.concatenate([2.0 * (side - actions.low) / width - 1.0 for side in observed], axis=-1)
     return lowest, highest, seen.clip(-1.0, 1.0).astype(np.float32)

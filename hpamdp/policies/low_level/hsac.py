@@ -17,6 +17,11 @@ Differs from the source:
   The soft value is then the mean of `component_samples` sampled actions, and the critics value the action as a whole.
   The discrete heads get a policy gradient with the other samples' mean as its baseline (Kool, van Hoof and Welling
   2019, *Buy 4 REINFORCE Samples, Get a Baseline for Free!*), the parameters a gradient through the critics.
+- With `autoregressive` each component's choice is a step of its own, whose state holds the choices before it (Metz et
+  al. 2017, *Discrete Sequential Prediction of Continuous Actions for Deep RL*, arXiv 1705.05035). So the heads learn in
+  states from the replay buffer: after choices that were executed, also after those that the policy no longer makes.
+  Otherwise the first component would settle before the later ones have learned what best follows its other choices.
+  The expectation over a component's own choices is exact.
 
 TorchRL's SACLoss does not fit: it sums the log-probabilities of all action leaves under one temperature. Its
 DiscreteSACLoss has no parameters, and the expectation over discrete actions here also weighs their log-densities.
@@ -38,11 +43,16 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import ActionFeature, is_greedy
-from hpamdp.policies.masks import masked_logits, random_discrete
+from hpamdp.policies.masks import masked_logits, random_discrete, with_fixed
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.hybrid_actor import HeadOptions, HybridActor, ScaleOptions
-from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution, log_slope_of_tanh
+from hpamdp.policies.shared.hybrid_distribution import (
+    Draw,
+    HybridDistribution,
+    gaussian_log_density,
+    log_slope_of_tanh,
+)
 from hpamdp.policies.shared.memory import ReplayMemoryOptions
 from hpamdp.policies.shared.networks import (
     HybridCritics,
@@ -52,6 +62,7 @@ from hpamdp.policies.shared.networks import (
     as_preactivations,
     mlp,
     polyak_update,
+    unsquashed,
 )
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -88,7 +99,10 @@ class HSACOptions(HeadOptions, ReplayMemoryOptions, ActorCriticOptions, TargetRa
     policy_delay: PositiveInt = 2
     """Critic updates for each update of the actor and the temperatures."""
     component_samples: Annotated[int, Field(ge=2, le=64)] = 4
-    """Actions sampled in each state to estimate its soft value, if an action has several components."""
+    """Actions sampled in each state to estimate its soft value, if an action has several components.
+
+    With `autoregressive` only in targets: the actor's loss values all choices of one component in each state.
+    """
 
 
 class HSACActor(nn.Module):
@@ -127,6 +141,13 @@ class HSACActor(nn.Module):
         distribution: HybridDistribution = self(observation, mask)
         return *draw(distribution), distribution
 
+    def most_probable(
+        self, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the most probable discrete actions and their mean raw parameters, as in `HybridActor`."""
+        distribution: HybridDistribution = self(observation, mask)
+        return distribution.mode()
+
 
 class HSACPolicy(TensorDictModuleBase):
     """Samples the action, uniformly during the warm-up; greedy: the most probable one with the squashed means."""
@@ -154,8 +175,10 @@ class HSACPolicy(TensorDictModuleBase):
             unit_parameters = 2.0 * unit_parameters - 1.0
             discrete = random_discrete(self.specs, shape, allowed, device)
         else:
-            draw = HybridDistribution.mode if is_greedy() else HybridDistribution.sample
-            discrete, raw, _ = self.actor.act(draw, features, allowed, None)
+            if is_greedy():
+                discrete, raw = self.actor.most_probable(features, allowed, None)
+            else:
+                discrete, raw, _ = self.actor.act(HybridDistribution.sample, features, allowed, None)
             unit_parameters = raw.tanh()
         parameters = self.specs.from_unit(unit_parameters, td)
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
@@ -192,6 +215,7 @@ class HSAC(ReplayLearner):
             if isinstance(self.actor, HSACActor)
             else JointCritics(self.perception.specs, 2, options.hidden_dims)
         )
+        self.takes_turns = options.autoregressive and not specs.components.is_single
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.log_discrete_temperature = log_temperature(
             options.discrete_temperature, is_tuned=options.tune_discrete_temperature
@@ -216,7 +240,9 @@ class HSAC(ReplayLearner):
         scalars = self.gradient_step("critics", self.critic_loss, sample)
         scalars["discrete_temperature"], scalars["parameter_temperature"] = self.temperatures()
         if self.updates % self.options.policy_delay == 0:
-            scalars |= self.gradient_step("actor", self.actor_loss, self.detached(sample), self.allowed(sample))
+            stored = (sample["discrete"], sample["unit"]) if self.takes_turns else ()
+            given = self.detached(sample), self.allowed(sample), self.fixed(sample), *stored
+            scalars |= self.gradient_step("actor", self.actor_loss, *given)
             if self.tunes_temperatures:
                 excesses = scalars["discrete_excess"], scalars["parameter_excess"]
                 self.gradient_step("temperatures", self.temperature_loss, *excesses)
@@ -230,9 +256,21 @@ class HSAC(ReplayLearner):
         loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "q": q.mean()}
 
-    def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss that falls with the soft value, and the mean entropies minus their targets."""
-        value, discrete_excess, parameter_excess = self.soft_value(self.critics, state, allowed)
+    def actor_loss(
+        self, state: Tensor, allowed: Tensor | None, is_fixed: Tensor | None = None, *stored: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss that falls with the soft value, and the mean entropies minus their targets.
+
+        Args:
+            state: what actor and critics see, `[B, perception.specs.observation_dim]`.
+            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; if None, all.
+            is_fixed: the parameters that have a single value there, bool `[B, num_parameters]`; if None, none.
+            stored: if components take turns, the discrete actions and the parameters that were executed there.
+        """
+        if stored:
+            value, discrete_excess, parameter_excess = self.soft_value_in_turns(state, allowed, is_fixed, *stored)
+        else:
+            value, discrete_excess, parameter_excess = self.soft_value(self.critics, state, allowed, is_fixed)
         loss = -value.mean()
         excesses = {"discrete_excess": discrete_excess.mean(), "parameter_excess": parameter_excess.mean()}
         return loss, {"actor": loss, **excesses}
@@ -257,11 +295,15 @@ class HSAC(ReplayLearner):
         """
         allowed = self.specs.allowed(observation, action_mask)
         features = self.target_perception(observation, memory, has_seen=has_seen)
-        value, _, _ = self.soft_value(self.target_critics, features, allowed)
+        value, _, _ = self.soft_value(self.target_critics, features, allowed, self.specs.is_fixed(observation))
         return value
 
     def soft_value(
-        self, critics: HybridCritics | JointCritics, state: Tensor, allowed: Tensor | None = None
+        self,
+        critics: HybridCritics | JointCritics,
+        state: Tensor,
+        allowed: Tensor | None = None,
+        is_fixed: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the soft value V of states `[B, observation_dim]`, and both entropies minus their targets, each `[B]`.
 
@@ -272,16 +314,20 @@ class HSAC(ReplayLearner):
             critics: give Q.
             state: what actor and critics see, `[B, perception.specs.observation_dim]`.
             allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; if None, all.
+            is_fixed: the parameters that have a single value there, bool `[B, num_parameters]`; if None, none. They
+                have no entropy.
         """
         if isinstance(critics, JointCritics):
-            return self.sampled_soft_value(critics, state, allowed)
+            return self.sampled_soft_value(critics, state, allowed, is_fixed)
         discrete_weight, parameter_weight = self.temperatures()
         distribution: HybridDistribution = self.actor(state, allowed)
         unit_parameters, log_density = distribution.sample_squashed()
+        unit_parameters, log_density = with_fixed(unit_parameters, is_fixed), with_fixed(log_density, is_fixed)
         log_probs = distribution.discrete_log_probs
         # Of each discrete action's own parameters together, `[B, num_discrete]`.
         own_log_density = distribution.sum_of_own(log_density)
-        own_target = self.options.parameter_target_entropy * self.parameter_dims
+        dims = self.parameter_dims if is_fixed is None else distribution.sum_of_own((~is_fixed).float())
+        own_target = self.options.parameter_target_entropy * dims
         q = critics(state, unit_parameters).amin(0) - discrete_weight * log_probs - parameter_weight * own_log_density
         probs = log_probs.exp()
         most_entropy = self.most_discrete_entropy if allowed is None else allowed.sum(-1).log()
@@ -290,36 +336,121 @@ class HSAC(ReplayLearner):
         return (probs * q).sum(-1), discrete_excess, parameter_excess
 
     def sampled_soft_value(
-        self, critics: JointCritics, state: Tensor, allowed: Tensor | None
+        self, critics: JointCritics, state: Tensor, allowed: Tensor | None, is_fixed: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the same as `soft_value`, from samples of actions with several components.
 
         The gradient of the value is that of its expectation; its number is the mean of the samples.
         """
-        num = self.options.component_samples
+        num, components = self.options.component_samples, self.specs.components
         discrete_weight, parameter_weight = self.temperatures()
-        repeated = state.repeat_interleave(num, 0)
-        mask = None if allowed is None else allowed.repeat_interleave(num, 0)
+        repeated, mask, fixed = (_repeated(rows, num) for rows in (state, allowed, is_fixed))
         discrete, raw, distribution = self.actor.act(HybridDistribution.sample, repeated, mask, None)
-        components = self.specs.components
-        discrete_log_prob, raw_log_prob = (components.total(each) for each in distribution.log_prob(discrete, raw))
-        is_own = components.is_chosen(discrete).index_select(-1, self.owner)
-        parameter_log_prob = raw_log_prob - (log_slope_of_tanh(raw) * is_own).sum(-1)
-        q = critics.of_discrete(repeated, discrete, raw.tanh()).amin(0)
+        discrete_log_prob, parameter_log_prob = (
+            components.total(each) for each in self.log_probs(distribution, discrete, raw, fixed)
+        )
+        q = critics.of_discrete(repeated, discrete, with_fixed(raw.tanh(), fixed)).amin(0)
         value = q - discrete_weight * discrete_log_prob - parameter_weight * parameter_log_prob
         each = value.detach().unflatten(0, (-1, num))
         baseline = (each.sum(-1, keepdim=True) - each) / (num - 1)
         score = discrete_log_prob * (each - baseline).flatten()
         value = value + score - score.detach()
-        most_entropy: Tensor | float = self.most_discrete_entropy
-        if mask is not None:
-            most_entropy = torch.stack([part.sum(-1) for part in mask.split(components.sizes, -1)], -1).log().sum(-1)
-        num_own = (self.parameter_dims * components.is_chosen(discrete)).sum(-1)
-        discrete_excess = -discrete_log_prob - self.options.discrete_target_entropy * most_entropy
-        parameter_excess = -parameter_log_prob - self.options.parameter_target_entropy * num_own
-        parts = (part.unflatten(0, (-1, num)).mean(-1) for part in (value, discrete_excess, parameter_excess))
-        value, discrete_excess, parameter_excess = parts
+        excesses = self.excesses(discrete_log_prob, parameter_log_prob, discrete, mask, fixed)
+        value, discrete_excess, parameter_excess = (
+            part.unflatten(0, (-1, num)).mean(-1) for part in (value, *excesses)
+        )
         return value, discrete_excess, parameter_excess
+
+    def soft_value_in_turns(
+        self, state: Tensor, allowed: Tensor | None, is_fixed: Tensor | None, discrete: Tensor, unit: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the same as `soft_value` for an autoregressive actor whose components take turns.
+
+        In every n-th state it is the turn of the same one of the n components. The components before it keep what was
+        executed there. The expectation over its own choices is exact, and the later components are sampled. So the
+        value is that of going on from there, and each discrete head gets the gradient of its turns.
+
+        Args:
+            state: as for `soft_value`.
+            allowed: as for `soft_value`.
+            is_fixed: as for `soft_value`.
+            discrete: what was executed, `[B, num_components]`.
+            unit: its parameters, `[B, num_parameters]`.
+
+        Returns:
+            The values `[B]`, in the order of the turns, and the entropies where the first component has its turn.
+        """
+        num = len(self.specs.components.sizes)
+
+        def of_turn(rows: Tensor | None, number: int) -> Any:
+            return None if rows is None else rows[number::num]
+
+        rows = state, allowed, is_fixed, discrete, unit
+        turns = [self._turn(number, *[of_turn(each, number) for each in rows]) for number in range(num)]
+        return torch.cat([turn[0] for turn in turns]), turns[0][1], turns[0][2]
+
+    def _turn(
+        self,
+        number: int,
+        state: Tensor,
+        allowed: Tensor | None,
+        is_fixed: Tensor | None,
+        discrete: Tensor,
+        unit: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `soft_value_in_turns` does of the states in which this component has its turn."""
+        assert isinstance(self.actor, AutoregressiveActor) and isinstance(self.critics, JointCritics)
+        size = self.specs.components.sizes[number]
+        discrete_weight, parameter_weight = self.temperatures()
+        own = torch.arange(size, device=state.device).repeat(len(state))
+        rows = state, allowed, is_fixed, discrete, unsquashed(unit)
+        state, mask, fixed, discrete, raw = (_repeated(each, size) for each in rows)
+        discrete, raw, distribution = self.actor.act_from(number, own, discrete, raw, state, mask)
+        log_probs, densities = self.log_probs(distribution, discrete, raw, fixed)
+        own_log_prob, later_log_prob = log_probs[:, number], log_probs[:, number + 1 :].detach().sum(-1)
+        discrete_log_prob, parameter_log_prob = own_log_prob + later_log_prob, densities[:, number:].sum(-1)
+        q = self.critics.of_discrete(state, discrete, with_fixed(raw.tanh(), fixed)).amin(0)
+        value = q - discrete_weight * discrete_log_prob - parameter_weight * parameter_log_prob
+        excesses = self.excesses(discrete_log_prob, parameter_log_prob, discrete, mask, fixed)
+        value, discrete_excess, parameter_excess = (
+            (own_log_prob.exp() * part).unflatten(0, (-1, size)).sum(-1) for part in (value, *excesses)
+        )
+        return value, discrete_excess, parameter_excess
+
+    def log_probs(
+        self, distribution: HybridDistribution, discrete: Tensor, raw: Tensor, is_fixed: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the log-likelihoods of discrete actions and of their squashed parameters, in the shape of `discrete`.
+
+        Args:
+            distribution: of the action.
+            discrete: what was chosen, `[N, num_components]`, or `[N]` of a single component.
+            raw: the parameters before they are squashed, `[N, num_parameters]`.
+            is_fixed: the parameters that do not count, bool `[N, num_parameters]`; if None, all count.
+        """
+        standardised = (raw - distribution.mean) / distribution.log_scale.exp()
+        log_density = gaussian_log_density(standardised, distribution.log_scale) - log_slope_of_tanh(raw)
+        of_discrete = distribution.sum_of_own(with_fixed(log_density, is_fixed))
+        of_choice = self.specs.components.of_choice
+        return of_choice(distribution.discrete_log_probs, discrete), of_choice(of_discrete, discrete)
+
+    def excesses(
+        self,
+        discrete_log_prob: Tensor,
+        parameter_log_prob: Tensor,
+        discrete: Tensor,
+        allowed: Tensor | None,
+        is_fixed: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return samples of both entropies minus their targets, `[N]` each, of log-likelihoods `[N]`."""
+        components = self.specs.components
+        most_entropy: Tensor | float = self.most_discrete_entropy
+        if allowed is not None:
+            most_entropy = torch.stack([part.sum(-1) for part in allowed.split(components.sizes, -1)], -1).log().sum(-1)
+        is_own = components.is_chosen(discrete).index_select(-1, self.owner)
+        num_own = (is_own if is_fixed is None else is_own & ~is_fixed).sum(-1)
+        discrete_excess = -discrete_log_prob - self.options.discrete_target_entropy * most_entropy
+        return discrete_excess, -parameter_log_prob - self.options.parameter_target_entropy * num_own
 
     def temperatures(self) -> tuple[Tensor, Tensor]:
         """Return the weights of the discrete entropy and of the parameters' entropy, without gradients."""
@@ -328,6 +459,10 @@ class HSAC(ReplayLearner):
     def on_progress(self, steps: int) -> None:
         """Explore with the actor from the end of the warm-up on."""
         self.policy.is_random.fill_(False)
+
+
+def _repeated(rows: Tensor | None, num: int) -> Any:
+    return None if rows is None else rows.repeat_interleave(num, 0)
 
 
 def make_actor(specs: PAMDPSpecs, options: HSACOptions) -> HSACActor | HybridActor:

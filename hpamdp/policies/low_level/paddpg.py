@@ -32,7 +32,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import ActionFeature, is_greedy
-from hpamdp.policies.masks import masked_values
+from hpamdp.policies.masks import masked_values, with_fixed
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions, TwinCriticOptions
 from hpamdp.policies.shared.exploration import EpsilonOptions, linear_schedule, with_exploring_noise
 from hpamdp.policies.shared.networks import (
@@ -89,14 +89,19 @@ class PADDPGActor(nn.Module):
     def forward(self, state: Tensor) -> Tensor:
         """Return what the actor outputs, clipped; its gradients are inverted."""
         scores, parameters = self.net(state).tensor_split([self.num_discrete], -1)
-        return self.in_cells(InvertingGradients.apply(torch.cat([scores, parameters + self.initial(state)], -1)))
+        output = InvertingGradients.apply(torch.cat([scores, parameters + self.initial(state)], -1))
+        return self.as_stored(output, state)
 
-    def in_cells(self, output: Tensor) -> Tensor:
-        """Return an output with whole parameters in the middle of their cells, see `PAMDPSpecs.in_cells`."""
-        if not self.specs.has_integers:
+    def as_stored(self, output: Tensor, state: Tensor) -> Tensor:
+        """Return an output with the numbers that the critic has seen for the same action.
+
+        Whole parameters are in the middle of their cells (`PAMDPSpecs.in_cells`), those with a single value are 0.
+        """
+        is_fixed = self.specs.is_fixed(state)
+        if not self.specs.has_integers and is_fixed is None:
             return output
         scores, parameters = output.tensor_split([self.num_discrete], -1)
-        return torch.cat([scores, self.specs.in_cells(parameters)], -1)
+        return torch.cat([scores, with_fixed(self.specs.in_cells(parameters), is_fixed)], -1)
 
 
 def with_lowest_scores(output: Tensor, allowed: Tensor | None) -> Tensor:
@@ -203,7 +208,7 @@ class PADDPG(ReplayLearner):
         output = self.target_actor(observation)
         if self.options.twin:
             output = with_clipped_noise(output, smoothing, self.options.target_smoothing_clip)
-            output = self.target_actor.in_cells(output)
+            output = self.target_actor.as_stored(output, observation)
         output = with_lowest_scores(output, self.specs.allowed(observation, action_mask))
         return q_values(self.target_critics, observation, output).amin(0)
 

@@ -50,7 +50,7 @@ from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.policies.base import ActionFeature, is_greedy, option_ends
-from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete
+from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete, with_fixed
 from hpamdp.policies.shared.actor_critic import set_learning_rates
 from hpamdp.policies.shared.actor_search import (
     SearchingActorOptions,
@@ -214,9 +214,10 @@ class PDQNPolicy(TensorDictModuleBase):
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         state = self.perception.see(td).reshape(-1, self.perception.specs.observation_dim)
         allowed = allowed_rows(self.specs, td)
-        unit_parameters = self.actor(state)
+        is_fixed = self.specs.is_fixed(td.get(keys.OBSERVATION).reshape(len(state), -1))
+        unit_parameters = with_fixed(self.actor(state), is_fixed)
         if is_greedy() and len(self.variations) > 0:
-            discrete, unit_parameters = self._best_variation(state, unit_parameters, allowed)
+            discrete, unit_parameters = self._best_variation(state, unit_parameters, allowed, is_fixed)
         else:
             values = masked_values(self.critics(state, unit_parameters).amin(0), allowed)
             discrete = self.specs.components.best(values)
@@ -246,15 +247,20 @@ class PDQNPolicy(TensorDictModuleBase):
         td.set(PROCESS, process.reshape(*td.batch_size, self.specs.num_parameters))
         return (unit_parameters + process).clamp(-1.0, 1.0)
 
-    def _best_variation(self, state: Tensor, unit_parameters: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _best_variation(
+        self, state: Tensor, unit_parameters: Tensor, allowed: Tensor | None, is_fixed: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """Return the discrete actions `[B]` and the parameters `[B, P]` that are best among x(s) and its variations."""
         num_candidates = 1 + len(self.variations)
         num_rows = max(1, _MAX_NUMBERS // (num_candidates * max(unit_parameters.shape[-1], self.specs.num_discrete)))
 
-        def best_of(some_states: Tensor, some_parameters: Tensor) -> tuple[Tensor, Tensor]:
-            return best_of_candidates(self.critics, some_states, with_variations(some_parameters, self.variations))
+        def best_of(some_states: Tensor, some_parameters: Tensor, *fixed: Tensor) -> tuple[Tensor, Tensor]:
+            candidates = with_variations(some_parameters, self.variations)
+            candidates = with_fixed(candidates, fixed[0].unsqueeze(-2) if fixed else None)
+            return best_of_candidates(self.critics, some_states, candidates)
 
-        best_values, best_indices = in_pieces(best_of, num_rows, state, unit_parameters)
+        fixed = () if is_fixed is None else (is_fixed,)
+        best_values, best_indices = in_pieces(best_of, num_rows, state, unit_parameters, *fixed)
         discrete = self.specs.components.best(masked_values(best_values, allowed))
         variations = torch.cat([torch.zeros_like(self.variations[:1]), self.variations])
         if self.specs.components.is_single:
@@ -319,7 +325,8 @@ class PDQN(ReplayLearner):
         scalars = self.gradient_step("critics", self.critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.options.policy_delay == 0:
-            scalars |= self.gradient_step("actor", self.actor_loss, self.detached(sample), self.allowed(sample))
+            given = self.detached(sample), self.allowed(sample), self.fixed(sample)
+            scalars |= self.gradient_step("actor", self.actor_loss, *given)
             polyak_update(self.target_actor, self.actor, self.options.actor_tau)
             polyak_update(self.target_critics, self.critics, self.options.critic_tau)
             polyak_update(self.target_perception, self.perception, self.options.critic_tau)
@@ -354,6 +361,7 @@ class PDQN(ReplayLearner):
         state = self.target_perception(observation, memory, has_seen=has_seen)
         clip = self.options.target_smoothing_clip
         unit_parameters = with_clipped_noise(self.target_actor(state), smoothing, clip)
+        unit_parameters = with_fixed(unit_parameters, self.specs.is_fixed(observation))
         q = self.target_critics(state, unit_parameters).amin(0)
         choosing_q = q
         if self.options.double_q:
@@ -367,15 +375,19 @@ class PDQN(ReplayLearner):
         """Return `value` with target smoothing."""
         return self.value(observation, action_mask, **memory, smoothing=self.options.target_smoothing)
 
-    def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+    def actor_loss(
+        self, state: Tensor, allowed: Tensor | None, is_fixed: Tensor | None = None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return minus the sum of the allowed discrete actions' values; only the actor gets its gradient."""
         raw = self.actor.raw(state)
-        q = self.critics(state, self.actor.bounded(raw)).amin(0)
+        q = self.critics(state, with_fixed(self.actor.bounded(raw), is_fixed)).amin(0)
         value = (q if allowed is None else q * allowed).sum(-1)
-        loss = searching_actor_loss(self.options, value, raw, partial(self._search, state, raw, q, allowed))
+        loss = searching_actor_loss(self.options, value, raw, partial(self._search, state, raw, q, allowed, is_fixed))
         return loss, {"actor": -value.mean()}
 
-    def _search(self, state: Tensor, raw: Tensor, q: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _search(
+        self, state: Tensor, raw: Tensor, q: Tensor, allowed: Tensor | None, is_fixed: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """Find for every discrete action the best of random parameters, by the critics.
 
         Args:
@@ -383,6 +395,7 @@ class PDQN(ReplayLearner):
             raw: the actor's parameters there, before they are bounded, `[B, num_parameters]`.
             q: their values, `[B, num_discrete]`.
             allowed: the discrete actions that may be taken, bool `[B, num_discrete]`. If None, all.
+            is_fixed: the parameters that have a single value there, bool `[B, num_parameters]`. If None, none.
 
         Returns:
             For each parameter, by how much the best of its discrete action is better than the actor's, at least 0, and
@@ -391,6 +404,7 @@ class PDQN(ReplayLearner):
         shape = len(state), self.options.search_samples, self.specs.num_parameters
         with torch.no_grad():
             candidates = 2.0 * torch.rand(shape, device=state.device, dtype=torch.float32) - 1.0
+            candidates = with_fixed(candidates, None if is_fixed is None else is_fixed.unsqueeze(-2))
             best_value, best_index = best_of_candidates(self.critics, state, candidates)
             best_parameters = candidates.gather(1, best_index[:, self.owner].unsqueeze(1)).squeeze(1)
             gain = (best_value - q).clamp(min=0.0)

@@ -15,6 +15,9 @@ from hpamdp.policies.shared.hybrid_actor import HybridActor, make_small
 from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution
 from hpamdp.specs import PAMDPSpecs
 
+# The most probable choice is searched among all if there are at most this many; each costs a row of the network.
+_MAX_JOINT = 64
+
 
 def _clipped(raw: Tensor) -> Tensor:
     return raw.clamp(-1.0, 1.0)
@@ -115,6 +118,57 @@ class AutoregressiveActor(HybridActor):
             first, first_parameter = first + size, first_parameter + num
         discrete = choices[0] if self.components.is_single else torch.stack(choices, -1)
         return discrete, torch.cat(raws, -1), self._joined(distributions)
+
+    def act_from(
+        self, number: int, choice: Tensor, discrete: Tensor, raw: Tensor, observation: Tensor, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor, HybridDistribution]:
+        """Go on from a component, as `act` does: keep those before it, and sample its parameters and the later ones.
+
+        Args:
+            number: of the component.
+            choice: its discrete actions, `[*B]`.
+            discrete: the discrete actions to keep, `[*B, num_components]`.
+            raw: their raw parameters, `[*B, num_parameters]`.
+            observation: of the states, `[*B, observation_dim]`.
+            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`. If None, all.
+        """
+        kept = enumerate(zip(discrete.unbind(-1), raw.split(self.parameter_sizes, -1), strict=True))
+
+        def follow(part: HybridDistribution) -> tuple[Tensor, Tensor]:
+            place, before = next(kept)
+            if place < number:
+                return before
+            sampled, sampled_raw = part.sample()
+            return (choice if place == number else sampled), sampled_raw
+
+        return self.act(follow, observation, mask, None)
+
+    def most_probable(
+        self, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the discrete actions that are most probable together, and their mean raw parameters.
+
+        With more than 64 combinations, each component takes its own most probable choice, given those before it.
+        """
+        sizes = self.components.sizes
+        if self.components.is_single or math.prod(sizes) > _MAX_JOINT:
+            return super().most_probable(observation, mask, pair_mask)
+        choices = torch.cartesian_prod(*(torch.arange(size, device=observation.device) for size in sizes))
+        num = len(choices)
+        following = iter(choices.unbind(-1))
+
+        def follow(part: HybridDistribution) -> tuple[Tensor, Tensor]:
+            return next(following).expand(part.mean.shape[:-1]), part.mode()[1]
+
+        def repeated(rows: Tensor | None, num_dims: int) -> Tensor | None:
+            return None if rows is None else rows.unsqueeze(-1 - num_dims).repeat_interleave(num, -1 - num_dims)
+
+        observations = observation.unsqueeze(-2).repeat_interleave(num, -2)
+        discrete, raw, distribution = self.act(follow, observations, repeated(mask, 1), repeated(pair_mask, 2))
+        log_prob = self.components.of_choice(distribution.discrete_log_probs, discrete).sum(-1)
+        best = log_prob.argmax(-1)
+        raw = raw.gather(-2, best[..., None, None].expand(*best.shape, 1, raw.shape[-1])).squeeze(-2)
+        return choices[best], raw
 
     def _choices(self, discrete: Tensor) -> list[Tensor]:
         return [discrete] if self.components.is_single else list(discrete.unbind(-1))

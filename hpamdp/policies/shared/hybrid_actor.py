@@ -186,6 +186,13 @@ class HybridActor(nn.Module):
         distribution: HybridDistribution = self(observation, mask)
         return *draw(distribution), distribution
 
+    def most_probable(
+        self, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the most probable discrete actions and their mean raw parameters; arguments as for `act`."""
+        discrete, raw, _ = self.act(HybridDistribution.mode, observation, mask, pair_mask)
+        return discrete, raw
+
     def set_min_scale(self, min_scale: float) -> None:
         """Set the smallest standard deviation."""
         self.log_min_scale.fill_(math.log(min_scale))
@@ -228,13 +235,12 @@ class HybridPolicy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, the parameters and maybe their raw sample, `[*B, num_parameters]` each."""
         allowed = self.specs.allowed(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
-        if not is_greedy():
-            draw = HybridDistribution.sample
-        elif self.samples_when_greedy:
-            draw = HybridDistribution.sample_discrete
+        state = self.perception.see(td), allowed, td.get(keys.PAIR_MASK, None)
+        if is_greedy() and not self.samples_when_greedy:
+            discrete, raw = self.actor.most_probable(*state)
         else:
-            draw = HybridDistribution.mode
-        discrete, raw, _ = self.actor.act(draw, self.perception.see(td), allowed, td.get(keys.PAIR_MASK, None))
+            draw = HybridDistribution.sample_discrete if is_greedy() else HybridDistribution.sample
+            discrete, raw, _ = self.actor.act(draw, *state)
         if self.writes_raw:
             td.set(RAW, raw)
         parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0), td)

@@ -385,6 +385,10 @@ class ReplayLearner(Learner):
         """Return which discrete actions may be taken in a sample's states, bool `[B, num_discrete]`. If None, all."""
         return self.specs.allowed(sample["state"], sample.get("action_mask", None))
 
+    def fixed(self, sample: TensorDictBase) -> Tensor | None:
+        """Return which parameters have a single value in a sample's states, see `PAMDPSpecs.is_fixed`."""
+        return self.specs.is_fixed(sample["state"])
+
     def pairs(self, sample: TensorDictBase) -> Tensor | None:
         """Return which discrete actions go together in a sample's states, as in `pair_mask`. If None, all do."""
         return sample.get("pair_mask", None)
