@@ -220,7 +220,7 @@ def test_a_selectors_replay_holds_bytes_and_samples_what_was_stored(memory):
     batch.set(("next", keys.DECISION_OBSERVATION), observation)
     if memory == "gru":
         batch.set(selector.memory_key, torch.zeros(*batch.shape, selector.options.memory_size))
-        selector.learn_from_steps(batch)
+        selector.learn_from_options(batch)
     else:
         selector.learn(batch.flatten())
     stored = selector.buffer[:]["state"]
