@@ -24,6 +24,7 @@ from hpamdp.policies.low_level.paddpg import SCORES
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.shared.gradients import gradients_of
+from hpamdp.policies.shared.networks import EnsembleMLP, HybridCritics, mlp
 from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.run.assemble import assemble
 from hpamdp.specs import PAMDPSpecs
@@ -156,20 +157,20 @@ def test_compiled_updates_of_hppo_are_the_same_up_to_rounding_for_batches_of_any
 
 
 class Dtypes(TorchDispatchMode):
-    """Notes the types of the inputs of matrix products made under it."""
+    """Notes of matrix products made under it the types of their inputs, with the numbers of outputs of each."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.seen: set[torch.dtype] = set()
+        self.seen: dict[torch.dtype, set[int]] = {}
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         if func in (torch.ops.aten.mm.default, torch.ops.aten.addmm.default, torch.ops.aten.bmm.default):
-            self.seen.add(args[-1].dtype)
+            self.seen.setdefault(args[-1].dtype, set()).add(args[-1].shape[-1])
         return func(*args, **(kwargs or {}))
 
 
 @pytest.mark.parametrize("name", MAKE)
-def test_updates_in_bfloat16_make_all_products_in_it_and_have_nearly_the_same_gradients(name):
+def test_updates_in_bfloat16_make_the_products_of_hidden_layers_in_it_and_have_nearly_the_same_gradients(name):
     torch.manual_seed(0)
     learner, batch = MAKE[name](), batch_for(name)
     parameters = list(learner.critics.parameters())
@@ -179,9 +180,75 @@ def test_updates_in_bfloat16_make_all_products_in_it_and_have_nearly_the_same_gr
             _, gradients = gradients_of(learner.critic_loss, parameters, batch, precision=learner.descent.precision)
         both.append(torch.cat([gradient.flatten() for gradient in gradients]))
         learner.lower_precision()
-    assert products.seen == {torch.bfloat16}
+    last = products.seen.pop(torch.float32)
+    assert products.seen.keys() == {torch.bfloat16}
+    assert max(last) < 16, "hidden layers have 64 units"
     assert all(gradient.dtype == torch.float32 for gradient in both)
     assert torch.cosine_similarity(*both, dim=0) > 0.99
+
+
+@pytest.mark.parametrize("is_pausing", [False, True])
+def test_in_bfloat16_the_ratios_before_any_update_are_1_at_the_final_scale(is_pausing):
+    learner = test_hppo.make(epochs=1, minibatch_size=64, hidden_dims=[64, 64])
+    learner.lower_precision()
+    with torch.no_grad():
+        learner.actor.parameter_head.weight.normal_(0.0, 0.3)  # means differ from state to state, as after training
+        learner.actor.parameter_head.bias[SPECS.num_parameters :] = -12.0
+    learner.actor.set_min_scale(0.01)
+    batch = test_hppo.random_rows(learner, 64, 4)
+    everything = torch.ones(batch.shape, dtype=torch.bool)
+    seen = []
+    learner.surrogate = lambda log_ratio, advantage: seen.append(log_ratio.detach().exp()) or log_ratio * advantage
+    if is_pausing:  # rows that wait for others
+        learner.options = learner.options.model_copy(update={"minibatch_size": 300})
+        learner.learn(batch[:32], everything[:32])
+        learner.options = learner.options.model_copy(update={"minibatch_size": 64})
+        learner.learn(batch[32:], everything[32:])
+    else:
+        learner.learn(batch, everything)
+    for ratio in seen[:2]:  # the discrete action's and the parameters', in the first minibatch
+        torch.testing.assert_close(ratio, torch.ones_like(ratio), atol=1e-3, rtol=0.0)
+
+
+@pytest.mark.parametrize("name", ["mlp", "ensemble", "one value", "pdqn", "multipass", "no hidden layer", "hppo"])
+def test_in_bfloat16_values_near_50_are_as_fine_as_in_float32(name):
+    torch.manual_seed(0)
+    critics = partial(HybridCritics, SPECS, 2)
+    net, last = {
+        "mlp": lambda: ((net := mlp(4, [128, 128], 3)), net[-1]),
+        "ensemble": lambda: ((net := EnsembleMLP(2, 4, [128, 128], 3)), net.layers[-1]),
+        "one value": lambda: ((net := EnsembleMLP(2, 4, [128, 128], 1)), net.layers[-1]),
+        "pdqn": lambda: ((net := critics([128, 128], is_multipass=False)), net.net.layers[-1]),
+        "multipass": lambda: ((net := critics([128, 128], is_multipass=True)), net.net.layers[-1]),
+        "no hidden layer": lambda: ((net := critics([], is_multipass=True)), net.net.layers[-1]),
+        "hppo": lambda: ((net := test_hppo.make().critic), net[-1]),
+    }[name]()
+    with torch.no_grad():
+        last.bias.fill_(50.0)
+        inputs = (torch.rand(500, 4),) + ((torch.rand(500, 3),) if isinstance(net, HybridCritics) else ())
+        exact = net(*inputs)
+        with torch.autocast("cpu", torch.bfloat16):
+            lower = net(*inputs)
+    assert lower.dtype == torch.float32
+    assert (lower - exact).abs().max() < 0.01
+    assert len(lower.unique()) > 400, "bfloat16 has steps of 0.25 there"
+
+
+def test_plans_in_bfloat16_tell_rewards_near_50_apart():
+    torch.manual_seed(0)
+    learner = DLPA(SPECS, planning_precision="bfloat16")
+    with torch.no_grad():
+        learner.model.outcome.net.layers[-1].bias[..., :2] = 50.0
+        learner.model.outcome.net.layers[-1].bias[..., 2] = -20.0  # no step terminates
+    planner = learner.policy.planner
+    state, discrete = torch.rand(20, 4), torch.randint(3, (20, 30, 1))
+    unit = torch.rand(20, 30, 1, 3) * 2 - 1
+    with torch.no_grad():
+        lower = planner.returns(state, discrete, unit)
+        planner.precision = torch.float32
+        exact = planner.returns(state, discrete, unit)
+    assert (lower - exact).abs().max() < 0.01
+    assert (lower.argmax(1) == exact.argmax(1)).float().mean() >= 0.9
 
 
 @pytest.mark.parametrize("name", ["pdqn", "hyar", "hsac"])

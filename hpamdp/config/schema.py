@@ -122,7 +122,7 @@ class RunConfig(Settings):
     compile_updates: bool | Literal["auto"] = "auto"
     """Compile the learners' updates by `torch.compile`. If `auto`, only with a compiler and in a long enough run."""
     update_precision: Literal["float32", "bfloat16"] = "float32"
-    """Precision of the matrix products in updates. bfloat16 is faster only with hardware support and large networks."""
+    """Precision of the hidden layers in updates. bfloat16 is faster only with hardware support and large networks."""
     agent: AgentConfig = AgentConfig()
     env: EnvConfig = EnvConfig()
     low: StartConfig = StartConfig()

@@ -43,7 +43,7 @@ from hpamdp.policies.shared.exported_policy import exported_actor
 from hpamdp.policies.shared.hybrid_actor import RAW, HeadOptions, HybridActor, HybridPolicy, hidden_layers
 from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.policies.shared.memory import MemoryOptions
-from hpamdp.policies.shared.networks import InitialParameters
+from hpamdp.policies.shared.networks import InitialParameters, OutputLinear
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.sequences import sequence_starts
@@ -176,7 +176,7 @@ class HPPO(OnPolicy, Learner):
         self.critic = nn.Sequential(
             *products,
             hidden_layers(self.actor.num_inputs, options.critic_hidden_dims),
-            nn.Linear(options.critic_hidden_dims[-1], 1, dtype=torch.float32),
+            OutputLinear(options.critic_hidden_dims[-1], 1, dtype=torch.float32),
         )
         has_credit = options.credit != "joint" and not specs.components.is_single
         self.credit_critic = (
@@ -260,7 +260,7 @@ class HPPO(OnPolicy, Learner):
 
         The log-probabilities are those of the policy that the update begins with. If the collector works ahead, an
         older policy has acted, and ratios to that one would be clipped before anything was learned: Hilton, Cobbe and
-        Schulman 2021, arXiv 2110.00641, section 3.
+        Schulman 2021, arXiv 2110.00641, section 3. They have the precision of the update, for the same reason.
         """
         advantage, target = self.advantages(batch, mask)
         rows = {
@@ -279,14 +279,15 @@ class HPPO(OnPolicy, Learner):
         if self.perception.is_recurrent:
             rows["begins"] = self.perception.begins(batch)[mask]
             rows["starts"] = sequence_starts(self.perception.begins(batch), mask, self.options.sequence_length)
-        features = self.features(rows)
-        distribution = self._distribution(features, rows)
-        log_probs = distribution.log_prob(rows["discrete"], rows[RAW])
-        rows["discrete_log_prob"], rows["parameter_log_prob"] = log_probs
-        if self.credit_critic is not None:
-            contributions = self.credit_critic.contributions(features, distribution, rows["discrete"], rows[RAW])
-            rows[BASELINE] = self.credit_critic.baselines(features, contributions)
-            rows["raw_advantage"] = rows["advantage"]
+        with self.descent.same_precision(self.frames.device):
+            features = self.features(rows)
+            distribution = self._distribution(features, rows)
+            log_probs = distribution.log_prob(rows["discrete"], rows[RAW])
+            rows["discrete_log_prob"], rows["parameter_log_prob"] = log_probs
+            if self.credit_critic is not None:
+                contributions = self.credit_critic.contributions(features, distribution, rows["discrete"], rows[RAW])
+                rows[BASELINE] = self.credit_critic.baselines(features, contributions)
+                rows["raw_advantage"] = rows["advantage"]
         return TensorDict(rows, batch_size=[int(mask.sum())])
 
     def empty_rows(self) -> dict[str, Tensor]:

@@ -13,6 +13,7 @@ from hpamdp.components import Components
 from hpamdp.policies.masks import masked_logits
 from hpamdp.policies.shared.hybrid_actor import HybridActor, make_small
 from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution
+from hpamdp.policies.shared.networks import OutputLinear
 from hpamdp.specs import PAMDPSpecs
 
 # The most probable choice is searched among all if there are at most this many; each costs a row of the network.
@@ -54,7 +55,7 @@ class AutoregressiveActor(HybridActor):
         self.heads = nn.ModuleList()
         for size, num, part in zip(sizes, self.parameter_sizes, self.parts, strict=True):
             num_values = 0 if part is None else part.num_logits
-            last = nn.Linear(width, size + 2 * num + num_values, dtype=torch.float32)
+            last = OutputLinear(width, size + 2 * num + num_values, dtype=torch.float32)
             make_small(last)
             with torch.no_grad():
                 last.bias[size + num : size + 2 * num] = raw_scale
@@ -93,7 +94,7 @@ class AutoregressiveActor(HybridActor):
             self.components.sizes, self.parameter_sizes, self.heads, self.owners, self.parts, strict=True
         ):
             allowed = self.components.allowed_next(len(choices), is_chosen > 0.0, mask, pair_mask)
-            output = head(torch.cat([hidden, is_chosen, own], -1)).float()
+            output = head(torch.cat([hidden, is_chosen, own], -1))
             logits, mean, raw_scale, value_logits = output.split(
                 [size, num, num, output.shape[-1] - size - 2 * num], -1
             )

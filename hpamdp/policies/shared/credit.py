@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
-from hpamdp.policies.shared.networks import HybridCritics
+from hpamdp.policies.shared.networks import HybridCritics, OutputLinear, in_float32
 from hpamdp.specs import PAMDPSpecs
 
 # `joint`: every component gets the whole advantage. Otherwise the branches of a `CreditCritic` are summed or mixed.
@@ -48,7 +48,7 @@ class CreditCritic(nn.Module):
             num = len(self.components.sizes)
             # Weights and bias of the mixing network's hidden layer, and weights of its output.
             self.sizes = [num * _MIXING_UNITS, _MIXING_UNITS, _MIXING_UNITS]
-            self.hyper = nn.Linear(specs.observation_dim, sum(self.sizes), dtype=torch.float32)
+            self.hyper = OutputLinear(specs.observation_dim, sum(self.sizes), dtype=torch.float32)
 
     def contributions(
         self, features: Tensor, distribution: HybridDistribution, discrete: Tensor, raw: Tensor
@@ -73,7 +73,7 @@ class CreditCritic(nn.Module):
             return contributions.sum(-1)
         weight, bias, out_weight = self.hyper(features).split(self.sizes, -1)
         weight = weight.abs().unflatten(-1, (contributions.shape[-1], _MIXING_UNITS))
-        mixed = torch.einsum("bc,bch->bh", contributions, weight)
+        mixed = in_float32(lambda each: torch.einsum("bc,bch->bh", each, weight), contributions)
         hidden = F.elu(mixed + bias) - F.elu(bias)
         return (hidden * out_weight.abs()).sum(-1)
 

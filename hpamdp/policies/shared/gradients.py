@@ -49,8 +49,12 @@ class Descent:
         self._while_compiling = while_compiling
 
     def lower_precision(self) -> None:
-        """Compute matrix products in bfloat16; parameters and sums over many terms stay in float32."""
+        """Compute matrix products in bfloat16, except for last layers; parameters and long sums stay in float32."""
         self.precision = torch.bfloat16
+
+    def same_precision(self, device: torch.device) -> AbstractContextManager:
+        """Return a context in which products have the precision of those in `step`."""
+        return lower_products(device, self.precision)
 
     def step(
         self,
@@ -94,12 +98,16 @@ def expectile_loss(excess: Tensor, expectile: float) -> Tensor:
     return (torch.where(excess > 0.0, expectile, 1.0 - expectile).float() * excess.square()).mean()
 
 
+def lower_products(device: torch.device, precision: torch.dtype) -> AbstractContextManager:
+    """Return a context in which matrix products have this precision."""
+    return nullcontext() if precision == torch.float32 else torch.autocast(device.type, precision)
+
+
 def gradients_of(
     loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs, precision: torch.dtype = torch.float32
 ) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
     """Return the scalars of a loss and its gradients, None for parameters that it does not depend on."""
-    is_lower = precision != torch.float32
-    with torch.autocast(parameters[0].device.type, precision) if is_lower else nullcontext():
+    with lower_products(parameters[0].device, precision):
         loss, scalars = loss_of(*inputs)
     gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
     # A fused optimizer takes it for granted that gradients lie in memory as their parameters do.

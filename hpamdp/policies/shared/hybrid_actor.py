@@ -18,7 +18,7 @@ from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import masked_logits
 from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution, ValuePlaces
-from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, VectorProducts
+from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, OutputLinear, VectorProducts
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.settings import SettingError, Settings
 from hpamdp.specs import PAMDPSpecs
@@ -122,11 +122,11 @@ class HybridActor(nn.Module):
 
     def make_heads(self, specs: PAMDPSpecs, width: int, raw_scale: float) -> None:
         """Make the heads on hidden layers of this width; `log_scale(raw_scale)` is their initial log-scale."""
-        self.discrete_head = nn.Linear(width, specs.num_discrete, dtype=torch.float32)
-        self.parameter_head = nn.Linear(width, 2 * specs.num_parameters, dtype=torch.float32)
+        self.discrete_head = OutputLinear(width, specs.num_discrete, dtype=torch.float32)
+        self.parameter_head = OutputLinear(width, 2 * specs.num_parameters, dtype=torch.float32)
         heads = [self.discrete_head, self.parameter_head]
         if self.values is not None:
-            self.value_head = nn.Linear(width, self.values.num_logits, dtype=torch.float32)
+            self.value_head = OutputLinear(width, self.values.num_logits, dtype=torch.float32)
             heads.append(self.value_head)
         for head in heads:
             make_small(head)
@@ -141,11 +141,10 @@ class HybridActor(nn.Module):
             mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; if None, all.
         """
         hidden = self.hidden(observation)
-        # In float32, also where the products are bfloat16: sums over parameters and their likelihoods need it.
-        mean, raw_scale = self.parameter_head(hidden).float().chunk(2, -1)
+        mean, raw_scale = self.parameter_head(hidden).chunk(2, -1)
         mean = mean + self.initial(observation)
-        logits = masked_logits(self.discrete_head(hidden).float(), mask)
-        values = None if self.values is None else self.values.distribution(self.value_head(hidden).float())
+        logits = masked_logits(self.discrete_head(hidden), mask)
+        values = None if self.values is None else self.values.distribution(self.value_head(hidden))
         log_probs = self.components.log_softmax(logits)
         return HybridDistribution(log_probs, mean, self.log_scale(raw_scale), self.owner, self.components, values)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -23,6 +23,25 @@ _LARGEST_DRAWN_TO = 0.97
 
 # Passes of multi-pass critics that are computed at once: bounds the memory where there are many discrete actions.
 _MAX_PASSES = 1 << 13
+
+
+def in_float32(layer: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """Apply a layer in float32, also where autocast computes products in bfloat16.
+
+    bfloat16 has steps of 0.25 near 50. So what networks say is computed in float32, from hidden layers in bfloat16.
+    """
+    if x.is_meta or not torch.is_autocast_enabled(x.device.type):
+        return layer(x)
+    with torch.autocast(x.device.type, enabled=False):
+        return layer(x.float())
+
+
+class OutputLinear(nn.Linear):
+    """The last layer of a network, see `in_float32`."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply the layer in float32."""
+        return in_float32(super().forward, x)
 
 
 class EnsembleLinear(nn.Module):
@@ -77,7 +96,7 @@ class EnsembleMLP(nn.Module):
         x = x.expand(num_members or self.num_members, *x.shape)
         for layer in self.layers[:-1]:
             x = self.activated(layer(x))
-        return self.layers[-1](x)
+        return in_float32(self.layers[-1], x)
 
     def activated(self, x: Tensor) -> Tensor:
         """Return the activations of a hidden layer's output `[*B, width]`, which is overwritten."""
@@ -85,12 +104,12 @@ class EnsembleMLP(nn.Module):
 
 
 def mlp(in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> nn.Sequential:
-    """Return a ReLU network with linear output."""
+    """Return a ReLU network with linear output, which is float32."""
     dims = [in_dim, *hidden_dims]
     layers: list[nn.Module] = []
     for size, next_size in pairwise(dims):
         layers += [nn.Linear(size, next_size, dtype=torch.float32), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim, dtype=torch.float32))
+    return nn.Sequential(*layers, OutputLinear(dims[-1], out_dim, dtype=torch.float32))
 
 
 def as_preactivations(output: Tensor) -> Tensor:
@@ -305,8 +324,11 @@ class HybridCritics(nn.Module):
         first, last = self.net.layers[0], self.net.layers[-1]
         assert isinstance(first, EnsembleLinear) and isinstance(last, EnsembleLinear)
         of_state, of_parameters = first.weight.split([self.observation_dim, unit_parameters.shape[-1]], 1)
-        common = torch.baddbmm(first.bias, state.expand(len(of_state), *state.shape), of_state)
-        x = common.unsqueeze(2)
+
+        def of_states(x: Tensor) -> Tensor:
+            return torch.baddbmm(first.bias, x.expand(len(of_state), *x.shape), of_state)
+
+        x = (in_float32(of_states, state) if first is last else of_states(state)).unsqueeze(2)
         for slot, is_own in zip(self.slots.unbind(-1), self.is_own.unbind(-1), strict=True):
             # Of every discrete action the next one of its parameters, `[B, K]`, in its own pass.
             x = torch.addcmul(x, (unit_parameters[:, slot] * is_own).unsqueeze(-1), of_parameters[:, slot].unsqueeze(1))

@@ -14,6 +14,7 @@ from pydantic import Field, NonNegativeFloat, model_validator
 from torch import Tensor
 from typing_extensions import Self
 
+from hpamdp.policies.shared.gradients import lower_products
 from hpamdp.policies.shared.planning import Prediction, absolute_temperature, discounted_return, elite_weights
 from hpamdp.policies.shared.planning_policy import PlanningOptions
 from hpamdp.specs import PAMDPSpecs
@@ -128,7 +129,7 @@ class Planner:
         def steps() -> Iterator[Prediction]:
             nonlocal rows
             for h in range(discrete.shape[2]):
-                with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
+                with lower_products(rows.device, self.precision):
                     chosen = discrete[:, :, h].flatten(0, 1)
                     predicted = self.model(rows, chosen, unit_parameters[:, :, h].flatten(0, 1))
                 rows = predicted.next_state
