@@ -29,6 +29,7 @@ LEARNERS = {
     "paddpg": [*PLATFORM, "low=paddpg"],
     "hsac": [*PLATFORM, "low=hsac"],
     "hyar": [*PLATFORM, "low=hyar"],
+    "hyar_published": [*PLATFORM, "low=hyar_published"],
     "hyar_that_searches": [*PLATFORM, "low=hyar", "low.greedy_samples=8"],
     "hyar_nearest": ["env=hard_move", "high=none", "low=hyar", "low.discrete=nearest"],
     "qpamdp": [*PLATFORM, "low=qpamdp"],

@@ -31,6 +31,10 @@ SHORT = {
     "td3_bc": ["low.warmup_steps=64", "low.batch_size=16"],
     "hsac": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
     "hyar": ["low.warmup_steps=64", "low.codec_pretrain_updates=2", "low.updates_per_step=0.05", "low.batch_size=16"],
+    "hyar_published": [
+        *("low.warmup_steps=64", "low.codec_pretrain_updates=2", "low.updates_per_step=0.05", "low.batch_size=16"),
+        *("low.codec_episodes=1", "low.codec_first_episode=0", "low.codec_batch_size=16"),
+    ],
     "paddpg": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
     "pets": [
         *("low.warmup_steps=64", "low.updates_per_step=0.1", "low.batch_size=16", "low.transition_dims=[16]"),

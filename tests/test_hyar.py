@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from conftest import make_config
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -14,7 +15,12 @@ SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
     twin=True, discrete="greedy",
-    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], layer_norm=False, warmup_steps=2000,
+    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, codec_inputs="concatenated", predicted_change="standardised",
+    change_unit="warmup",
+    codec_loss="sum", reconstruction_weight=1.0, codec_batch_size=None, codec_episodes=None, codec_first_episode=0,
+    latent_range_every=100, correction_error="mean", critic_window=None, inverting_gradients=False,
+    actor_max_grad_norm=None, noise_initial=None, noise_episodes=1000,
+    hidden_dims=[64, 64], layer_norm=False, warmup_steps=2000,
     codec_pretrain_updates=700, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
     latent_coverage=0.96, correction_factor=5.0, parameter_tolerance=None, relabelling="mean",
     buffer_size=20_000, batch_size=64, updates_per_step=0.25, gamma=0.9, reward_scale=1.0, tau=0.02, actor_lr=1e-3,
@@ -379,3 +385,171 @@ def test_the_learning_rates_fall_to_their_final_fraction():
         learner.on_progress(frames)
         rates.append([learner.optimizers[name].param_groups[0]["lr"] for name in ("codec", "actor", "critics")])
     assert rates == [pytest.approx([f * 2e-3, f * 1e-3, f * 3e-3]) for f in (1.0, 0.55, 0.1, 0.1)]
+
+
+def random_rows(learner: HyAR, num: int, *, is_done: bool = True) -> TensorDict:
+    rows = one_step_rows(learner, num)
+    rows["next", keys.DONE] = torch.full((num, 1), is_done)
+    return rows
+
+
+def test_multiplied_inputs_act_on_each_other_alone():
+    codec = make(codec_inputs="multiplied").codec
+    state, discrete = torch.randn(20, 4), torch.randint(3, (20,))
+    some, other = torch.randn(20, 3), torch.randn(20, 3)
+    assert not torch.equal(codec.decode(state, discrete, some)[1], codec.decode(state, discrete, other)[1])
+    with torch.no_grad():
+        codec.decoder.inputs[1].weight.zero_()
+        codec.decoder.inputs[1].bias.fill_(-1.0)  # after ReLU, 0 for every state and embedding
+    torch.testing.assert_close(codec.decode(state, discrete, some)[1], codec.decode(state, discrete, other)[1])
+
+
+def test_a_bounded_change_is_predicted_by_tanh_in_the_units_of_the_observation():
+    torch.manual_seed(0)
+    learner = make(predicted_change="bounded", warmup_steps=100, codec_pretrain_updates=1)
+    learn(learner, 1)
+    assert torch.equal(learner.codec.change_scale, torch.ones(4))
+    with torch.no_grad():
+        learner.codec.dynamics_head[-1].bias.fill_(9.0)
+        change = learner.codec.change(torch.randn(20, 4), torch.randint(3, (20,)), torch.randn(20, 3))
+    assert (change <= 1.0).all() and (change > 0.99).all()
+
+
+def test_the_mean_loss_averages_over_an_actions_own_parameters_and_the_dimensions_of_z():
+    learner = make(latent_dim=6)
+    rows = TensorDict(
+        state=torch.randn(50, 4), next_state=torch.randn(50, 4), unit=torch.rand(50, 3),
+        discrete=torch.ones(50, dtype=torch.long), batch_size=[50],
+    )  # fmt: skip
+    parts = {}
+    for form in ("sum", "mean"):
+        learner.options = learner.options.model_copy(update={"codec_loss": form, "reconstruction_weight": 2.0})
+        torch.manual_seed(0)
+        loss, parts[form] = learner.codec_loss(rows)
+    weighted = 2.0 * parts["mean"]["reconstruction"] + 1e-4 * parts["mean"]["kl"] + 0.1 * parts["mean"]["dynamics"]
+    torch.testing.assert_close(loss, weighted)
+    ratios = {name: (parts["sum"][name] / parts["mean"][name]).item() for name in parts["sum"]}
+    assert ratios == pytest.approx({"reconstruction": 2.0, "kl": 6.0, "dynamics": 1.0}, rel=1e-4)
+
+
+def test_the_latest_error_is_that_of_the_transitions_from_which_the_range_of_z_was_estimated():
+    torch.manual_seed(0)
+    learner = make(correction_error="latest", codec_pretrain_updates=30)
+    learn(learner, 10)
+    latest = learner.dynamics_error.item()
+    for _ in range(5):
+        learner._update_codec(learner._codec_sample())
+    assert learner.dynamics_error.item() == latest, "a single update does not move it"
+    with torch.no_grad():
+        learner.codec.dynamics_head[-1].bias.fill_(10.0)
+    learner.fit_latent_range()
+    assert 95.0 < learner.dynamics_error.item() < 110.0
+
+
+def test_the_codec_is_updated_once_in_so_many_episodes_after_the_first(monkeypatch):
+    learner = make(warmup_steps=100, codec_pretrain_updates=1, codec_episodes=10, codec_first_episode=40)
+    learn(learner, 1, 100)
+    updates = []
+    monkeypatch.setattr(learner, "_update_codec", lambda sample: updates.append(len(sample)) or {})
+    due = []
+    for num, is_done in [(39, True), (50, False), (10, True), (1, True), (35, True)]:
+        learner.learn(random_rows(learner, num, is_done=is_done), torch.ones(num, dtype=torch.bool))
+        due.append(len(updates))
+    assert due == [0, 0, 0, 1, 4], "after 39, 39, 49, 50 and 85 episodes"
+
+
+def test_with_a_window_the_critics_see_the_newest_steps_alone_and_none_of_the_warm_up():
+    torch.manual_seed(0)
+    learner = make(critic_window=80, warmup_steps=200, codec_pretrain_updates=1, updates_per_step=1.0, batch_size=60)
+    learn(learner, 1)
+    assert learner.updates == 0 and len(learner.buffer) == 200
+    learn(learner, 1, 50)
+    assert learner.updates == 0, "fewer than a batch"
+    learn(learner, 1, 50)
+    assert learner.updates == 50
+    newest = {row.tobytes() for row in learner.buffer[220:300]["state"].numpy()}
+    seen = {row.tobytes() for sample in learner.sample_batches(20) for row in sample["state"].numpy()}
+    assert seen == newest
+    assert len(learner._codec_sample()) == 60
+    drawn = {row.tobytes() for _ in range(20) for row in learner._codec_sample()["state"].numpy()}
+    assert len(drawn) > 250, "the codec sees all"
+
+
+def test_the_noise_falls_with_the_episodes_after_the_warm_up():
+    learner = make(
+        noise_initial=1.0, noise_episodes=100, parameter_noise=0.1, epsilon_final=0.0, epsilon_steps=0,
+        warmup_steps=200, codec_pretrain_updates=1, updates_per_step=1e-3,
+    )  # fmt: skip
+    noises = []
+    for num, is_done in [(200, True), (50, True), (20, False), (50, True), (50, True)]:
+        learner.learn(random_rows(learner, num, is_done=is_done), torch.ones(num, dtype=torch.bool))
+        noises.append(learner.policy.noise.item())
+    assert noises == pytest.approx([1.0, 0.55, 0.55, 0.1, 0.1])
+    assert learner.policy.epsilon == 0.0, "no action is random after the warm-up"
+    state = torch.zeros(2000, 4)
+    with torch.no_grad():
+        latent = learner.policy(TensorDict({keys.OBSERVATION: state}, [2000]))[LATENT]
+    assert latent[:, 3:].std(0).mean() < 0.2
+
+
+def test_inverting_gradients_scale_a_latent_actions_gradient_by_the_range_that_is_left():
+    torch.manual_seed(0)
+    learner = make(discrete="nearest", inverting_gradients=True)
+    state = torch.rand(30, 4) * 2 - 1
+    raw = learner.actor.raw(state).detach().requires_grad_()
+    learner.actor.raw = lambda _: raw
+    gradients = []
+    for is_inverting in (False, True):
+        learner.options = learner.options.model_copy(update={"inverting_gradients": is_inverting})
+        gradients.append(torch.autograd.grad(learner.actor_loss(state, None)[0], raw)[0])
+    latent = raw.detach().tanh()
+    left = torch.where(gradients[0] < 0.0, 1.0 - latent, 1.0 + latent) / 2.0
+    torch.testing.assert_close(gradients[1], gradients[0] * left)
+
+
+def test_the_published_recipe_has_the_published_settings_and_learns():
+    settings = make_config(["low=hyar_published", "high=none", "env=platform"]).low.settings
+    expected = dict(
+        twin=True, discrete="nearest", embedding_dim=6, latent_dim=6, hidden_dims=(256, 256), codec_hidden_dim=256,
+        codec_lr=1e-4, codec_batch_size=64, codec_pretrain_updates=5000, reconstruction_weight=2.0, kl_weight=0.5,
+        dynamics_weight=1.0, codec_loss="mean", latent_coverage=0.96, correction_factor=5.0, relabelling="sample",
+        gamma=0.99, tau=0.005, actor_lr=3e-4, critic_lr=3e-4, policy_delay=2, target_smoothing=0.1,
+        target_smoothing_clip=0.5, batch_size=128, updates_per_step=1.0, critic_window=100_000, noise_initial=1.0,
+        noise_episodes=1000, parameter_noise=0.1, actor_max_grad_norm=10.0, inverting_gradients=True, lr_final=1.0,
+        augment=False, parameter_tolerance=None, greedy_samples=0, search_samples=0, preactivation_penalty=0.0,
+    )  # fmt: skip
+    assert {name: settings[name] for name in expected} == expected
+    short = dict(warmup_steps=200, codec_pretrain_updates=2, updates_per_step=0.02, critic_window=150)
+    learner = make(**{**{name: value for name, value in settings.items() if name != "budget"}, **short})
+    for _ in range(3):
+        learner.learn(random_rows(learner, 200), torch.ones(200, dtype=torch.bool))
+    assert learner.updates == 8 and learner.episodes == 400
+
+
+def test_a_window_smaller_than_a_batch_and_noise_that_would_rise_are_refused():
+    with pytest.raises(SettingError, match="critic_window=10: must be at least batch_size=64"):
+        make(critic_window=10)
+    with pytest.raises(SettingError, match=r"noise_initial=0\.01: must be at least parameter_noise=0\.1"):
+        make(noise_initial=0.01)
+    assert make(critic_window=100).steps_to_update()["warmup_steps"] == 2064
+
+
+@pytest.mark.parametrize("change_unit", ["warmup", "stored"])
+def test_the_unit_of_the_predicted_change_follows_the_stored_steps_and_the_prediction_stays(change_unit):
+    torch.manual_seed(0)
+    learner = make(change_unit=change_unit, warmup_steps=200, codec_pretrain_updates=50, updates_per_step=1e-3)
+    learn(learner, 1)  # random steps change the first two entries alone
+    rows = random_rows(learner, 2000)
+    rows["next", keys.OBSERVATION][:, 3] += torch.randn(2000)
+    learner.learn(rows, torch.ones(2000, dtype=torch.bool))
+    state, discrete, z = torch.rand(50, 4), torch.randint(3, (50,)), torch.randn(50, 3)
+    with torch.no_grad():
+        before = learner.codec.change(state, discrete, z) * learner.codec.change_scale
+        learner.fit_latent_range()
+        after = learner.codec.change(state, discrete, z) * learner.codec.change_scale
+    torch.testing.assert_close(after, before)
+    _, scalars = learner.codec_loss(learner.buffer.sample(2000))
+    follows = change_unit == "stored"
+    assert (scalars["dynamics"] < 10.0) == follows, "else thousands, beside 1 of the parameters"
+    if follows:
+        torch.testing.assert_close(learner.dynamics_error, scalars["dynamics"], rtol=0.3, atol=0.0)

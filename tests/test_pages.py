@@ -19,7 +19,12 @@ ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 FOLDERS = {"low": "learners", "high": "selectors", "env": "domains"}
 # Those that share a page.
-SHARED = {"pdqn_published": "pdqn", "sliding": "moving", "catch_point_picture": "catch_point"}
+SHARED = {
+    "hyar_published": "hyar",
+    "pdqn_published": "pdqn",
+    "sliding": "moving",
+    "catch_point_picture": "catch_point",
+}
 ALL = [(group, name) for group in FOLDERS for name in choices(group)]
 
 

@@ -157,7 +157,7 @@ def test_compiled_updates_of_hppo_are_the_same_up_to_rounding_for_batches_of_any
 
 
 class Dtypes(TorchDispatchMode):
-    """Notes of matrix products made under it the types of their inputs, with the numbers of outputs of each."""
+    """Notes the types of the inputs of matrix products made under it, each with the smallest sizes of the products."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -165,7 +165,8 @@ class Dtypes(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         if func in (torch.ops.aten.mm.default, torch.ops.aten.addmm.default, torch.ops.aten.bmm.default):
-            self.seen.setdefault(args[-1].dtype, set()).add(args[-1].shape[-1])
+            smallest = min(*args[-2].shape[-2:], *args[-1].shape[-2:])
+            self.seen.setdefault(args[-1].dtype, set()).add(smallest)
         return func(*args, **(kwargs or {}))
 
 
@@ -180,9 +181,9 @@ def test_updates_in_bfloat16_make_the_products_of_hidden_layers_in_it_and_have_n
             _, gradients = gradients_of(learner.critic_loss, parameters, batch, precision=learner.descent.precision)
         both.append(torch.cat([gradient.flatten() for gradient in gradients]))
         learner.lower_precision()
-    last = products.seen.pop(torch.float32)
-    assert products.seen.keys() == {torch.bfloat16}
-    assert max(last) < 16, "hidden layers have 64 units"
+    assert products.seen.keys() == {torch.bfloat16, torch.float32}
+    assert max(products.seen[torch.bfloat16]) == 64, "the hidden layers have 64 units"
+    assert max(products.seen[torch.float32]) < 16, "the last layers have fewer outputs"
     assert all(gradient.dtype == torch.float32 for gradient in both)
     assert torch.cosine_similarity(*both, dim=0) > 0.99
 

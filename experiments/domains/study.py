@@ -113,8 +113,8 @@ def learner(run: Run) -> str:
         name = "patd3"
     elif name == "pdqn_published" and low["multipass"]:
         name = "mpdqn_published"
-    elif name == "hyar" and not low["twin"]:
-        name = "hyar_ddpg"
+    elif name in ("hyar", "hyar_published") and not low["twin"]:
+        name = name.replace("hyar", "hyar_ddpg")
     return f"{name}{AUGMENTED}" if low.get("augment", False) is True else name
 
 

@@ -54,8 +54,8 @@ def check_run(run: RunConfig, device: torch.device, build_one: Callable[[], PAMD
 def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component], device: torch.device) -> None:
     """Refuse replay buffers, batches and layers that are too large for memory, before any of them is built.
 
-    They are recognised by the names of their settings: `buffer_size`, `batch_size`, `minibatch_size`, and names that
-    end in `hidden_dims`.
+    They are recognised by the names of their settings: `buffer_size`, and names that end in `batch_size` or
+    `hidden_dims`.
 
     Args:
         config: config of the run.
@@ -77,7 +77,7 @@ def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component]
             setting = f"{component.group}.{name}={as_json(value)}"
             if name == "buffer_size":
                 needs[setting] = num * value * (row + _bytes_remembered(component, specs))
-            elif name in ("batch_size", "minibatch_size"):
+            elif name.endswith("batch_size") and value is not None:
                 needs[setting] = value * row
             elif name.endswith("hidden_dims"):
                 # Behind pictures is an encoder, whose few features are not counted here.

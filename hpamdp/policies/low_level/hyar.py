@@ -21,7 +21,7 @@ Differs from the source:
 - random actions have no latent action of their own: they are encoded when they are sampled from the replay buffer, as
   the representation-shift correction does for outdated ones;
 - the correction compares the error of a stored action with a running mean of the codec's error, over its last hundred
-  or so updates, instead of the error of the last update;
+  or so updates, instead of its error after the last update (`correction_error=latest`);
 - with `parameter_tolerance` the correction asks whether z still decodes to the executed parameters, which are stored.
   The source asks whether the change of the state that z predicts is the one that followed. Where changes are hard to
   predict, the two hardly agree: see `experiments/domains`;
@@ -30,10 +30,13 @@ Differs from the source:
 - with `greedy_samples` the greedy policy also values variations of z and takes the best of them;
 - with `search_samples` the actor is also drawn to the best of random latent actions, weighted by their gain in value,
   and `preactivation_penalty` keeps it from the bounds; both as in P-DQN;
-- tanh bounds the actor's output; the published code also multiplies the gradient by the range that is left (inverting
-  gradients), and clips its norm at 10;
+- the codec concatenates its inputs, which the published code multiplies (`codec_inputs`); its predicted change has no
+  bound, there it is a tanh (`predicted_change`); its loss sums, there it averages (`codec_loss`);
+- tanh bounds the actor's output; the published code also multiplies the gradient by the range that is left
+  (`inverting_gradients`), and clips its norm at 10 (`actor_max_grad_norm`);
 - exploration is by random actions, ever fewer, and by Gaussian noise of a constant scale; in the published code it is
-  by Gaussian noise alone, whose scale falls from 1 to 0.1.
+  by Gaussian noise alone, whose scale falls from 1 to 0.1 (`noise_initial`);
+- the critics learn from the random steps, too; in the published code only the codec does (`critic_window`).
 
 TorchRL's TD3Loss would fit the latent actor and critics, but an update takes 1.5 times as long with it (8.0 instead of
 5.3 ms of CPU time, batches of 256), because it runs the networks as functional calls under vmap.
@@ -42,19 +45,21 @@ TorchRL's TD3Loss would fit the latent actor and critics, but an update takes 1.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
+from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.policies.base import ActionFeature, is_greedy
+from hpamdp.policies.low_level.hyar_codec import CodecOptions, HybridCodec
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.actor_critic import TargetRateOptions, set_learning_rates
 from hpamdp.policies.shared.actor_search import (
@@ -67,6 +72,7 @@ from hpamdp.policies.shared.actor_search import (
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
+    InvertingGradients,
     as_preactivations,
     mlp,
     polyak_update,
@@ -75,7 +81,7 @@ from hpamdp.policies.shared.networks import (
 )
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.policies.shared.scales import scale_of
-from hpamdp.settings import LearningRate, PositiveFraction, SettingError
+from hpamdp.settings import PositiveFraction, SettingError
 from hpamdp.specs import PAMDPSpecs
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random
@@ -84,12 +90,10 @@ LATENT = "latent"  # the latent action as the actor gave it; NaN where the actio
 _MAX_CANDIDATES = 1 << 14
 
 
-class HyAROptions(TargetRateOptions, SearchingActorOptions):
+class HyAROptions(CodecOptions, TargetRateOptions, SearchingActorOptions):
     """Settings of `HyAR`. Noise is in units where the latent action's bounds are [-1, 1].
 
-    The published settings: discrete=nearest latent_dim=6 hidden_dims=[256,256] codec_pretrain_updates=5000
-    codec_lr=1e-4 kl_weight=0.5 dynamics_weight=1 gamma=0.99 tau=0.005 actor_lr=3e-4 critic_lr=3e-4
-    target_smoothing_clip=0.5, after a warm-up of 5,000 to 20,000 random episodes.
+    The published settings are those of `low=hyar_published`.
     """
 
     twin: bool = True
@@ -99,28 +103,28 @@ class HyAROptions(TargetRateOptions, SearchingActorOptions):
 
     `nearest` is the published form. With `greedy`, updates take longer the more discrete actions there are.
     """
-    embedding_dim: PositiveInt = 6
-    """Dimension of a discrete action's embedding e."""
-    latent_dim: PositiveInt | None = None
-    """Dimension of the latent variable z of the VAE; if null, the largest number of parameters of a discrete action."""
-    codec_hidden_dim: PositiveInt = 128
-    """Width of the codec's layers."""
     warmup_steps: PositiveInt = 2000
     """Random steps of a learner before its first update; the codec is trained on them."""
-    codec_pretrain_updates: PositiveInt = 2000
-    """Updates of the codec alone at the end of the warm-up."""
-    codec_every: PositiveInt = 10
-    """Critic updates for each update of the codec after that."""
-    codec_lr: LearningRate = 1e-3
-    """Learning rate of the codec."""
-    kl_weight: NonNegativeFloat = 1e-4
-    """Weight of the KL divergence in the codec's loss."""
-    dynamics_weight: NonNegativeFloat = 0.1
-    """Weight of the predicted change of the state in the codec's loss."""
-    latent_coverage: PositiveFraction = 0.96
-    """Central fraction of the encoded z that the actor can reach: the latent-space constraint of the paper."""
+    critic_window: PositiveInt | None = None
+    """Newest steps after the warm-up that the critics and the actor learn from; if null, all that are stored."""
+    inverting_gradients: bool = False
+    """Scale the gradient of a latent action by the range that is left to its bound, as published, in addition to tanh.
+
+    The range is that in the direction of the gradient (Hausknecht and Stone 2016, arXiv 1511.04143).
+    """
+    actor_max_grad_norm: PositiveFloat | None = None
+    """Largest gradient norm of an update of the actor; if null, there is no limit."""
+    noise_initial: PositiveFloat | None = None
+    """Scale of the exploring noise after the warm-up; it falls to `parameter_noise`. If null, it is constant."""
+    noise_episodes: PositiveInt = 1000
+    """The learner's own episodes, after its warm-up, within which this scale falls linearly."""
     correction_factor: PositiveFloat = 5.0
-    """Encode a stored z again if the error of its predicted change is this many times the codec's recent mean."""
+    """Encode a stored z again if the error of its predicted change is this many times the codec's error."""
+    correction_error: Literal["mean", "latest"] = "mean"
+    """The codec's error: its mean over the last hundred or so updates of the codec, or the `latest`, as published.
+
+    The latest is that of the 4,096 stored transitions from which the range of z was estimated last.
+    """
     parameter_tolerance: NonNegativeFloat | None = None
     """Instead, encode a stored z again if its decoded parameters differ from the executed ones by more than this.
 
@@ -136,90 +140,15 @@ class HyAROptions(TargetRateOptions, SearchingActorOptions):
     epsilon_steps: NonNegativeInt = 15_000
     """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
 
-
-class HybridCodec(nn.Module):
-    """The embedding table and the conditional VAE with its dynamics head.
-
-    Shapes: states `[B, observation_dim]`, discrete actions `[B]`, parameters `[B, num_parameters]` in [-1, 1],
-    e `[B, embedding_dim]`, z `[B, latent_dim]`.
-    """
-
-    mask: Tensor
-    change_scale: Tensor
-    z_low: Tensor
-    z_high: Tensor
-
-    def __init__(self, specs: PAMDPSpecs, embedding_dim: int, latent_dim: int, hidden_dim: int) -> None:
-        super().__init__()
-        self.latent_dim = latent_dim
-        condition_dim = specs.observation_dim + embedding_dim
-        self.table = nn.Parameter(
-            torch.empty(specs.num_discrete, embedding_dim, dtype=torch.float32).uniform_(-1.0, 1.0)
-        )
-        self.encoder = mlp(specs.num_parameters + condition_dim, [hidden_dim, hidden_dim], 2 * latent_dim)
-        self.decoder = nn.Sequential(mlp(latent_dim + condition_dim, [hidden_dim], hidden_dim), nn.ReLU())
-        self.parameter_head = nn.Linear(hidden_dim, specs.num_parameters, dtype=torch.float32)
-        self.dynamics_head = mlp(hidden_dim, [hidden_dim], specs.observation_dim)
-        self.register_buffer("mask", specs.parameter_mask.float())
-        self.register_buffer("change_scale", torch.ones(specs.observation_dim, dtype=torch.float32))
-        # The central range of the encoded z, onto which the actor's [-1, 1] is mapped.
-        self.register_buffer("z_low", -torch.ones(latent_dim, dtype=torch.float32))
-        self.register_buffer("z_high", torch.ones(latent_dim, dtype=torch.float32))
-
-    @property
-    def embeddings(self) -> Tensor:
-        """The embedding of each discrete action, `[num_discrete, embedding_dim]` in (-1, 1)."""
-        return self.table.tanh()
-
-    def nearest_discrete(self, e: Tensor, allowed: Tensor | None = None) -> Tensor:
-        """Return the discrete action `[B]` whose embedding is nearest to e.
-
-        Args:
-            e: `[B, embedding_dim]`.
-            allowed: the discrete actions to choose from, bool `[B, num_discrete]`. If None, all.
-        """
-        return masked_values(-torch.cdist(e, self.embeddings), allowed).argmax(-1)
-
-    def of_allowed(self, proposals: Tensor, allowed: Tensor | None) -> Tensor:
-        """Return latent actions whose e stands for an allowed discrete action, `[B, N, embedding_dim + latent_dim]`.
-
-        Where it does not, e is the embedding of the nearest allowed one; gradients pass as if it were as it was.
-        """
-        if allowed is None:
-            return proposals
-        e, z = proposals.split([self.table.shape[-1], self.latent_dim], -1)
-        is_allowed = allowed.unsqueeze(1).expand(-1, e.shape[1], -1).flatten(0, 1)
-        rows = e.flatten(0, 1).detach()
-        nearest = self.nearest_discrete(rows, is_allowed)
-        is_moved = self.nearest_discrete(rows) != nearest
-        moved = torch.where(is_moved.unsqueeze(-1), self.embeddings.detach()[nearest], rows)
-        return torch.cat([e + (moved - rows).unflatten(0, e.shape[:2]), z], -1)
-
-    def encode(self, state: Tensor, discrete: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean and log-variance of z, each `[B, latent_dim]`."""
-        own = parameters * self.mask[discrete]
-        mean, log_variance = self.encoder(torch.cat([own, state, self.embeddings[discrete]], -1)).chunk(2, -1)
-        return mean, log_variance.clamp(-10.0, 4.0)
-
-    def decode(self, state: Tensor, discrete: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the parameters `[B, num_parameters]` in [-1, 1] and the predicted change of the state, scaled."""
-        hidden = self._hidden(state, discrete, z)
-        return as_preactivations(self.parameter_head(hidden)).tanh(), self.dynamics_head(hidden)
-
-    def change(self, state: Tensor, discrete: Tensor, z: Tensor) -> Tensor:
-        """Return the predicted change of the state alone, scaled, `[B, observation_dim]`."""
-        return self.dynamics_head(self._hidden(state, discrete, z))
-
-    def _hidden(self, state: Tensor, discrete: Tensor, z: Tensor) -> Tensor:
-        return self.decoder(torch.cat([z, state, self.embeddings[discrete]], -1))
-
-    def z_from_unit(self, unit_z: Tensor) -> Tensor:
-        """Map the actor's [-1, 1] onto the central range of the encoded z."""
-        return self.z_low + (unit_z + 1.0) * 0.5 * (self.z_high - self.z_low)
-
-    def z_to_unit(self, z: Tensor) -> Tensor:
-        """Map z back to the actor's [-1, 1], clipped."""
-        return (2.0 * (z - self.z_low) / (self.z_high - self.z_low) - 1.0).clamp(-1.0, 1.0)
+    @model_validator(mode="after")
+    def _check_hyar(self) -> Self:
+        if self.critic_window is not None and self.critic_window < self.batch_size:
+            raise ValueError(f"critic_window={self.critic_window}: must be at least batch_size={self.batch_size}")
+        if self.noise_initial is not None and self.noise_initial < self.parameter_noise:
+            raise ValueError(
+                f"noise_initial={self.noise_initial}: must be at least parameter_noise={self.parameter_noise}"
+            )
+        return self
 
 
 class LatentActor(nn.Module):
@@ -298,6 +227,7 @@ class HyARPolicy(TensorDictModuleBase):
     """Takes the best of the actor's proposals, decoded; explores with noise on them and with random actions."""
 
     epsilon: Tensor
+    noise: Tensor
     variations: Tensor
 
     def __init__(
@@ -310,8 +240,9 @@ class HyARPolicy(TensorDictModuleBase):
         self.critics = critics
         self.codec = codec
         self.specs = specs
-        self.noise = options.parameter_noise
         self.register_buffer("epsilon", torch.ones((), dtype=torch.float32))
+        noise = torch.tensor(options.noise_initial or options.parameter_noise, dtype=torch.float32)
+        self.register_buffer("noise", noise, persistent=options.noise_initial is not None)
         of_z = even_normal(options.greedy_samples, codec.latent_dim, options.greedy_noise)
         self.register_buffer("variations", F.pad(of_z, (codec.table.shape[-1], 0)), persistent=False)
 
@@ -385,6 +316,8 @@ class HyAR(ReplayLearner):
     options: HyAROptions
     policy: HyARPolicy
     dynamics_error: Tensor
+    episodes: Tensor
+    warmup_rows: Tensor
 
     def __init__(
         self,
@@ -404,7 +337,7 @@ class HyAR(ReplayLearner):
 
         latent_dim = options.latent_dim or max(1, *specs.parameter_dims)
         dims, latent_dims = options.hidden_dims, (options.embedding_dim, latent_dim)
-        self.codec = HybridCodec(specs, *latent_dims, options.codec_hidden_dim)
+        self.codec = HybridCodec(specs, latent_dim, options)
         self.actor = LatentActor(specs, *latent_dims, dims, proposes_each=options.discrete == "greedy")
         self.critics = LatentCritics(
             2 if options.twin else 1, specs.observation_dim, sum(latent_dims), dims, layer_norm=options.layer_norm
@@ -412,8 +345,13 @@ class HyAR(ReplayLearner):
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = HyARPolicy(self.actor, self.critics, self.codec, specs, options)
-        # The codec's recent mean squared error of the scaled change of the state.
+        # The codec's mean squared error of the scaled change of the state, see `correction_error`.
         self.register_buffer("dynamics_error", torch.ones((), dtype=torch.float32))
+        # Saved only where they count: learners of earlier versions had neither.
+        self.counts_episodes = options.noise_initial is not None or options.codec_episodes is not None
+        self.register_buffer("episodes", torch.zeros((), dtype=torch.long), persistent=self.counts_episodes)
+        has_window = options.critic_window is not None
+        self.register_buffer("warmup_rows", torch.zeros((), dtype=torch.long), persistent=has_window)
         self.to(device)
         self.learning_rates = {"codec": options.codec_lr, "actor": options.actor_lr, "critics": options.critic_lr}
         modules = {"codec": self.codec, "actor": self.actor, "critics": self.critics}
@@ -422,24 +360,67 @@ class HyAR(ReplayLearner):
             for name, rate in self.learning_rates.items()
         }
 
+    def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
+        """Store the batch's transitions; after the warm-up, make the updates that are due."""
+        before = int(self.episodes)
+        if self.counts_episodes and int(self.frames) >= self.options.warmup_steps:
+            self.episodes += (batch["next", keys.DONE].squeeze(-1) & mask).sum()
+        scalars = super().learn(batch, mask)
+        for number in range(self._codec_updates(before) + 1, self._codec_updates(int(self.episodes)) + 1):
+            scalars |= {name: value.item() for name, value in self._update_codec(self._codec_sample()).items()}
+            if number % self.options.latent_range_every == 0:
+                self.fit_latent_range()
+        return scalars
+
+    def _codec_updates(self, episodes: int) -> int:
+        """Return the updates of the codec that are due after this many episodes; 0 if steps decide, not episodes."""
+        if self.options.codec_episodes is None:
+            return 0
+        return max(0, episodes - self.options.codec_first_episode) // self.options.codec_episodes
+
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics and, less often, the actor, the target networks and the codec."""
         scalars = self.gradient_step("critics", self.critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
-            scalars |= self.gradient_step("actor", self.actor_loss, sample["state"], self.allowed(sample))
+            scalars |= self.descent.step(
+                self.optimizers["actor"],
+                self.actor_loss,
+                sample["state"],
+                self.allowed(sample),
+                max_grad_norm=self.options.actor_max_grad_norm,
+            )
             polyak_update(self.target_actor, self.actor, self.options.tau)
             polyak_update(self.target_critics, self.critics, self.options.tau)
-        if self.updates % self.options.codec_every == 0:
-            scalars |= self._update_codec(sample)
-            if self.updates % (100 * self.options.codec_every) == 0:
+        if self.options.codec_episodes is None and self.updates % self.options.codec_every == 0:
+            own_sample = sample if self.options.codec_batch_size is None else self._codec_sample()
+            scalars |= self._update_codec(own_sample)
+            if self.updates % (self.options.latent_range_every * self.options.codec_every) == 0:
                 self.fit_latent_range()
         return scalars
 
+    def _codec_sample(self) -> TensorDictBase:
+        """Return a sample of all stored transitions for an update of the codec."""
+        return self.augmented(self.buffer.sample(self.options.codec_batch_size or self.options.batch_size))
+
     def _update_codec(self, sample: TensorDictBase) -> dict[str, Tensor]:
         scalars = self.gradient_step("codec", self.codec_loss, sample)
-        self.dynamics_error.lerp_(scalars["dynamics"], 0.01)
+        if self.options.correction_error == "mean":
+            self.dynamics_error.lerp_(scalars["dynamics"], 0.01)
         return scalars
+
+    def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
+        """Yield samples `[batch_size]` of the transitions that the critics learn from, once there are as many."""
+        if self.options.critic_window is None:
+            yield from super().sample_batches(num_batches)
+            return
+        stored, batch_size = self.buffer.write_count, self.options.batch_size
+        num_rows = min(stored - int(self.warmup_rows), len(self.buffer), self.options.critic_window)
+        if num_rows < batch_size:
+            return
+        for _ in range(num_batches):
+            ages = torch.randint(num_rows, (batch_size,))
+            yield self.augmented(self.buffer[(stored - 1 - ages) % self.options.buffer_size])
 
     def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance of Q(s, e, z) from r + discount * V(s'), where V is `value`."""
@@ -470,7 +451,8 @@ class HyAR(ReplayLearner):
     def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls with the values of the actor's allowed proposals by the first critic."""
         raw = self.actor.raw(state)
-        proposals = self.actor.proposals(raw.tanh(), self.codec.embeddings.detach())
+        given = InvertingGradients.apply(raw.tanh()) if self.options.inverting_gradients else raw.tanh()
+        proposals = self.actor.proposals(given, self.codec.embeddings.detach())
         if not self.actor.proposes_each:
             proposals = self.codec.of_allowed(proposals, allowed)
         q = self.critics(state, proposals, num_members=1)
@@ -550,7 +532,7 @@ class HyAR(ReplayLearner):
         state, discrete = batch["state"], batch["discrete"]
         z = self.codec.z_from_unit(z)
         if self.options.parameter_tolerance is None:
-            target = (batch["next_state"] - state) / self.codec.change_scale
+            target = self.codec.scaled_change(state, batch["next_state"])
             error = (self.codec.change(state, discrete, z) - target).square().mean(-1)
             return error <= self.options.correction_factor * self.dynamics_error
         unit_parameters, _ = self.codec.decode(state, discrete, z)
@@ -563,35 +545,67 @@ class HyAR(ReplayLearner):
         mean, log_variance = self.codec.encode(state, discrete, executed)
         z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
         unit_parameters, change = self.codec.decode(state, discrete, z)
-        reconstruction = ((unit_parameters - executed).square() * self.codec.mask[discrete]).sum(-1).mean()
-        divergence = -0.5 * (1.0 + log_variance - mean.square() - log_variance.exp()).sum(-1).mean()
-        dynamics = F.mse_loss(change, (sample["next_state"] - state) / self.codec.change_scale)
-        loss = reconstruction + self.options.kl_weight * divergence + self.options.dynamics_weight * dynamics
+        is_own = self.codec.mask[discrete]
+        errors = ((unit_parameters - executed).square() * is_own).sum(-1)
+        divergences = -0.5 * (1.0 + log_variance - mean.square() - log_variance.exp()).sum(-1)
+        if self.options.codec_loss == "mean":
+            errors, divergences = errors / is_own.sum(-1).clamp(min=1.0), divergences / self.codec.latent_dim
+        reconstruction, divergence = errors.mean(), divergences.mean()
+        dynamics = F.mse_loss(change, self.codec.scaled_change(state, sample["next_state"]))
+        loss = (
+            self.options.reconstruction_weight * reconstruction
+            + self.options.kl_weight * divergence
+            + self.options.dynamics_weight * dynamics
+        )
         return loss, {"reconstruction": reconstruction, "kl": divergence, "dynamics": dynamics}
 
     def start(self) -> None:
         """Train the codec alone."""
-        stored = self.buffer[:]
-        self.codec.change_scale.copy_(scale_of(stored["next_state"] - stored["state"]))
+        if not self.codec.is_change_bounded:
+            stored = self.buffer[:]
+            self.codec.change_scale.copy_(scale_of(stored["next_state"] - stored["state"]))
         for _ in range(self.options.codec_pretrain_updates):
-            self._update_codec(self.augmented(self.buffer.sample(self.options.batch_size)))
+            self._update_codec(self._codec_sample())
         self.fit_latent_range()
+        self.warmup_rows.fill_(self.buffer.write_count)
+
+    def steps_to_update(self) -> dict[str, int]:
+        """Return the length of the warm-up, with a batch after it if the critics learn from no earlier steps."""
+        needed = super().steps_to_update()
+        if self.options.critic_window is not None:
+            needed["warmup_steps"] += self.options.batch_size
+        return needed
 
     def on_progress(self, steps: int) -> None:
-        """Lower the probability of random actions, and the learning rates."""
+        """Lower the probability of random actions, the noise and the learning rates."""
         options = self.options
         self.policy.epsilon.fill_(linear_schedule(steps, options.epsilon_steps, options.epsilon_final))
+        if options.noise_initial is not None:
+            final = options.parameter_noise / options.noise_initial
+            part = linear_schedule(int(self.episodes), options.noise_episodes, final)
+            self.policy.noise.fill_(options.noise_initial * part)
         fraction = linear_schedule(steps, options.lr_steps, options.lr_final)
         set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
     def fit_latent_range(self) -> None:
-        """Set the range of z to the central `latent_coverage` of the encoded stored actions."""
+        """Set the range of z to the central `latent_coverage` of stored actions, encoded.
+
+        With `change_unit="stored"`, also set the unit of the predicted change. With that or with
+        `correction_error="latest"`, set the codec's error to that of the same actions.
+        """
         sample = self.buffer.sample(4096)
+        state, discrete = sample["state"], sample["discrete"]
+        has_new_unit = self.options.change_unit == "stored" and not self.codec.is_change_bounded
+        if has_new_unit:
+            self.codec.set_change_scale(scale_of(sample["next_state"] - state))
         with torch.no_grad():
-            mean, log_variance = self.codec.encode(sample["state"], sample["discrete"], sample["unit"])
+            mean, log_variance = self.codec.encode(state, discrete, sample["unit"])
             # Samples, not means: in a dimension that the codec does not use, all means are alike, and mapping their
             # narrow range onto [-1, 1] would blow up differences that mean nothing.
             z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
+            if self.options.correction_error == "latest" or has_new_unit:
+                change = self.codec.scaled_change(state, sample["next_state"])
+                self.dynamics_error.copy_(F.mse_loss(self.codec.change(state, discrete, z), change))
         tail = (1.0 - self.options.latent_coverage) / 2.0
         low, high = z.quantile(tail, 0), z.quantile(1.0 - tail, 0)
         self.codec.z_low.copy_(low)

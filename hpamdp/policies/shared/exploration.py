@@ -33,8 +33,11 @@ def with_exploring_noise(unit_actions: Tensor, deviation: float) -> Tensor:
 
 
 def linear_schedule(time: int, over: int, final: float) -> float:
-    """Return a fraction that falls linearly from 1 to `final` within a time `over`, both in the same unit."""
-    return 1.0 + (final - 1.0) * min(1.0, time / max(1, over))
+    """Return a fraction that falls linearly from 1 to `final` within a time `over`, both in the same unit.
+
+    If `over` is 0, it has fallen at once.
+    """
+    return 1.0 + (final - 1.0) * (min(1.0, time / over) if over > 0 else 1.0)
 
 
 def cosine_schedule(time: int, over: int) -> float:
