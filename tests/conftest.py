@@ -15,7 +15,12 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import ConfigRepository
+from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.object_type import ObjectType
+from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig
 
 from hpamdp.cli import main
@@ -37,8 +42,9 @@ torch.set_num_threads(1)
 CONF = Path(__file__).resolve().parent.parent / "conf"
 CROSSING = Path(__file__).resolve().parent.parent / "examples" / "crossing"
 sys.path.insert(0, str(CROSSING))
-# The word that adds the tests' own yaml files and that of the example.
-OWN = f"hydra.searchpath=[file://{Path(__file__).resolve().parent / 'conf'},file://{CROSSING / 'conf'}]"
+# The folders of the tests' own yaml files and of that of the example, and the word that adds them.
+OWN_FOLDERS = (Path(__file__).resolve().parent / "conf", CROSSING / "conf")
+OWN = f"hydra.searchpath=[{','.join(f'file://{folder}' for folder in OWN_FOLDERS)}]"
 
 
 def compose_config(overrides: Sequence[str]) -> DictConfig:
@@ -53,9 +59,46 @@ def compose_config(overrides: Sequence[str]) -> DictConfig:
 
 @cache
 def _composed(*overrides: str) -> DictConfig:
-    """Compose each config once: Hydra takes a tenth of a second, which is longer than many tests."""
+    """Compose the words of each test once."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", [*overrides], return_hydra_config=True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def yaml_files_read_once() -> Iterator[None]:
+    """Have Hydra read and merge the project's own yaml files once for the same choices.
+
+    A composition takes a tenth of a second, which is longer than most tests. Hydra applies the values of a test's words
+    each time. Files in other folders may change, so they are read each time.
+    """
+    read, merge = ConfigRepository.load_config, ConfigLoaderImpl._compose_config_from_defaults_list
+    own = {"hydra.conf", "", *map(str, (CONF, *OWN_FOLDERS))}
+    files: dict[object, ConfigResult | None] = {}
+    merged: dict[object, DictConfig] = {}
+
+    def read_once(repository, config_path):
+        source = repository._find_object_source(config_path, ObjectType.CONFIG)
+        if source is None or source.scheme() == "structured" or source.path not in own:
+            return read(repository, config_path)
+        if (source.path, config_path) not in files:
+            files[source.path, config_path] = read(repository, config_path)
+        return files[source.path, config_path]
+
+    def merge_once(loader, defaults, repo):
+        places = tuple(source.path for source in repo.get_sources())
+        stored = {group: names for group, names in ConfigStore.instance().repo.items() if group != "hydra"}
+        given = (places, repr(defaults), repr(stored))
+        if given in merged:
+            return copy.deepcopy(merged[given])
+        config = merge(loader, defaults, copy.deepcopy(repo))  # which it changes
+        if own.issuperset(places):
+            merged[given] = copy.deepcopy(config)
+        return config
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ConfigRepository, "load_config", read_once)
+        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", merge_once)
+        yield
 
 
 def make_config(overrides: Sequence[str]) -> Config:
