@@ -174,6 +174,39 @@ def forked(function: Callable[..., object], *arguments: object) -> int | None:
     return child.exitcode
 
 
+# Imported before workers are forked: what a run with workers needs, with Numba, which problems import.
+WORKER_MODULES = ("hpamdp.run.collection.multi", "hpamdp.env.kernels", "hpamdp.env.gymnasium.environment")
+
+
+@contextmanager
+def forked_workers() -> Iterator[None]:
+    """Start worker processes as forks of one process that has imported what they need.
+
+    By default each of them spends seconds on its imports. Arguments of the processes are pickled either way.
+    """
+    from hpamdp.env.gymnasium import processes
+
+    before = multiprocessing.get_start_method()
+    spawned = processes.AsyncVectorEnv
+    multiprocessing.set_forkserver_preload([*WORKER_MODULES])
+    multiprocessing.set_start_method("forkserver", force=True)
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                processes, "AsyncVectorEnv", lambda *args, **more: spawned(*args, **{**more, "context": "forkserver"})
+            )
+            yield
+    finally:
+        multiprocessing.set_start_method(before, force=True)
+
+
+@pytest.fixture
+def quick_workers() -> Iterator[None]:
+    """Have a test start its workers as `forked_workers`."""
+    with forked_workers():
+        yield
+
+
 @pytest.fixture
 def command(tmp_path, monkeypatch, capsys):
     """Run the command line in an empty folder and return its exit code, its stdout and its stderr."""

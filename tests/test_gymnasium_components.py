@@ -155,7 +155,7 @@ def test_a_component_that_has_no_such_action_is_told_in_one_line(discrete, line)
         env.step(action(env, [1, 1], torch.zeros(2, 2)))
 
 
-def test_processes_take_the_same_steps_with_several_components():
+def test_processes_take_the_same_steps_with_several_components(quick_workers):
     one, other = make("choice and an order", 3, num_workers=0), make("choice and an order", 3, num_workers=2)
     policy = Random(PAMDPSpecs.from_env(one)).policy
     try:

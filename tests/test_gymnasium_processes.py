@@ -28,7 +28,7 @@ def toys(num_workers: int) -> GymnasiumEnv:
 
 
 @pytest.mark.parametrize("maker", [toys, pytest.param(masked, marks=pytest.mark.slow)])
-def test_processes_give_the_same_steps_as_one_process(maker):
+def test_processes_give_the_same_steps_as_one_process(maker, quick_workers):
     one, other = maker(0), maker(2)
     generator = torch.Generator().manual_seed(0)
     try:
@@ -52,7 +52,7 @@ def test_processes_give_the_same_steps_as_one_process(maker):
 
 
 @pytest.mark.parametrize("where", ["constructor", "step"])
-def test_a_fault_in_a_worker_is_told_as_in_one_process(where, recwarn):
+def test_a_fault_in_a_worker_is_told_as_in_one_process(where, quick_workers, recwarn):
     if where == "constructor":  # which fails in this process first, where the spaces are read
         with pytest.raises(EnvironmentFaultError, match="its constructor raised ValueError"):
             faulty(where)

@@ -319,7 +319,7 @@ def test_a_run_that_chooses_lengths_resumes_to_the_last_bit(high, low, tmp_path,
 
 
 @pytest.mark.parametrize("ahead", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_workers_choose_lengths_and_resume_to_the_last_bit(ahead, tmp_path, monkeypatch):
+def test_workers_choose_lengths_and_resume_to_the_last_bit(ahead, quick_workers, tmp_path, monkeypatch):
     given = [*words_of("meta_critic", "hppo"), *RESUMED, "collector=multi", f"collector.ahead={str(ahead).lower()}"]
     stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
 
