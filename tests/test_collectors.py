@@ -16,7 +16,8 @@ from contextlib import closing, suppress
 
 import pytest
 import torch
-from conftest import CONF, OF_EACH_KIND, TRAINED, compose_config, make_config
+from conftest import CONF, OF_EACH_KIND, TRAINED, compose_config, forked_workers, make_config
+from test_grid import SHORT
 
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
@@ -40,7 +41,9 @@ from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, call_
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
+# By default the updates of long runs are compiled, which takes much longer than these tests.
 SMALL = ["num_envs=8", "steps_per_batch=4", "eval.layouts=4", "low=hppo", "low.minibatch_size=16"]
+SMALL += ["compile_updates=false"]
 GYMNASIUM = ["env.id=hpamdp/BoatDock-v0", "env.kwargs={controller:congruent}", "env.max_steps=9"]
 WORKERS = [
     "multi",
@@ -83,7 +86,9 @@ def assert_same_state(one, other):
 
 @pytest.fixture(scope="module", params=WORKERS)
 def workers(request, tmp_path_factory):
-    parts, collection = make(tmp_path_factory.mktemp(request.param), f"collector={request.param}")
+    # `test_batches_ahead_are_made_by_the_policy_from_before_the_last_update` starts its worker as runs do.
+    with forked_workers():
+        parts, collection = make(tmp_path_factory.mktemp(request.param), f"collector={request.param}")
     yield parts, collection
     collection.close()
     wait_until(lambda: not multiprocessing.active_children(), seconds=30)
@@ -148,8 +153,9 @@ def test_workers_have_the_priority_of_the_learner_that_waits_for_them(workers):
 )
 def test_a_copy_takes_all_that_a_policy_acts_by(low):
     warmup = ["low.warmup_steps=8"] if low in ("hyar", "hsac", "iql", "pdqn", "qpamdp", "td3_bc") else []
-    warmup += ["low.codec_pretrain_updates=2"] if low == "hyar" else []
-    config = make_config(["num_envs=8", "steps_per_batch=8", "eval.layouts=4", "high=ucb", f"low={low}", *warmup])
+    small = [word for word in SHORT.get(low, []) if "warmup_steps" not in word]
+    sizes = ["num_envs=8", "steps_per_batch=8", "eval.layouts=4", "compile_updates=false"]
+    config = make_config([*sizes, "high=ucb", f"low={low}", *small, *warmup])
     parts = assemble(config)
     collection = config.collector.build(config=config, parts=parts, frames=0)
     torch.manual_seed(1)
@@ -263,7 +269,7 @@ def test_a_frozen_presser_goes_with_the_share(tmp_path):
         ),
     ],
 )
-def test_what_workers_cannot_do_is_refused(overrides, message, tmp_path):
+def test_what_workers_cannot_do_is_refused(overrides, message, quick_workers, tmp_path):
     with pytest.raises(ConfigError, match=message):
         run(compose_config([*SMALL, *overrides]), tmp_path)
 
@@ -430,7 +436,7 @@ def test_a_shard_elsewhere_finds_the_users_classes_after_all_packages(tmp_path, 
     assert type(pickle.loads(sent).shard).__name__ == "Own"
 
 
-def test_a_worker_that_is_killed_is_replaced(workers):
+def test_a_worker_that_is_killed_is_replaced(workers, quick_workers):
     collection = workers[1]
     collection.options = WorkerOptions(max_restarts=1)
     assert collection.next().shape == (8, 4)
