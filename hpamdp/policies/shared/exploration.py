@@ -27,7 +27,7 @@ class EpsilonOptions(ParameterNoiseOptions):
     """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
 
 
-def with_exploring_noise(unit_actions: Tensor, deviation: float) -> Tensor:
+def with_exploring_noise(unit_actions: Tensor, deviation: float | Tensor) -> Tensor:
     """Return parameters in [-1, 1], of any shape, with Gaussian noise of this standard deviation."""
     return (unit_actions + deviation * torch.randn_like(unit_actions)).clamp(-1.0, 1.0)
 
