@@ -26,7 +26,7 @@ SHORT = {
         *("low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16", "low.hidden_dims=[16,16]"),
         *("low.num_samples=16", "low.num_elites=4", "low.num_iterations=2"),
     ],
-    "hppo": ["low.minibatch_size=16"],
+    "hppo": ["low.minibatch_size=16", "low.epochs=2"],
     "iql": ["low.warmup_steps=64", "low.batch_size=16"],
     "td3_bc": ["low.warmup_steps=64", "low.batch_size=16"],
     "hsac": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
