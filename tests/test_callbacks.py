@@ -441,25 +441,3 @@ def test_a_new_run_does_not_overwrite_a_best_agent_that_a_killed_run_left(tmp_pa
         start(tmp_path)
     assert start(tmp_path, "overwrite=true") == 0
     assert not (tmp_path / "best.pt").exists()
-
-
-def test_classes_of_a_user_that_values_name_are_imported_without_stand_ins(tmp_path):
-    from test_stand_ins import python
-
-    (tmp_path / "conf/callback").mkdir(parents=True)
-    (tmp_path / "conf/low").mkdir()
-    (tmp_path / "conf/callback/mine.yaml").write_text("_target_: mine.Mine\n")
-    (tmp_path / "conf/low/own.yaml").write_text("_target_: mine.Own\nbudget: {eval_every: 0}\n")
-    (tmp_path / "mine.py").write_text(
-        "import numpy as np\nfrom hpamdp.policies.low_level.random import Random\n"
-        "from hpamdp.run.callbacks import Callback\n\n\n"
-        "class Mine(Callback):\n    def __init__(self, weight: float = float(np.sqrt(4.0))):\n"
-        "        self.weight = weight\n\n    def metrics(self, trainer):\n        return {'weight': self.weight}\n\n\n"
-        "class Own(Random):\n    pass\n"
-    )
-    (tmp_path / "go.py").write_text("import sys\nfrom hpamdp.cli import main\nsys.path.insert(0, '.')\nmain()\n")
-    words = ["--config-dir", "conf", "env=platform", "high=uniform", "low=random", "+env.grouping=default"]
-    words += ["+low.per_option={jump: own}", "callbacks=[mine]", "total_frames=64", "num_envs=4", "steps_per_batch=8"]
-    done = python("go.py", *words, "eval.layouts=4", "film=false", "hydra.run.dir=out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert {row["own/weight"] for row in rows_of(tmp_path / "out")} == {"2.0"}

@@ -1,5 +1,6 @@
 """Classes read with stand-ins for slow libraries tell the same as the real ones, and leave nothing behind."""
 
+import csv
 import json
 import os
 import subprocess
@@ -64,19 +65,28 @@ except SystemExit as end:
     assert done.stdout == "2 False False\n" and done.stderr.count("\n") == 1, done.stderr
 
 
-def test_classes_of_a_user_are_imported_without_stand_ins(tmp_path):
-    (tmp_path / "conf/low").mkdir(parents=True)
-    (tmp_path / "conf/low/mine.yaml").write_text("_target_: mine.Mine\nbudget: {eval_every: 0}\n")
+def test_classes_of_a_user_that_groups_and_values_name_are_imported_without_stand_ins(tmp_path):
+    for group, name in (("low", "Mine"), ("low", "Own"), (CALLBACK, "Weight")):
+        file = tmp_path / "conf" / group / f"{name.lower()}.yaml"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(f"_target_: mine.{name}\n" + ("budget: {eval_every: 0}\n" if group == "low" else ""))
     (tmp_path / "mine.py").write_text(
-        "from abc import ABC\nimport numpy as np\nfrom hpamdp.policies.low_level.random import Random\n\n\n"
+        "from abc import ABC\nimport numpy as np\nfrom hpamdp.policies.low_level.random import Random\n"
+        "from hpamdp.run.callbacks import Callback\n\n\n"
         "class Mine(Random, ABC):\n    def __init__(self, specs, *, weight: float = float(np.sqrt(4.0))):\n"
-        "        super().__init__(specs)\n        self.weight = weight\n"
+        "        super().__init__(specs)\n        self.weight = weight\n\n\n"
+        "class Own(Random):\n    pass\n\n\n"
+        "class Weight(Callback):\n    def __init__(self, weight: float = float(np.sqrt(9.0))):\n"
+        "        self.weight = weight\n\n    def metrics(self, trainer):\n        return {'weight': self.weight}\n"
     )
-    words = ["--config-dir", "conf", "low=mine", "env=platform"]
+    words = ["--config-dir", "conf", "low=mine", "env=platform", "high=uniform", "+env.grouping=default"]
+    words += ["+low.per_option={jump: own}", "callbacks=[weight]"]
     short = ["total_frames=64", "num_envs=4", "steps_per_batch=8", "eval.layouts=4", "film=false"]
     run = "import sys\nfrom hpamdp.cli import main\nsys.path.insert(0, '.')\nmain()\n"
     (tmp_path / "go.py").write_text(run)
     done = python("go.py", *words, *short, "hydra.run.dir=out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert yaml.safe_load((tmp_path / "out/config.yaml").read_text())["low"]["weight"] == 2.0
+    with (tmp_path / "out/metrics.csv").open() as file:
+        assert {row["own/weight"] for row in csv.DictReader(file)} == {"3.0"}
     assert "low=mine has the settings weight" in python("go.py", *words, "--help", cwd=tmp_path).stdout
