@@ -121,10 +121,10 @@ def test_a_selector_that_ends_options_trains_and_is_evaluated(high, tmp_path):
     )
     words = QUICK_CRITIC if high == "meta_critic" else [f"high={high}", *words]
     low = ["low=pdqn", *SHORT["pdqn"]]
-    config = make_config([*SMALL, "env=rooms", *low, *words, "agent.termination=learned"])
+    config = make_config([*SMALL, "env=rooms", "env.max_steps=12", *low, *words, "agent.termination=learned"])
     parts = train(config, tmp_path / "run")
     played = parts.evaluation.run(parts.agent.policy)
-    assert played["steps"].max() <= 50
+    assert played["steps"].max() <= 12
 
 
 def test_frozen_learners_play_whole_episodes_so_that_options_cannot_be_shorter(tmp_path):

@@ -427,8 +427,8 @@ def test_the_option_after_a_batch_is_chosen_with_what_the_selector_remembers():
 @pytest.mark.parametrize("high", ["actor", "meta_critic"])
 def test_a_run_of_a_selector_with_a_recurrent_memory_resumes_to_the_last_bit(high, tmp_path, monkeypatch):
     words = [
-        *words_of(high, "random"), "env=rooms", "agent.termination=steps", "agent.option_length=2", "high.memory=gru",
-        "high.memory_size=8",
+        *words_of(high, "random"), "env=rooms", "env.max_steps=12", "agent.termination=steps", "agent.option_length=2",
+        "high.memory=gru", "high.memory_size=8",
     ]  # fmt: skip
     stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)
 
