@@ -1062,16 +1062,57 @@ def options() -> list[Claim]:
 
 
 def peers() -> list[Claim]:
-    xuance = rows("peers/results.csv", library="xuance")
-    counts = [len(runs) for runs in groups(rows("peers/results.csv"), "learner").values()]
-    numbers = dict(fewest=min(counts), most=max(counts), steps=xuance[0]["frames"])
+    def last(library: str, learner: str) -> dict[str, list[float]]:
+        """Return the last scores of the seeds, for each way to act."""
+        runs = [row for row in rows("peers/curves.csv", library=library) if row["learner"].split()[0] == learner]
+        by_acts: dict[str, list[float]] = {}
+        for (acts, _), run in groups(runs, "acts", "seed").items():
+            by_acts.setdefault(acts, []).append(max(run, key=lambda row: row["cpu_s"])["score"])
+        return by_acts
+
+    def steps_a_second(library: str, learner: str) -> float:
+        runs = [row for row in rows("peers/speed.csv", library=library) if row["learner"].split()[0] == learner]
+        ways = {row["acts"] for row in runs}.intersection(study("peers").SHOWN)
+        shown = [row for row in runs if row["acts"] in ways]
+        return float(np.mean([study("peers").steps_a_second(run) for run in groups(shown, "seed").values()]))
+
+    scores = {
+        name: last(library, name)["greedy"]
+        for library, name in (("xuance", "mpdqn"), ("hpamdp", "pdqn_published"), ("hpamdp", "pdqn"))
+    }
+    (hppo,) = last("hpamdp", "hppo").values()
+    di_engine = max(last("di-engine", "hppo").values(), key=np.mean)
+    numbers = dict(
+        limit=rows("peers/curves.csv")[0]["limit_s"],
+        seeds=len(scores["mpdqn"]),
+        platform={name: span(values, ".3f") for name, values in scores.items()},
+        hppo=span(hppo, ".2f"),
+        di_engine=span(di_engine, ".2f"),
+        speed={
+            name: steps_a_second(*name.split("/"))
+            for name in ("hpamdp/pdqn_published", "xuance/mpdqn", "hpamdp/hppo", "di-engine/hppo")
+        },
+    )
     return [
         Claim(
             page("peers"),
-            "With {fewest:word} or {most:word} seeds each, nothing can be ranked. After {steps:,} steps XuanCe's "
-            "MP-DQN does not arrive yet,",
+            "On Platform, after {limit:.0f} CPU seconds and with {seeds:word} seeds each, XuanCe's MP-DQN returns "
+            "{platform[mpdqn]}, hpamdp's MP-DQN with its published settings {platform[pdqn_published]}, and `pdqn` "
+            "{platform[pdqn]}.",
             numbers,
-            holds=max(column(xuance, "success")) == 0.0,
+        ),
+        Claim(
+            page("peers"),
+            "On Moving hpamdp's H-PPO returns {hppo}, and DI-engine's {di_engine} in the best of its ways to act.",
+            numbers,
+            holds=min(hppo) > max(di_engine),
+        ),
+        Claim(
+            page("peers"),
+            "With the same updates, hpamdp's MP-DQN makes {speed[hpamdp/pdqn_published]:,.0f} steps in a CPU second "
+            "where XuanCe's makes {speed[xuance/mpdqn]:,.0f}, and hpamdp's H-PPO {speed[hpamdp/hppo]:,.0f} where "
+            "DI-engine's makes {speed[di-engine/hppo]:,.0f}.",
+            numbers,
         ),
     ]
 

@@ -1,0 +1,120 @@
+"""The study of other libraries' learners: the clock that all of them share, and the tables."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+import torch
+
+from hpamdp import keys
+from hpamdp.analysis.study import read_csv
+
+PEERS = Path(__file__).resolve().parent.parent / "experiments" / "peers"
+
+
+def module(name):
+    file = PEERS / f"{name}.py"
+    if not file.exists():
+        pytest.skip("the studies are in the repository, not in the source distribution")
+    spec = importlib.util.spec_from_file_location(f"peers_{name}", file)
+    found = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(found)
+    return found
+
+
+@pytest.fixture
+def protocol(monkeypatch):
+    found = module("protocol")
+    monkeypatch.setattr(found, "EPISODES", 8)
+    return found
+
+
+class Clock:
+    """CPU seconds that pass only when a test says so."""
+
+    now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+def leap(td):
+    td.set(keys.DISCRETE, torch.full(td.batch_size, 2))
+    return td.set(keys.PARAMETERS, torch.tensor([3.0, 10.0, 400.0]).expand(*td.batch_size, 3))
+
+
+def measured(protocol, monkeypatch, file, limit=40.0, cost_of_scoring=0.0):
+    clock = Clock()
+    monkeypatch.setattr(protocol, "cpu_seconds", clock)
+
+    def slow(td):
+        clock.now += cost_of_scoring
+        return leap(td)
+
+    return clock, protocol.Curve("platform", {"greedy": slow}, {"library": "x", "seed": 300}, file, limit)
+
+
+def test_the_time_of_an_evaluation_is_not_part_of_the_time_of_training(protocol, monkeypatch, tmp_path):
+    clock, curve = measured(protocol, monkeypatch, tmp_path / "a.csv", cost_of_scoring=50.0)
+    curve.begin()
+    for steps in range(10, 90, 10):
+        clock.now += 5.0
+        assert curve.after(steps) == (steps == 80)
+    curve.end(80)
+    rows = read_csv(tmp_path / "a.csv")
+    assert [row["cpu_s"] for row in rows] == [0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0]
+    assert [row["steps"] for row in rows] == list(range(0, 90, 10))
+
+
+def test_evaluations_become_rarer_and_a_learner_that_ends_early_is_scored_at_its_end(protocol, monkeypatch, tmp_path):
+    clock, curve = measured(protocol, monkeypatch, tmp_path / "a.csv", limit=600.0)
+    curve.begin()
+    for steps in range(1, 200):
+        clock.now += 1.0
+        assert not curve.after(steps)
+    clock.now += 0.5
+    curve.end(199)
+    times = [row["cpu_s"] for row in read_csv(tmp_path / "a.csv")]
+    assert times[-1] == 199.5 and times[:4] == [0.0, 5.0, 10.0, 15.0]
+    assert max(times[i + 1] - times[i] for i in range(len(times) - 1)) > 20.0
+
+
+def test_every_evaluation_plays_the_same_episodes_and_leaves_the_random_numbers_alone(protocol, tmp_path):
+    curve = protocol.Curve("platform", {"greedy": leap}, {}, tmp_path / "a.csv")
+    state = torch.get_rng_state()
+    for _ in range(2):
+        curve._score(0, 0.0)
+    assert curve.rows[0] == curve.rows[1] and curve.rows[0]["score"] > 0.0
+    assert torch.equal(state, torch.get_rng_state())
+
+
+def row(seed, cpu_s, steps, score, learner="pdqn"):
+    name = {"problem": "platform", "library": "hpamdp", "version": "1", "learner": learner, "acts": "greedy"}
+    return {**name, "seed": seed, "limit_s": 600.0, "cpu_s": cpu_s, "steps": steps, "score": score, "success": score}
+
+
+def test_a_score_at_a_time_is_the_last_one_within_it_and_the_end_of_the_time_comes_a_batch_later():
+    study = module("study")
+    run = [row(300, cpu_s, 0, cpu_s / 1000) for cpu_s in (0.0, 50.0, 110.0, 601.0)]
+    assert [study.at(run, cpu_s)["cpu_s"] for cpu_s in (60.0, 120.0, 599.0, 600.0)] == [50.0, 110.0, 110.0, 601.0]
+
+
+def test_the_tables_have_a_line_for_each_learner_with_means_over_seeds_and_steps_after_the_warm_up():
+    study = module("study")
+    rows = [
+        row(seed, cpu_s, steps, score)
+        for seed, best in ((300, 0.9), (301, 1.0))
+        for cpu_s, steps, score in ((0.0, 0, 0.0), (10.0, 5000, 0.5), (110.0, 15000, best))
+    ]
+    _, _, line = study.scores_table(rows).splitlines()
+    scores = "0.500 ± 0.000 | 0.950 ± 0.071 | 0.950 ± 0.071 | 0.950 ± 0.071"
+    assert line.startswith(f"| Platform | hpamdp 1 | pdqn | greedy | 2 | {scores} |")
+    assert line.endswith("| 110 s | 15,000 |")
+    assert study.speed_table(rows).splitlines()[-1] == "| hpamdp 1 | pdqn | 100, 100 | 100 |"
+
+
+def test_curves_of_trainings_of_different_lengths_are_refused():
+    study = module("study")
+    longer = row(301, 0.0, 0, 0.0) | {"limit_s": 900.0}
+    with pytest.raises(ValueError, match=r"limit_s=\[600\.0, 900\.0\]: must be the same"):
+        study.scores_table([row(300, 0.0, 0, 0.0), longer])
