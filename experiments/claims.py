@@ -352,7 +352,7 @@ def hierarchy() -> list[Claim]:
         numbers_of,
         (runs("actor", uniform=1_000_000), runs("meta_critic"), runs("linucb"), runs("linucb", uniform=1_000_000)),
     )
-    # After half of the presses: selectors that find one boat, and those that see the layout.
+    # After half of the presses: selectors that find one boat, and selectors that see the layout.
     half = 2_000_000
     one_boat = runs(("ucb", "thompson", "epsilon_greedy", "exp3"), half)
     seeing = means(runs(("meta_critic", "linucb", "lin_thompson"), half), "high")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from pathlib import Path
 
 import torch
+from scripts import load_script
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -56,10 +56,7 @@ RECORDED = {
 
 
 def load_replay():
-    spec = importlib.util.spec_from_file_location("replay", REPLAY)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(REPLAY)
 
 
 def action(key, duration) -> TensorDict:

@@ -1,26 +1,18 @@
 """The numbers in the pages' sentences are those of the csv files."""
 
-import importlib.util
 import re
-import sys
 from pathlib import Path
 
 import pytest
+from scripts import load_script
 
 EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
 PART = {"*.md": re.compile(r"^\*\*Answer\.\*\*.*", re.MULTILINE | re.DOTALL)}
 
 
 def load(name: str, monkeypatch: pytest.MonkeyPatch):
-    script = EXPERIMENTS / f"{name}.py"
-    if not script.exists():
-        pytest.skip("the studies are in the repository, not in the source distribution")
     monkeypatch.syspath_prepend(EXPERIMENTS)
-    spec = importlib.util.spec_from_file_location(name, script)
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, name, module)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(EXPERIMENTS / f"{name}.py")
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """The pages of the site: one for each learner, selector and domain, made of the repository's own files."""
 
-import importlib.util
 import json
 import os
 import re
@@ -10,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 from conftest import TRAINED, choices, forked, make_config
+from scripts import load_script
 
 import hpamdp
 from hpamdp import cli
@@ -31,10 +31,7 @@ ALL = [(group, name) for group in FOLDERS for name in choices(group)]
 @pytest.fixture
 def hooks(monkeypatch):
     """The module docs/hooks.py, which mkdocs loads."""
-    spec = importlib.util.spec_from_file_location("site_hooks", DOCS / "hooks.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(DOCS / "hooks.py")
 
 
 def page(group: str, name: str) -> Path:

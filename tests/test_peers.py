@@ -1,10 +1,10 @@
 """The study of other libraries' learners: the clock that all of them share, and the tables."""
 
-import importlib.util
 from pathlib import Path
 
 import pytest
 import torch
+from scripts import load_script
 
 from hpamdp import keys
 from hpamdp.analysis.study import read_csv
@@ -13,13 +13,7 @@ PEERS = Path(__file__).resolve().parent.parent / "experiments" / "peers"
 
 
 def module(name):
-    file = PEERS / f"{name}.py"
-    if not file.exists():
-        pytest.skip("the studies are in the repository, not in the source distribution")
-    spec = importlib.util.spec_from_file_location(f"peers_{name}", file)
-    found = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(found)
-    return found
+    return load_script(PEERS / f"{name}.py")
 
 
 @pytest.fixture

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import os
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from batched_players import action, agrees, play, random_player
+from scripts import load_script
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -223,11 +222,7 @@ def test_references_are_those_of_the_published_limit_alone(make):
 
 
 def load_replay():
-    spec = importlib.util.spec_from_file_location("domains_replay", REPLAY)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_script(REPLAY)
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,10 @@
 """The report of all studies: renewed tables, one page that needs no other file, failures that stop nothing else."""
 
-import importlib.util
 import sys
 from pathlib import Path
 
 import pytest
+from scripts import load_script
 
 SCRIPT = Path(__file__).resolve().parent.parent / "experiments" / "report.py"
 STUDY = """
@@ -47,12 +47,7 @@ SECOND_TABLE = "| c |\n|---|\n| 3 |"
 
 @pytest.fixture(scope="module")
 def module():
-    if not SCRIPT.exists():
-        pytest.skip("the studies are in the repository, not in the source distribution")
-    spec = importlib.util.spec_from_file_location("report", SCRIPT)
-    loaded = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(loaded)
-    return loaded
+    return load_script(SCRIPT)
 
 
 @pytest.fixture

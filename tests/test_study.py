@@ -1,6 +1,5 @@
 """What studies make of finished runs: files gathered, seeds as the unit of the statistics."""
 
-import importlib.util
 import json
 import math
 import os
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scripts import load_script
 
 from hpamdp.analysis.study import (
     Run,
@@ -32,13 +32,7 @@ CONFIG = (
 
 
 def study(name):
-    file = EXPERIMENTS / name / "study.py"
-    if not file.exists():
-        pytest.skip("the studies are in the repository, not in the source distribution")
-    spec = importlib.util.spec_from_file_location(f"study_{name}", file)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(EXPERIMENTS / name / "study.py")
 
 
 def leave_run(folder, low="hppo", seed=0, scores=(-0.9, 1.5, 2.5), high="none", finished=True, **config):

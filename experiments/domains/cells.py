@@ -60,6 +60,7 @@ def runs(names: Sequence[str]) -> Iterator[tuple[Path, list[str]]]:
                     "film=false",
                     "hydra.mode=RUN",
                     f"hydra.run.dir={folder}",
+                    "resume=auto",
                 ],
             )
 
@@ -72,10 +73,9 @@ def is_finished(folder: Path) -> bool:
 def train(folder: Path, arguments: Sequence[str]) -> bool:
     """Run a command with one thread, its output in a file beside the run. Return whether it succeeded."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    resume = ["resume=auto"] if folder.exists() else []
     with folder.with_suffix(".log").open("w") as log:
         threads = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-        command = [sys.executable, str(ROOT / "run.py"), *arguments, *resume]
+        command = [sys.executable, str(ROOT / "run.py"), *arguments]
         done = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=os.environ | threads)
     return done.returncode == 0
 

@@ -131,7 +131,7 @@ def merged(stored: Rows, new: Rows) -> Rows:
 
 
 def scored_once(results: Rows) -> Rows:
-    """Return each learner's runs with seeds that ran once on each domain, or its earlier runs if there are none."""
+    """Return each learner's runs with seeds that ran once on each domain, else its earlier runs."""
     chosen: Rows = []
     for rows in groups(results, "domain", "learner").values():
         chosen += [row for row in rows if row["seed"] >= FIRST_SEED] or rows

@@ -67,7 +67,7 @@ def random_discrete(
 
 
 def with_fixed(unit_parameters: Tensor, is_fixed: Tensor | None) -> Tensor:
-    """Return parameters `[*B, num_parameters]` in [-1, 1] with 0 for those that have a single value in their state.
+    """Return parameters `[*B, num_parameters]` in [-1, 1] with 0 where the state leaves a single value.
 
     They are stored as 0, so critics have seen no other number there.
 
