@@ -14,7 +14,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner, is_greedy, option_ends
+from hpamdp.acting import is_greedy
+from hpamdp.policies.base import Learner, option_ends
 from hpamdp.policies.shared.hybrid_actor import HybridActor
 from hpamdp.policies.shared.networks import mlp
 from hpamdp.settings import PositiveFraction

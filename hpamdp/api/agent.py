@@ -12,9 +12,10 @@ import torch
 from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType
 
 from hpamdp import keys
+from hpamdp.acting import acting
 from hpamdp.api.arguments import path_argument, problem_arguments
 from hpamdp.api.export import export_onnx
 from hpamdp.config.compose import read
@@ -118,7 +119,7 @@ class Agent:
             raise ValueError(f"act: {error}") from error
         seen = self._seen(fresh.to(self._env.device))
         exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
-        with set_exploration_type(exploration), torch.no_grad():
+        with acting(exploration), torch.no_grad():
             self._last = self.policy(seen)
         self._starts[:] = False
         return self._form.write(self._last, is_batch=is_batch)

@@ -19,9 +19,10 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType
 
 from hpamdp import __version__, keys
+from hpamdp.acting import acting
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import OptionLength
@@ -170,7 +171,7 @@ def export_onnx(
     if missing:
         raise ConfigError(f"export: {' and '.join(missing)} not installed; pip install 'hpamdp[onnx]'")
     _check_levels(agent)
-    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad(), _quiet():
+    with acting(ExplorationType.DETERMINISTIC), torch.no_grad(), _quiet():
         step = GreedyStep(agent, env.gymnasium_form().scaling(), option_length)
         if agent.option_lengths:
             about = {"option_lengths": agent.option_lengths, **about}

@@ -9,9 +9,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType
 
 from hpamdp import keys
+from hpamdp.acting import acting
 from hpamdp.env.base import PAMDPEnv
 
 
@@ -112,7 +113,7 @@ class OptionChoiceEnv(PAMDPEnv):
         # What the policy carries from step to step, as a step of the environment alone keeps nothing.
         state_keys = getattr(self._low_policy, "state_keys", [])
         # Episodes that a partial reset did not start again are over: they stay as they are and earn 0.
-        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        with acting(ExplorationType.DETERMINISTIC), torch.no_grad():
             for step in range(self._inner_env.max_steps):
                 acted = self._low_policy(td.set(keys.OPTION, option))
                 td = self._inner_env._step(acted)

@@ -10,10 +10,11 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner, Level, Selector, finished_decisions, is_greedy
+from hpamdp.acting import acting, is_greedy
+from hpamdp.policies.base import Learner, Level, Selector, finished_decisions
 from hpamdp.policies.masks import allowed_or_first
 from hpamdp.policies.option_lengths import OptionLengths, PairSelector
 from hpamdp.specs import PAMDPSpecs
@@ -276,7 +277,7 @@ class AgentNextOptions:
         """
         is_decision = torch.ones(len(td), 1, dtype=torch.bool, device=td.get(keys.OBSERVATION).device)
         td = td.copy().set(keys.IS_DECISION, is_decision).set(keys.OPTION, held)
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
+        with acting(ExplorationType.DETERMINISTIC):
             if self.pairs is not None:
                 return self.pairs.split(self.selector.choose(self.pairs.with_pairs(td))[keys.OPTION])[0]
             option = self.selector.choose(td)[keys.OPTION]

@@ -11,9 +11,9 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
+from hpamdp.acting import is_greedy
 from hpamdp.policies.masks import random_choice
 from hpamdp.policies.stored_rows import check_stored_rows
 from hpamdp.settings import SettingError
@@ -26,11 +26,6 @@ class ActionFeature(Enum):
     COMPONENTS = "an action of several components"
     PAIR_MASK = "a pair_mask, which forbids pairs of discrete actions"
     PARAMETER_BOUNDS = "bounds of the parameters that depend on the state"
-
-
-def is_greedy() -> bool:
-    """Return whether policies must act greedily; otherwise they explore."""
-    return exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
 
 
 def have_stepped(parts: Mapping[str, Any]) -> bool:

@@ -11,9 +11,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType
 
 from hpamdp import keys
+from hpamdp.acting import acting
 from hpamdp.env.base import PAMDPEnv, ProblemError
 from hpamdp.policies.agent import HierarchicalAgent
 
@@ -82,7 +83,7 @@ class Evaluation:
         # A policy that samples even when greedy (a random one) must not move the run's generators.
         with (
             torch.random.fork_rng(devices=[device] if device.type == "cuda" else []),
-            set_exploration_type(ExplorationType.DETERMINISTIC),
+            acting(ExplorationType.DETERMINISTIC),
             torch.no_grad(),
         ):
             torch.manual_seed(self.seed)

@@ -14,9 +14,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType
 
 from hpamdp import keys
+from hpamdp.acting import acting
 from hpamdp.messages import first_line
 from hpamdp.policies.shared.sized_by_data import SizedByData
 from hpamdp.run.tensor_archive import SavedTensor
@@ -322,7 +323,7 @@ def example_steps(env: EnvBase, policy: TensorDictModuleBase) -> TensorDictBase:
             if mask is not None:
                 mask.fill_(True)
     before = {name: buffer.clone() for name, buffer in policy.named_buffers()}
-    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.random.fork_rng():
+    with acting(ExplorationType.DETERMINISTIC), torch.random.fork_rng():
         steps = policy(steps)
     for name, buffer in policy.named_buffers():
         buffer.copy_(before[name])

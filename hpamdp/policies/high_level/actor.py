@@ -29,7 +29,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
+from hpamdp.acting import is_greedy
 from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.policies.shared.networks import mlp
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised

@@ -26,7 +26,7 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
+from hpamdp.acting import is_greedy
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble

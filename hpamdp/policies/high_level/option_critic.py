@@ -31,7 +31,7 @@ from torch.nn import functional as F
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
+from hpamdp.acting import is_greedy
 from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.networks import mlp, polyak_update

@@ -20,7 +20,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.base import Selector, is_greedy
+from hpamdp.acting import is_greedy
+from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.settings import Fraction, Settings
 from hpamdp.specs import PAMDPSpecs

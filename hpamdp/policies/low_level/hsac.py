@@ -42,7 +42,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from hpamdp import keys
-from hpamdp.policies.base import ActionFeature, is_greedy
+from hpamdp.acting import is_greedy
+from hpamdp.policies.base import ActionFeature
 from hpamdp.policies.masks import masked_logits, random_discrete, with_fixed
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor

@@ -58,7 +58,8 @@ from torch.nn import functional as F
 from typing_extensions import Self
 
 from hpamdp import keys
-from hpamdp.policies.base import ActionFeature, is_greedy
+from hpamdp.acting import is_greedy
+from hpamdp.policies.base import ActionFeature
 from hpamdp.policies.low_level.hyar_codec import CodecOptions, HybridCodec
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.actor_critic import TargetRateOptions, set_learning_rates

@@ -31,7 +31,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from hpamdp import keys
-from hpamdp.policies.base import ActionFeature, is_greedy
+from hpamdp.acting import is_greedy
+from hpamdp.policies.base import ActionFeature
 from hpamdp.policies.masks import masked_values, with_fixed
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions, TwinCriticOptions
 from hpamdp.policies.shared.exploration import EpsilonOptions, linear_schedule, with_exploring_noise

@@ -49,7 +49,8 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from hpamdp import keys
-from hpamdp.policies.base import ActionFeature, is_greedy, option_ends
+from hpamdp.acting import is_greedy
+from hpamdp.policies.base import ActionFeature, option_ends
 from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete, with_fixed
 from hpamdp.policies.shared.actor_critic import set_learning_rates
 from hpamdp.policies.shared.actor_search import (

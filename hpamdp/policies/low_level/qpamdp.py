@@ -40,7 +40,8 @@ from torch.nn import functional as F
 from typing_extensions import Self
 
 from hpamdp import keys
-from hpamdp.policies.base import ActionFeature, Learner, is_greedy, option_ends
+from hpamdp.acting import is_greedy
+from hpamdp.policies.base import ActionFeature, Learner, option_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters

@@ -30,7 +30,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hpamdp import keys
-from hpamdp.policies.base import ActionFeature, is_greedy
+from hpamdp.acting import is_greedy
+from hpamdp.policies.base import ActionFeature
 from hpamdp.policies.masks import allowed_rows, masked_logits, with_fixed
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, SmoothedTargetOptions, TargetRateOptions
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise

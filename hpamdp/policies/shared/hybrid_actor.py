@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
+from hpamdp.acting import is_greedy
 from hpamdp.policies.masks import masked_logits
 from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution, ValuePlaces
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, OutputLinear, VectorProducts

@@ -14,7 +14,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from hpamdp import keys
-from hpamdp.policies.base import Selector, is_greedy
+from hpamdp.acting import is_greedy
+from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.bandit import BanditOptions, RewardStatistics
 from hpamdp.settings import Indices, SettingError

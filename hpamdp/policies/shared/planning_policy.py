@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
+from hpamdp.acting import is_greedy
 from hpamdp.policies.masks import random_discrete
 from hpamdp.policies.shared.end_values import EndValueOptions
 from hpamdp.policies.shared.planning import SearchOptions

@@ -12,7 +12,9 @@ from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType
 
+from hpamdp.acting import acting
 from hpamdp.config.schema import Config
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, checked_state
@@ -26,16 +28,17 @@ class SingleCollection(Collection):
         self.env = parts.env
         selector = parts.agent.selector
         pending = None if selector is None else selector.pending.clone()
-        self._collector = Collector(
-            parts.env,
-            parts.policy,
-            frames_per_batch=config.run.num_envs * config.run.steps_per_batch,
-            total_frames=-1,
-            # Otherwise TorchRL casts the whole tensordict twice at every step.
-            device=parts.device,
-            trust_policy=True,
-            auto_register_policy_transforms=False,
-        )
+        with acting(ExplorationType.RANDOM):
+            self._collector = Collector(
+                parts.env,
+                parts.policy,
+                frames_per_batch=config.run.num_envs * config.run.steps_per_batch,
+                total_frames=-1,
+                # Otherwise TorchRL casts the whole tensordict twice at every step.
+                device=parts.device,
+                trust_policy=True,
+                auto_register_policy_transforms=False,
+            )
         if selector is not None and pending is not None:
             selector.pending.copy_(pending)  # TorchRL has just tried the policy, which made no real decisions
         self._batches = iter(self._collector)
@@ -44,7 +47,8 @@ class SingleCollection(Collection):
     def next(self) -> TensorDictBase:
         """Collect a batch."""
         self._is_idle = False
-        batch = next(self._batches)
+        with acting(ExplorationType.RANDOM):
+            batch = next(self._batches)
         self._is_idle = True
         return batch
 

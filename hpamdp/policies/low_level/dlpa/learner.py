@@ -42,7 +42,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp import keys
-from hpamdp.policies.base import ActionFeature, is_greedy, option_ends
+from hpamdp.acting import is_greedy
+from hpamdp.policies.base import ActionFeature, option_ends
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
 from hpamdp.policies.low_level.dlpa.planner import Planner, PlannerOptions
 from hpamdp.policies.shared.end_values import EndValues

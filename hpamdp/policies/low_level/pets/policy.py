@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
+from hpamdp.acting import is_greedy
 from hpamdp.policies.low_level.pets.model import PETSModel, PETSModelOptions
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
