@@ -29,6 +29,8 @@ class Case(NamedTuple):
     heading: float
     duration: float
     fuel: float
+    strength: float = 1.0
+    glide: float = 1.0
 
 
 class Simulated(NamedTuple):
@@ -56,20 +58,21 @@ def cases(sample):
 
 
 def press(batch: list[Case], function=physics.press) -> physics.Press:
-    x, y, goal_x, goal_y, heading, duration, fuel = torch.tensor(batch, dtype=torch.float64).unbind(-1)
+    x, y, goal_x, goal_y, heading, duration, fuel, *boat = torch.tensor(batch, dtype=torch.float64).unbind(-1)
     columns = (x, y, fuel, goal_x, goal_y, heading.cos(), heading.sin(), duration)
-    return function(*(column.to(torch.float32) for column in columns))
+    strength, glide = (column.to(torch.float32) for column in boat)
+    return function(*(column.to(torch.float32) for column in columns), strength=strength, glide=glide)
 
 
 def simulate(case: Case) -> Simulated:
     """Simulate one press in small time steps, given only its acceleration (NumPy, float64)."""
     pressed_for = min(case.duration, case.fuel)
-    # In the glide the speed falls along the same curve, in GLIDE times the time.
+    # In the glide the speed falls along the same curve, in 0.95 * glide times the time.
     dt = pressed_for / NUM_STEPS
     middle = (np.arange(NUM_STEPS) + 0.5) * dt
-    rising = 100.0 * middle**2 - 20.0 / 3.0 * middle**3
+    rising = case.strength * (100.0 * middle**2 - 20.0 / 3.0 * middle**3)
     speeds = np.concatenate([rising, rising[::-1]])
-    steps = np.concatenate([rising * dt, rising[::-1] * dt * 0.95])
+    steps = np.concatenate([rising * dt, rising[::-1] * dt * 0.95 * case.glide])
     way = np.cumsum(steps)
     x = case.x + way * math.cos(case.heading)
     y = case.y + way * math.sin(case.heading)
@@ -118,6 +121,34 @@ def test_small_time_steps_agree_on_many_presses_of_every_outcome():
             assert_agrees(case, expected)
             met[expected.outcome] += 1
     assert min(met.values()) >= 10, met
+
+
+def test_small_time_steps_agree_on_boats_with_other_strength_and_glide():
+    rng = np.random.default_rng(1)
+    met = dict.fromkeys((SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS), 0)
+    for _ in range(150):
+        x, y, goal_x, goal_y = rng.uniform(-75.0, 75.0, 4)
+        if math.hypot(goal_x - x, goal_y - y) < 15.5:
+            continue
+        heading = math.atan2(goal_y - y, goal_x - x) + rng.normal(0.0, 0.4)
+        case = Case(x, y, goal_x, goal_y, heading, rng.uniform(0.3, 1.6), 6.0, *rng.uniform(0.5, 2.0, 2))
+        expected = simulate(case)
+        if expected.margin > 0.1:
+            assert_agrees(case, expected)
+            met[expected.outcome] += 1
+    assert min(met.values()) >= 10, met
+
+
+def test_strength_and_glide_change_the_way_and_the_time_of_a_press_alike():
+    time = torch.linspace(0.0, 1.2, 20_001, dtype=torch.float64)
+    press_time = torch.tensor(0.7, dtype=torch.float64)
+    way = physics.distance_at(press_time, time, strength=1.3, glide=0.7)
+    virtual = torch.where(time <= 0.7, time, 0.7 - (time - 0.7) / (0.7 * physics.GLIDE)).clamp(min=0.0)
+    expected = torch.cumulative_trapezoid(1.3 * physics.speed(virtual), time)
+    torch.testing.assert_close(way[1:], expected, atol=1e-5, rtol=0.0)
+    sailing = (time > 0.01) & (time < 1.16)
+    again = physics.time_at(press_time, way, strength=1.3, glide=0.7)
+    torch.testing.assert_close(again[sailing], time[sailing], atol=1e-5, rtol=0.0)
 
 
 @EACH
@@ -187,7 +218,7 @@ def test_the_distance_is_the_integral_of_the_measured_speed():
 @EACH
 @given(st.lists(cases(), min_size=20, max_size=20))
 def test_turning_the_world_by_180_degrees_and_swapping_the_controller_turns_the_result(batch):
-    x, y, goal_x, goal_y, _, duration, fuel = torch.tensor(batch).unbind(-1)
+    x, y, goal_x, goal_y, _, duration, fuel, *_ = torch.tensor(batch).unbind(-1)
     key = torch.arange(len(batch)) % 3
     # For each key of the incongruent controller, with key map 1 and 2, the opposite key of the congruent controller.
     opposite = torch.tensor([[0, 2, 1], [1, 0, 2]])

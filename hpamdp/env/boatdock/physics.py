@@ -9,6 +9,9 @@ no branch that depends on the data. So the same code runs on CPU and CUDA, eager
 A press accelerates the boat from rest along the key's direction. Then the boat glides to rest: its speed runs back down
 the same curve, stretched in time by GLIDE. The path is a straight segment. So closed forms give the first crossing of
 the dock circle and of the harbour circle, and the speed there.
+
+`press`, `distance_at` and `time_at` take two factors that make a boat unlike people's: `strength` multiplies its speed
+while the key is down, and `glide` multiplies length and duration of its glide. Both are 1 for people's boats.
 """
 
 from __future__ import annotations
@@ -79,22 +82,31 @@ def press_for(distance: Tensor) -> Tensor:
     return duration_for(distance / (1.0 + GLIDE))
 
 
-def distance_at(duration: Tensor, elapsed: Tensor) -> Tensor:
-    """Return the distance (px) covered `elapsed` seconds after the beginning of a press of `duration` seconds."""
+def distance_at(
+    duration: Tensor, elapsed: Tensor, strength: Tensor | float = 1.0, glide: Tensor | float = 1.0
+) -> Tensor:
+    """Return the distance (px) covered `elapsed` seconds after the beginning of a press of `duration` seconds.
+
+    `press` explains `strength` and `glide`.
+    """
     pressed = pressed_distance(torch.minimum(elapsed, duration).clamp(min=0.0))
+    stretch = GLIDE * glide
     # The glide runs back down the speed curve. `virtual` is the press time that would give the speed at that moment.
-    virtual = (duration - (elapsed - duration).clamp(min=0.0) / GLIDE).clamp(min=0.0)
-    return torch.where(elapsed > duration, pressed + GLIDE * (pressed - pressed_distance(virtual)), pressed)
+    virtual = (duration - (elapsed - duration).clamp(min=0.0) / stretch).clamp(min=0.0)
+    glided = stretch * (pressed - pressed_distance(virtual))
+    return strength * torch.where(elapsed > duration, pressed + glided, pressed)
 
 
-def time_at(duration: Tensor, distance: Tensor) -> Tensor:
+def time_at(duration: Tensor, distance: Tensor, strength: Tensor | float = 1.0, glide: Tensor | float = 1.0) -> Tensor:
     """Return the seconds until a press of `duration` seconds has covered `distance` px: the inverse of `distance_at`.
 
-    If the boat comes to rest before, return the time at which it does.
+    If the boat comes to rest before, return the time at which it does. `press` explains `strength` and `glide`.
     """
     pressed = pressed_distance(duration)
-    virtual = torch.minimum(duration_for(pressed - (distance - pressed) / GLIDE), duration)
-    in_glide = duration + GLIDE * (duration - virtual)
+    distance = distance / strength
+    stretch = GLIDE * glide
+    virtual = torch.minimum(duration_for(pressed - (distance - pressed) / stretch), duration)
+    in_glide = duration + stretch * (duration - virtual)
     return torch.where(distance > pressed, in_glide, torch.minimum(duration_for(distance), duration))
 
 
@@ -116,7 +128,17 @@ def distance_to_harbour(x: Tensor, y: Tensor, dir_x: Tensor, dir_y: Tensor) -> T
 
 
 def press(
-    x: Tensor, y: Tensor, fuel: Tensor, goal_x: Tensor, goal_y: Tensor, dir_x: Tensor, dir_y: Tensor, duration: Tensor
+    x: Tensor,
+    y: Tensor,
+    fuel: Tensor,
+    goal_x: Tensor,
+    goal_y: Tensor,
+    dir_x: Tensor,
+    dir_y: Tensor,
+    duration: Tensor,
+    *,
+    strength: Tensor | float = 1.0,
+    glide: Tensor | float = 1.0,
 ) -> Press:
     """Press a key for `duration` seconds and glide until the first event.
 
@@ -126,6 +148,8 @@ def press(
         goal_x, goal_y: centre of the dock, px from the harbour's centre, `[*B]`.
         dir_x, dir_y: unit direction of the key, `[*B]`.
         duration: seconds in [0, MAX_DURATION], `[*B]`. The press ends early if the tank is empty.
+        strength: factor above 0 of the speed while the key is down, `[*B]` or a number.
+        glide: factor above 0 of the length and the duration of the glide, `[*B]` or a number.
 
     Returns:
         The position at the event or at rest, the fuel left (s), the speed (px/s) at the end of the acceleration, and
@@ -133,8 +157,9 @@ def press(
         with fuel left is SAILING.
     """
     duration = torch.minimum(duration, fuel)
-    pressed = pressed_distance(duration)
-    total = (1.0 + GLIDE) * pressed
+    pressed = strength * pressed_distance(duration)
+    stretch = GLIDE * glide
+    total = (1.0 + stretch) * pressed
     to_dock = distance_to_dock(x, y, goal_x, goal_y, dir_x, dir_y)
     to_harbour = distance_to_harbour(x, y, dir_x, dir_y)
     docks = (to_dock <= total) & (to_dock <= to_harbour)
@@ -144,13 +169,13 @@ def press(
     # `virtual` is the time on the speed curve. It grows to `duration` while the key is down, and falls back to 0 in the
     # glide.
     in_glide = travelled > pressed
-    virtual = duration_for(torch.where(in_glide, (total - travelled) / GLIDE, travelled))
+    virtual = duration_for(torch.where(in_glide, (total - travelled) / stretch, travelled) / strength)
     virtual = torch.minimum(virtual, duration)
     burnt = torch.where(in_glide, duration, virtual)
     left = fuel - burnt
     left = torch.where(left > DRY, left, 0.0)
 
-    docked = torch.where(speed(virtual) <= DOCKING_SPEED, SUCCESS, TOO_FAST)
+    docked = torch.where(strength * speed(virtual) <= DOCKING_SPEED, SUCCESS, TOO_FAST)
     rested = torch.where(left > 0.0, SAILING, OUT_OF_FUEL)
     outcome = torch.where(docks, docked, torch.where(leaves, OUT_OF_BOUNDS, rested)).to(torch.int32)
-    return Press(x + travelled * dir_x, y + travelled * dir_y, left, speed(burnt), outcome)
+    return Press(x + travelled * dir_x, y + travelled * dir_y, left, strength * speed(burnt), outcome)
