@@ -63,6 +63,9 @@ class PAMDPEnv(EnvBase):
       `[N, num_discrete, num_discrete]` beside the observation: whether the column's action may follow the row's;
     - if parameters have other bounds in each state, `parameter_low` and `parameter_high` float32 `[N, num_parameters]`
       beside the observation, within the bounds of the spec;
+    - if an episode is a session of several trips (`has_trips`), `trip_ended` bool `[N, 1]` beside the observation:
+      whether the step ended a trip. It is also true where `done`, and false after a reset. The next trip begins at
+      once: the observation of the same step is its first one;
     - `reward`, `done`, `terminated`, `truncated` `[N, 1]`; a time limit is `truncated` only.
 
     A step does not change an episode that is over, and its reward is 0.
@@ -86,6 +89,10 @@ class PAMDPEnv(EnvBase):
     bounds_place: int | None = None
     max_steps: int  # steps of the longest episode
     result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads
+
+    # Whether an episode is a session: several trips, one after another, through which something unseen stays the same.
+    # An agent can learn what that is in one trip and use it in the next ones (Duan et al. 2016, *RL^2*).
+    has_trips: ClassVar[bool] = False
 
     # Whether a reset of some environments returns the others unchanged. If so, TorchRL's merge of the two changes
     # nothing and is left out, since it takes longer than simple physics of 65,536 environments.
