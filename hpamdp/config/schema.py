@@ -46,12 +46,15 @@ class AgentConfig(Settings):
     termination: Literal["episode", "steps", "learned", "chosen"] = "episode"
     """When options end: with the episode, after `option_length` steps, or at any step if the selector decides so.
 
+    If an episode is a session of trips, options also end with their trips.
     `chosen`: the selector chooses an option, and its length from `option_lengths`.
     """
     option_length: PositiveInt | None = None
     """Steps of an option, with `termination=steps` only."""
     option_lengths: Annotated[tuple[PositiveInt, ...], FromList, AfterValidator(_check_increasing)] | None = None
     """With `termination=chosen`: lengths to choose from, in steps, increasing. If null, 1, 2, 4, 8, 16, 32, 64, 128."""
+    values_end: Literal["session", "trip"] = "session"
+    """How far values look, if an episode is a session of trips: to the end of the `session`, or of the `trip`."""
     uniform_option_steps: NonNegativeInt = 0
     """Steps at the start of training in which options are chosen uniformly, so that each option's learner gets data.
 

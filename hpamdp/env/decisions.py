@@ -27,8 +27,8 @@ class DecisionTracker(Transform):
     - `option_return`: sum of rewards since the option began, discounted by `gamma`, and `option_steps`, its number of
       steps.
     - `decision_observation` `[*B, observation_dim]`: the observation at which the option was chosen.
-    - `option_ended`, bool, only with an `option_length`: under `next`, the option ended with this step by itself, not
-      only because its episode did.
+    - `option_ended`, bool, only with an `option_length` or `ends_with_trips`: under `next`, the option ended with this
+      step by itself or with its trip, not only because its episode did.
     - `option_mask`, bool `[*B, num_options]`, only with `option_actions`: which options have an allowed action, of each
       component. Where the held option has none, it ends.
     - `episode_return` and `episode_steps`: undiscounted sum of rewards and number of steps since the episode began.
@@ -40,13 +40,14 @@ class DecisionTracker(Transform):
 
     Args:
         gamma: discount of an environment step within the option.
-        option_length: steps after which an option ends, unless its episode ends first. If None, an option lasts the
-            episode. If `math.inf`, the selector ends it: it sets `is_decision` in the root of the step at which it
-            chooses again. If "chosen", the policy writes the number of steps of each option under `option_length`,
-            int64 `[*B]`.
+        option_length: steps after which an option ends, unless its episode or trip ends first. If None, an option lasts
+            as long as these. If `math.inf`, the selector ends it: it sets `is_decision` in the root of the step at
+            which it chooses again. If "chosen", the policy writes the number of steps of each option under
+            `option_length`, int64 `[*B]`.
         option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`, if options are sets of
             actions and some may be forbidden; else None.
         components: of the action; if None, there is one.
+        ends_with_trips: whether options end with the trips inside their episodes, see `PAMDPEnv.has_trips`.
         keeps_observation: whether to write `decision_observation`. Pictures are large, so they are kept only if there
             are options to choose.
     """
@@ -58,6 +59,7 @@ class DecisionTracker(Transform):
         option_actions: Tensor | None = None,
         *,
         components: Components | None = None,
+        ends_with_trips: bool = False,
         keeps_observation: bool = True,
     ) -> None:
         super().__init__()
@@ -65,6 +67,8 @@ class DecisionTracker(Transform):
         self.option_length = option_length
         self.option_actions = option_actions
         self.components = components
+        self.ends_with_trips = ends_with_trips
+        self.ends_inside = option_length is not None or ends_with_trips
         self.keeps_observation = keeps_observation
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -72,7 +76,7 @@ class DecisionTracker(Transform):
         shape = (*observation_spec.shape, 1)
         device = observation_spec.device
         observation_spec[keys.IS_DECISION] = Binary(n=1, shape=shape, dtype=torch.bool, device=device)
-        if self.option_length is not None:
+        if self.ends_inside:
             observation_spec[keys.OPTION_ENDED] = observation_spec[keys.IS_DECISION].clone()
         for name in (keys.OPTION_RETURN, keys.EPISODE_RETURN):
             observation_spec[name] = Unbounded(shape=shape, device=device, dtype=torch.float32)
@@ -91,7 +95,7 @@ class DecisionTracker(Transform):
         observation = tensordict_reset.get(keys.OBSERVATION)
         is_decision = torch.ones_like(tensordict_reset.get(keys.DONE))
         zeros = torch.zeros(is_decision.shape, device=observation.device, dtype=torch.float32)
-        if self.option_length is not None:
+        if self.ends_inside:
             tensordict_reset.set(keys.OPTION_ENDED, torch.zeros_like(is_decision))
         if self.option_actions is not None:
             tensordict_reset.set(keys.OPTION_MASK, self._possible_options(tensordict_reset, self.option_actions))
@@ -114,19 +118,22 @@ class DecisionTracker(Transform):
         option_return = tensordict.get(keys.OPTION_RETURN)
         option_steps = tensordict.get(keys.OPTION_STEPS)
         is_stuck = self._set_option_mask(tensordict, next_tensordict)
-        if self.option_length is None:
-            is_decision = done.clone()
-        else:
+        is_decision = done.clone()
+        if self.ends_inside:
             # Only a reset writes zeros: an option that begins inside an episode restarts its sums here.
             is_first = tensordict.get(keys.IS_DECISION)
             option_return = _zero_where(is_first, option_return)
             option_steps = _zero_where(is_first, option_steps)
-            length = self.option_length
-            if length == "chosen":
-                length = tensordict[keys.OPTION_LENGTH].unsqueeze(-1)
-            option_ended = option_steps + 1 >= length
-            if is_stuck is not None:
-                option_ended = option_ended | is_stuck
+            option_ended = torch.zeros_like(done)
+            if self.option_length is not None:
+                length = self.option_length
+                if length == "chosen":
+                    length = tensordict[keys.OPTION_LENGTH].unsqueeze(-1)
+                option_ended = option_steps + 1 >= length
+                if is_stuck is not None:
+                    option_ended = option_ended | is_stuck
+            if self.ends_with_trips:
+                option_ended = option_ended | next_tensordict.get(keys.TRIP_ENDED)
             is_decision = done | option_ended
             next_tensordict.set(keys.OPTION_ENDED, option_ended)
         next_tensordict.set(keys.IS_DECISION, is_decision)
@@ -141,7 +148,7 @@ class DecisionTracker(Transform):
     def _decision_observation(self, tensordict: TensorDictBase) -> Tensor:
         """Return the observation at which the option of this step was chosen, `[*B, observation_dim]`."""
         decision_observation: Tensor = tensordict.get(keys.DECISION_OBSERVATION)
-        if self.option_length is None:
+        if not self.ends_inside:
             return decision_observation.clone()
         return torch.where(tensordict.get(keys.IS_DECISION), tensordict.get(keys.OBSERVATION), decision_observation)
 
@@ -149,7 +156,7 @@ class DecisionTracker(Transform):
         """Write which options are possible next; return where the held one is not, `[*B, 1]`, if any may be forbidden.
 
         Raises:
-            ProblemError: the held option has no allowed action left, and should last as long as its episode.
+            ProblemError: the held option has no allowed action left, and should last as long as its episode or trip.
         """
         if self.option_actions is None:
             return None
@@ -157,12 +164,15 @@ class DecisionTracker(Transform):
         next_tensordict.set(keys.OPTION_MASK, possible)
         option = tensordict.get(keys.OPTION)
         is_stuck = ~possible.gather(-1, option.unsqueeze(-1))
-        if self.option_length is None and is_stuck.any():
-            row = int(is_stuck.flatten().nonzero()[0])
-            raise ProblemError(
-                f"environment {row}: option {option.flatten()[row].item()} has no allowed action left, and options "
-                "last as long as their episodes; use agent.termination=steps, learned or chosen"
-            )
+        if self.option_length is None:
+            is_held = is_stuck & ~next_tensordict.get(keys.TRIP_ENDED) if self.ends_with_trips else is_stuck
+            if is_held.any():
+                row = int(is_held.flatten().nonzero()[0])
+                lifetime = "trips" if self.ends_with_trips else "episodes"
+                raise ProblemError(
+                    f"environment {row}: option {option.flatten()[row].item()} has no allowed action left, and options "
+                    f"last as long as their {lifetime}; use agent.termination=steps, learned or chosen"
+                )
         return is_stuck
 
     def _possible_options(self, tensordict: TensorDictBase, option_actions: Tensor) -> Tensor:
@@ -223,7 +233,12 @@ def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLen
         option_actions = torch.tensor(env.option_actions, device=env.device)
     keeps_observation = env.has_choice or not env.observation_entries
     return DecisionTracker(
-        gamma, option_length, option_actions, components=env.components, keeps_observation=keeps_observation
+        gamma,
+        option_length,
+        option_actions,
+        components=env.components,
+        ends_with_trips=env.has_trips and env.has_choice,
+        keeps_observation=keeps_observation,
     )
 
 

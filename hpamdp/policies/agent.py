@@ -31,6 +31,19 @@ def with_option(rows: TensorDictBase, num_options: int) -> TensorDictBase:
     return rows
 
 
+def ended_with_trips(batch: TensorDictBase) -> TensorDictBase:
+    """Return a shallow copy of steps `[*B]` in which a trip's last step is `done` and `terminated`.
+
+    What is learned from them counts no reward of later trips. Memories go on, since they begin where `is_decision` or
+    `episode_steps` says so.
+    """
+    trip_ended = batch.get(("next", keys.TRIP_ENDED))
+    batch = batch.copy()
+    for name in (keys.DONE, keys.TERMINATED):
+        batch.set(("next", name), batch.get(("next", name)) | trip_ended)
+    return batch
+
+
 class OptionRouter(TensorDictModuleBase):
     """The low level's policy: in each environment, the policy of the held option's learner acts.
 
@@ -356,6 +369,8 @@ class HierarchicalAgent(nn.Module):
         policy: writes `option`, if there is a selector, and the action leaves.
         router: the low level's part of `policy`.
         pairs: the pairs of options and lengths; None if the selector chooses options alone.
+        values_end_with_trips: whether values of both levels end with a trip, if episodes are sessions of trips. The run
+            sets it.
 
     Raises:
         ValueError: the selector's `specs` list other options than the pairs.
@@ -363,6 +378,7 @@ class HierarchicalAgent(nn.Module):
     """
 
     frames: Tensor
+    values_end_with_trips: bool = False
 
     def __init__(
         self,
@@ -423,13 +439,18 @@ class HierarchicalAgent(nn.Module):
         """Let both levels learn from a collected batch `[*B, T]`; return scalars named `high/...` and `low/...`."""
         scalars: dict[str, float] = {}
         self.frames += batch.numel()
+        if self.next_options is not None and self.next_options.decides_ends:
+            batch = self.next_options.with_ends(batch)
+        if self.values_end_with_trips:
+            batch = ended_with_trips(batch)
         if self.selector is not None and self.next_options is not None:
-            if self.next_options.decides_ends:
-                batch = self.next_options.with_ends(batch)
             self._set_is_uniform()
-            seen = self._seen_by_selector(batch)
+            seen = steps = self._seen_by_selector(batch)
             self._set_pending(self.selector, seen)
-            steps = self.next_options.with_steps_before(seen) if self.next_options.decides_ends else seen
+            if self.next_options.decides_ends:
+                steps = self.next_options.with_steps_before(seen)
+                if self.values_end_with_trips:  # the step before the batch may have ended a trip
+                    steps = ended_with_trips(steps)
             learned = self.selector.learn_from_options(steps)
             learned = {**learned, **self.selector.learn_from_steps(seen), **self._mean_length(batch)}
             scalars.update({f"high/{name}": value for name, value in learned.items()})

@@ -144,6 +144,9 @@ def check_built(config: Config, env: PAMDPEnv) -> None:
             f"{config.env}: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; "
             "use agent.termination=steps agent.option_length=1 to change them"
         )
+    forgetful = compatibility.memory_ends_with_trips(config, facts)
+    if forgetful is not None:
+        warn(forgetful)
 
 
 def _facts_of_built(env: PAMDPEnv) -> ProblemFacts:
@@ -205,6 +208,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         selector_ends_options=config.run.agent.termination == "learned" and selector is not None,
         option_lengths=lengths,
     )
+    agent.values_end_with_trips = config.run.agent.values_end == "trip"
     return agent.to(device)
 
 
@@ -221,6 +225,8 @@ def set_up_updates(config: Config, agent: HierarchicalAgent) -> None:
         given = "compile_updates=true"
         if run.agent.termination != "episode":
             raise ConfigError(f"{given}: goes with agent.termination=episode only, not with {run.agent.termination}")
+        if _options_end_inside(config, agent):
+            raise ConfigError(f"{given}: {config.env} has trips, with which options end; use compile_updates=auto")
         _ask_learners(config, agent, given, lambda learner: learner.compile_updates())
     if run.update_precision != "float32":
         given = f"update_precision={run.update_precision}"
@@ -230,7 +236,7 @@ def set_up_updates(config: Config, agent: HierarchicalAgent) -> None:
 def _compile_if_it_pays(config: Config, agent: HierarchicalAgent) -> None:
     """Compile the updates of all learners that support it, if they make enough updates in this run."""
     run = config.run
-    if run.agent.termination != "episode" or run.low.freeze:
+    if _options_end_inside(config, agent) or run.low.freeze:
         return
     share = 1.0 / len(agent.learners)
     for _, learner in with_learners(config, agent):
@@ -238,6 +244,12 @@ def _compile_if_it_pays(config: Config, agent: HierarchicalAgent) -> None:
         if num >= _UPDATES_THAT_PAY:
             with suppress(ValueError):  # the learner, or this machine, cannot compile
                 learner.compile_updates()
+
+
+def _options_end_inside(config: Config, agent: HierarchicalAgent) -> bool:
+    """Return whether options may end inside their episodes."""
+    has_trips = agent.selector is not None and compatibility.has_trips(config)
+    return has_trips or config.run.agent.termination != "episode"
 
 
 def _ask_learners(config: Config, agent: HierarchicalAgent, given: str, ask: Callable[[Learner], None]) -> None:

@@ -101,6 +101,11 @@ def _memory(component: Component) -> str | None:
     return str(memory) if memory in ("stack", "gru") else None  # a bandit's memory is another thing
 
 
+def has_trips(config: Config) -> bool:
+    """Return whether an episode of the problem is a session of several trips."""
+    return bool(getattr(config.env.cls, "has_trips", False))
+
+
 def _needs(component: Component) -> tuple[str, ...]:
     return getattr(component.cls, "needs", ())
 
@@ -166,6 +171,43 @@ def callbacks_have_evaluations(config: Config) -> str | None:
     every = "offline.eval_every" if run.mode == "offline" else "eval.every"
     counting = [str(each) for each in config.callbacks if getattr(each.cls, "needs_evaluations", False)]
     return f"{counting[0]}: needs evaluations during training; set {every} above 0" if counting else None
+
+
+# Rules about sessions of trips.
+
+
+def values_end_where_there_are_trips(config: Config) -> str | None:
+    """Refuse `agent.values_end=trip` for episodes without trips."""
+    if config.run.agent.values_end == "session" or has_trips(config):
+        return None
+    return f"agent.values_end=trip: episodes of {config.env} have no trips; use agent.values_end=session"
+
+
+def sessions_are_played_here(config: Config) -> str | None:
+    """Refuse what takes an episode for a single trip: data sets, and learners that play whole episodes."""
+    if not has_trips(config) or config.run.mode == "eval":
+        return None
+    if config.data.cls is not None:
+        return f"{config.data}: {config.env} has sessions of trips, which data sets do not hold; use data=none"
+    if config.run.low.freeze:
+        return f"low.freeze=true: plays whole episodes, but {config.env} has sessions of trips; use low.freeze=false"
+    return None
+
+
+def memory_ends_with_trips(config: Config, problem: ProblemFacts) -> str | None:
+    """Return a warning if a learner's memory begins anew with each trip; None if it does not, or there is none.
+
+    It may be meant so: within a trip the memory is of use. But it does not see what earlier trips have shown.
+    """
+    if not (has_trips(config) and _has_choice(config, problem)) or config.run.agent.sharing == "shared":
+        return None
+    remembering = [low for low in config.learners if _memory(low) is not None]
+    if not remembering:
+        return None
+    return (
+        f"low.memory={_memory(remembering[0])}: with agent.sharing=per_option a memory begins with its option, so it "
+        "forgets earlier trips; agent.sharing=shared remembers the session"
+    )
 
 
 # Rules about the data that the agent learns from.
@@ -236,7 +278,7 @@ def memories_have_own_steps(config: Config) -> str | None:
 def selectors_remember_several_decisions(config: Config) -> str | None:
     """Refuse a selector with a memory if its episodes have a single decision."""
     memory = _memory(config.high)
-    if memory is None or config.run.agent.termination != "episode":
+    if memory is None or config.run.agent.termination != "episode" or has_trips(config):
         return None
     return (
         f"high.memory={memory}: agent.termination=episode has one decision in an episode, and nothing to remember; use "
@@ -254,9 +296,10 @@ def memories_have_values(config: Config) -> str | None:
         )
     settings = "memory", "memory_size", "stack_steps"
     memories = {tuple(each.settings[name] for name in settings if _memory(each)) for each in config.learners}
-    if run.termination != "episode" and len(memories) > 1:
+    if (run.termination != "episode" or has_trips(config)) and len(memories) > 1:
+        given = f"{config.env} has trips, and so" if has_trips(config) else f"agent.termination={run.termination}"
         return (
-            f"low.per_option: agent.termination={run.termination} needs the same memory, memory_size and stack_steps "
+            f"low.per_option: {given} needs the same memory, memory_size and stack_steps "
             "in all learners, which value each other's states"
         )
     return None
@@ -482,6 +525,8 @@ RULES: tuple[Rule, ...] = (
     saved_runs_are_named,
     stop_score_needs_evaluations,
     callbacks_have_evaluations,
+    values_end_where_there_are_trips,
+    sessions_are_played_here,
     offline_runs_have_data,
     levels_support_the_mode,
     n_step_fits_a_batch,

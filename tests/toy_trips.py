@@ -1,0 +1,105 @@
+"""Sessions of trips: problems whose episodes are several trips, one after another, with something unseen that stays."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+
+from hpamdp import keys
+from hpamdp.env.base import PAMDPEnv
+
+
+class Sessions(PAMDPEnv):
+    """Take `length` steps in each of `trips` trips; every step earns 1.
+
+    The observation is the step in the trip and the number of the trip, both as fractions, and the last step's reward.
+
+    Args:
+        num_envs: environments of the batch.
+        trips: trips of a session.
+        length: steps of a trip.
+        seed: of what is hidden.
+        device: where the tensors live.
+
+    Attributes:
+        hidden: 0 or 1, drawn anew for each session, int64 `[N]`.
+    """
+
+    has_trips: ClassVar[bool] = True
+    parameter_dims = (1, 1)
+
+    def __init__(
+        self, num_envs: int = 1, *, trips: int = 2, length: int = 2, seed: int = 0, device: object = "cpu"
+    ) -> None:
+        super().__init__(device=device, batch_size=[num_envs])
+        self.length, self.max_steps = length, trips * length
+        n = num_envs
+        flag = Binary(n=1, shape=(n, 1), dtype=torch.bool)
+        self.observation_spec = Composite(observation=Bounded(-1.0, 1.0, shape=(n, 3)), trip_ended=flag, shape=(n,))
+        action = Composite(discrete=Categorical(2, shape=(n,)), parameters=Bounded(-1.0, 1.0, shape=(n, 2)), shape=(n,))
+        option = {"option": Categorical(2, shape=(n,))} if self.option_names else {}
+        self.action_spec = Composite(action=action, **option, shape=(n,))
+        self.reward_spec = Unbounded(shape=(n, 1))
+        self.done_spec = self.make_done_spec()
+        self._set_seed(seed)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.generator = torch.Generator().manual_seed(seed or 0)
+        self.hidden = torch.zeros(self.batch_size, dtype=torch.long)
+        self.steps = torch.zeros(self.batch_size, dtype=torch.long)
+        self.last_reward = torch.zeros(self.batch_size)
+
+    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        mask = self.reset_mask(tensordict)
+        self.hidden = torch.where(mask, torch.randint(2, self.batch_size, generator=self.generator), self.hidden)
+        self.steps = torch.where(mask, 0, self.steps)
+        self.last_reward = torch.where(mask, 0.0, self.last_reward)
+        return self._read()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        is_running = self.steps < self.max_steps
+        self.last_reward = torch.where(is_running, self.earned(tensordict), 0.0)
+        self.steps = (self.steps + 1).clamp(max=self.max_steps)
+        return self._read().set(keys.REWARD, self.last_reward.unsqueeze(-1))
+
+    def earned(self, tensordict: TensorDictBase) -> Tensor:
+        """Return what the actions of a step earn, `[N]`."""
+        return torch.ones(self.batch_size)
+
+    def _read(self) -> TensorDict:
+        place, trip = self.steps % self.length, self.steps // self.length
+        observation = torch.stack([place / self.length, trip * self.length / self.max_steps, self.last_reward], -1)
+        terminated = (self.steps >= self.max_steps).unsqueeze(-1)
+        flags = {
+            keys.TRIP_ENDED: ((place == 0) & (self.steps > 0)).unsqueeze(-1),
+            keys.TERMINATED: terminated,
+            keys.TRUNCATED: torch.zeros_like(terminated),
+            keys.DONE: terminated.clone(),
+        }
+        return TensorDict({keys.OBSERVATION: observation, **flags}, self.batch_size)
+
+
+class SessionsOfOptions(Sessions):
+    """Sessions with two options to choose from; every step earns 1."""
+
+    option_names = ("left", "right")
+
+
+class HiddenAction(Sessions):
+    """One of the two discrete actions earns 1 through a session, the other one -1. Which one is hidden."""
+
+    def earned(self, tensordict: TensorDictBase) -> Tensor:
+        """Return 1 for the hidden action, else -1."""
+        return torch.where(tensordict[keys.DISCRETE] == self.hidden, 1.0, -1.0)
+
+
+class HiddenOption(SessionsOfOptions):
+    """One of the two options earns 1 a step through a session, the other one -1. Which one is hidden."""
+
+    def earned(self, tensordict: TensorDictBase) -> Tensor:
+        """Return 1 for the hidden option, else -1."""
+        return torch.where(tensordict[keys.OPTION] == self.hidden, 1.0, -1.0)
