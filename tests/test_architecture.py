@@ -16,7 +16,7 @@ LOW, HIGH = "hpamdp.policies.low_level", "hpamdp.policies.high_level"
 LEARNERS = [module for module in FILES if module.startswith(f"{LOW}.")]
 TORCH = ("torch", "torchrl", "tensordict")
 # The rooms that know boats; everything else is generic.
-BOATS = ("hpamdp.env.boatdock", "hpamdp.env.boatdock_released", "hpamdp.data.human")
+BOATS = ("hpamdp.env.boatdock", "hpamdp.env.boatdock_released", "hpamdp.env.boatdock_unseen", "hpamdp.data.human")
 BOAT_WORDS = re.compile(r"boat|\bpress|_press|harbou?r|\bdock|_dock|controller|congruent|\bfuel|_fuel", re.IGNORECASE)
 
 
@@ -119,8 +119,8 @@ def test_environments_and_policies_do_not_know_each_other():
     assert not importers("hpamdp.env", inside="hpamdp.policies")
 
 
-def test_a_problem_knows_no_other_but_the_released_boats_the_boats_and_the_lander_gymnasium():
-    allowed = {"boatdock": {"boatdock_released"}, "gymnasium": {"lunar_lander"}}
+def test_a_problem_knows_no_other_but_the_released_and_unseen_boats_the_boats_and_the_lander_gymnasium():
+    allowed = {"boatdock": {"boatdock_released", "boatdock_unseen"}, "gymnasium": {"lunar_lander"}}
     rooms = {module.split(".")[2] for module in FILES if is_in(module, "hpamdp.env") and module.count(".") == 3}
     assert {"boatdock", "boatdock_released", "gymnasium", "platform"} <= rooms
     for room in rooms:

@@ -1,0 +1,1 @@
+"""Sessions of trips with boats that the agent does not know."""
