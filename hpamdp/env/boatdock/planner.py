@@ -539,10 +539,10 @@ def _search_sequences(
         num_presses: number of presses of each sequence. Earlier legs have length 0.
     """
     num = len(position[0])
-    place = (column[:, None].expand(num, len(directions)) for column in position)
-    legs = (leg.expand(num, len(directions)) for leg in directions.flatten(1).unbind(1))
-    one = torch.ones(num, len(directions), device=directions.device, dtype=torch.float32)
-    course = _Course(*place, *legs, *(one, torch.zeros_like(one)))
+    columns = [column[:, None].expand(num, len(directions)) for column in position]
+    columns += [leg.expand(num, len(directions)) for leg in directions.flatten(1).unbind(1)]
+    columns += [torch.ones_like(columns[0]), torch.zeros_like(columns[0])]
+    course = _Course(*columns)
     sequence, first, second = _local_minima(course, num_presses)
     candidates = _Course(*(field.gather(1, sequence) for field in course))
     coarse = _total_seconds(candidates, first, second, num_presses) + cost[sequence]
