@@ -1,21 +1,30 @@
 """Sessions of trips: options last for trips, values look past them or not, and memories are kept over the session."""
 
+import math
+import signal
+
 import pytest
 import torch
 from tensordict import TensorDict
+from test_resume import stop_and_resume, words_of
 from torchrl.envs import check_env_specs
+from torchrl.envs.utils import ExplorationType
 from toy_options import steppers
 from toy_trips import HiddenOption, Sessions, SessionsOfOptions
 
 import hpamdp
 from hpamdp import keys
+from hpamdp.acting import acting
 from hpamdp.config.errors import ConfigError
+from hpamdp.config.outside_jobs import choosing_class
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent, ended_with_trips, with_option
 from hpamdp.policies.base import Learner, Selector
 from hpamdp.policies.high_level.actor import Actor
 from hpamdp.policies.high_level.meta_critic import MetaCritic
 from hpamdp.policies.high_level.option_critic import OptionCritic
+from hpamdp.policies.high_level.thompson import Thompson
+from hpamdp.policies.high_level.ucb import UCB
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.hppo import HPPO
@@ -27,6 +36,7 @@ from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.qpamdp import QPAMDP
 from hpamdp.policies.low_level.random import Random
 from hpamdp.policies.shared.sequences import sample_with_past, states_of_past
+from hpamdp.policies.shared.session_bandit import SESSION_REWARDS, SessionRewards
 from hpamdp.specs import PAMDPSpecs
 
 GAMMA = 0.5
@@ -333,6 +343,64 @@ def test_a_selector_remembers_the_observations_at_the_decisions_of_a_sessions_tr
         torch.testing.assert_close(rolled[selector.memory_key][:, t], state)
 
 
+# Bandits of a session.
+
+BANDITS = {"ucb": UCB, "thompson": Thompson}
+every_bandit = pytest.mark.parametrize("high", BANDITS)
+
+
+def session_bandit(high: str, num_envs: int, steps: int, *, is_greedy: bool) -> tuple[Selector, TensorDict]:
+    """Return a bandit of sessions, and steps of sessions of six trips that it has learned from."""
+    torch.manual_seed(0)
+    env = HiddenOption(num_envs, trips=6)
+    specs = PAMDPSpecs.from_env(env)
+    selector = BANDITS[high](specs, memory="session", exploration=0.5)
+    agent = agent_of([Random(specs), Random(specs)], specs, "session", selector)
+    with acting(ExplorationType.DETERMINISTIC if is_greedy else ExplorationType.RANDOM), torch.no_grad():
+        rolled = with_decisions(env).rollout(steps, agent.policy, break_when_any_done=False)
+    agent.learn(rolled)
+    return selector, rolled
+
+
+@every_bandit
+def test_a_session_bandit_knows_the_returns_of_its_own_sessions_earlier_trips_alone(high):
+    _, rolled = session_bandit(high, 5, 24, is_greedy=False)
+    for row in rolled:
+        for t, step in enumerate(row):
+            begin = t // 12 * 12
+            expected = torch.zeros(3, 2, dtype=torch.float64)
+            for end in range(begin + 1, t // 2 * 2, 2):
+                earned = row[end]["next", keys.OPTION_RETURN].item()
+                expected[:, row[end][keys.OPTION]] += torch.tensor([1.0, earned, earned**2])
+            assert torch.equal(step[SESSION_REWARDS], expected)
+
+
+@pytest.mark.parametrize("is_greedy", [False, True])
+@every_bandit
+def test_a_session_bandit_finds_the_right_option_of_each_session_also_in_evaluation(high, is_greedy):
+    selector, rolled = session_bandit(high, 40, 24, is_greedy=is_greedy)
+    earned = rolled["next", keys.OPTION_RETURN][:, 1::2].reshape(40, 2, 6)
+    assert {*earned[..., :2].flatten().tolist()} == {-2.0, 2.0}
+    assert (earned[..., :2].sum(-1) == 0.0).all(), "both options are tried first"
+    assert earned[..., 2:].mean() > 1.2
+    assert not selector.statistics.counts.any() and selector.has_updated()
+
+
+def test_the_bounds_of_a_session_equal_those_by_hand():
+    selector = UCB(PAMDPSpecs.from_env(HiddenOption(1)), memory="session", exploration=0.5)
+    # The first option earned 1 and 3, the second one 2.
+    rewards = SessionRewards(torch.tensor([[[2.0, 1.0], [4.0, 2.0], [10.0, 4.0]]], dtype=torch.float64))
+    deviation = math.sqrt(2.0 / 3.0)
+    bounds = [2.0 + 0.5 * deviation * math.sqrt(2.0 * math.log(4.0) / count) for count in (2.0, 1.0)]
+    assert selector.session_values(rewards)[0].tolist() == pytest.approx(bounds)
+
+
+@every_bandit
+def test_a_run_with_a_session_bandit_resumes_to_the_last_bit(high, tmp_path, monkeypatch):
+    words = [*words_of(high, "random"), choosing_class("env", HiddenOption), "high.memory=session"]
+    stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)
+
+
 # Settings.
 
 QUIET = {"total_frames": 256, "num_envs": 8, "steps_per_batch": 16, "eval.every": 0, "eval.layouts": 4}
@@ -349,6 +417,12 @@ def test_trips_make_decisions_that_a_selector_can_remember():
     ("env", "settings", "message"),
     [
         ("platform", {"agent.values_end": "trip"}, "agent.values_end=trip: episodes of env=platform have no trips"),
+        (
+            "boatdock",
+            {"high": "ucb", "high.memory": "session"},
+            "high.memory=session: episodes of env=boatdock have no trips",
+        ),
+        (HiddenOption, {"high": "exp3", "high.memory": "session"}, "high.memory=.session.: must be"),
         (HiddenOption, {"low.freeze": True}, "low.freeze=true: plays whole episodes"),
         (HiddenOption, {"data": "human"}, "data=human: env=HiddenOption has sessions of trips"),
         (HiddenOption, {"compile_updates": True}, "compile_updates=true: env=HiddenOption has trips"),

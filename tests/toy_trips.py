@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -26,7 +27,7 @@ class Sessions(PAMDPEnv):
         device: where the tensors live.
 
     Attributes:
-        hidden: 0 or 1, drawn anew for each session, int64 `[N]`.
+        session: number of the environment's session, int64 `[N]`.
     """
 
     has_trips: ClassVar[bool] = True
@@ -36,6 +37,7 @@ class Sessions(PAMDPEnv):
         self, num_envs: int = 1, *, trips: int = 2, length: int = 2, seed: int = 0, device: object = "cpu"
     ) -> None:
         super().__init__(device=device, batch_size=[num_envs])
+        self.num_envs = num_envs
         self.length, self.max_steps = length, trips * length
         n = num_envs
         flag = Binary(n=1, shape=(n, 1), dtype=torch.bool)
@@ -48,14 +50,14 @@ class Sessions(PAMDPEnv):
         self._set_seed(seed)
 
     def _set_seed(self, seed: int | None) -> None:
-        self.generator = torch.Generator().manual_seed(seed or 0)
-        self.hidden = torch.zeros(self.batch_size, dtype=torch.long)
+        self.seed = seed or 0
+        self.session = torch.full(self.batch_size, -1)
         self.steps = torch.zeros(self.batch_size, dtype=torch.long)
         self.last_reward = torch.zeros(self.batch_size)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask = self.reset_mask(tensordict)
-        self.hidden = torch.where(mask, torch.randint(2, self.batch_size, generator=self.generator), self.hidden)
+        self.session = self.session + mask.long()
         self.steps = torch.where(mask, 0, self.steps)
         self.last_reward = torch.where(mask, 0.0, self.last_reward)
         return self._read()
@@ -65,6 +67,21 @@ class Sessions(PAMDPEnv):
         self.last_reward = torch.where(is_running, self.earned(tensordict), 0.0)
         self.steps = (self.steps + 1).clamp(max=self.max_steps)
         return self._read().set(keys.REWARD, self.last_reward.unsqueeze(-1))
+
+    @property
+    def hidden(self) -> Tensor:
+        """What stays the same in a session, 0 or 1, int64 `[N]`: a hash of the numbers of environment and session."""
+        number = 1 + torch.arange(len(self.session)) + 7919 * self.session + 104729 * self.seed
+        return (number * 2654435761 >> 13) % 2
+
+    def env_state(self) -> dict[str, Tensor]:
+        """Return the columns of the sessions, `[N]` each."""
+        return {"session": self.session, "steps": self.steps, "last_reward": self.last_reward}
+
+    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Continue from an `env_state`."""
+        for name, column in columns.items():
+            setattr(self, name, column.clone())
 
     def earned(self, tensordict: TensorDictBase) -> Tensor:
         """Return what the actions of a step earn, `[N]`."""

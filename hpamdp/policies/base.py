@@ -245,7 +245,7 @@ class Selector(Level, TensorDictModuleBase):
             None, it can: its `specs` then list the pairs as options. If it `needs` the environment's entries or
             `asks_learners`, the run knows that it cannot.
         is_bandit: True if the selector uses an option's return as its full value, that is, does not bootstrap. Its
-            options must last as long as their episodes; others are refused.
+            options must last as long as their episodes or trips; others are refused.
         modes: what the selector can learn from: its own choices (`train`), or a data set of other choices (`offline`).
             A data set lacks keys that a selector adds to `out_keys`, so such a selector usually has `train` alone.
         memory_key: under which the selector's memory of earlier decisions lies in a step, if it has one.

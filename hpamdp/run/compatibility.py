@@ -183,6 +183,13 @@ def values_end_where_there_are_trips(config: Config) -> str | None:
     return f"agent.values_end=trip: episodes of {config.env} have no trips; use agent.values_end=session"
 
 
+def session_rewards_need_trips(config: Config) -> str | None:
+    """Refuse a bandit's `high.memory=session` for episodes without trips."""
+    if config.high.settings.get("memory") != "session" or has_trips(config):
+        return None
+    return f"high.memory=session: episodes of {config.env} have no trips; use all, discounted or sliding_window"
+
+
 def sessions_are_played_here(config: Config) -> str | None:
     """Refuse what takes an episode for a single trip: data sets, and learners that play whole episodes."""
     if not has_trips(config) or config.run.mode == "eval":
@@ -526,6 +533,7 @@ RULES: tuple[Rule, ...] = (
     stop_score_needs_evaluations,
     callbacks_have_evaluations,
     values_end_where_there_are_trips,
+    session_rewards_need_trips,
     sessions_are_played_here,
     offline_runs_have_data,
     levels_support_the_mode,

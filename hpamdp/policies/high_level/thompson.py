@@ -3,7 +3,9 @@
 Source: Russo, Van Roy, Kazerouni, Osband and Wen 2018, *A Tutorial on Thompson Sampling*, arXiv 1707.02038, section 3.
 Forgetting: see `RewardStatistics`.
 
-Differs from the source: the variance of the rewards is the observed one; the prior of the means is flat.
+Differs from the source:
+- the variance of the rewards is the observed one, and the prior of the means is flat;
+- with `memory=session` each environment has posteriors of its own, from the rewards of its session's trips.
 """
 
 from __future__ import annotations
@@ -13,17 +15,17 @@ from pydantic import PositiveFloat
 from torch import Tensor
 
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit import Bandit, BanditOptions
+from hpamdp.policies.shared.session_bandit import SessionBandit, SessionBanditOptions, SessionRewards
 
 
-class ThompsonOptions(BanditOptions):
+class ThompsonOptions(SessionBanditOptions):
     """Settings of `Thompson`."""
 
     exploration: PositiveFloat = 1.0
     """Factor of the posteriors' standard deviation; 1 is Bayesian."""
 
 
-class Thompson(Bandit):
+class Thompson(SessionBandit):
     """Choose the option with the highest sample from the Gaussian posterior distributions of the mean rewards."""
 
     Options = ThompsonOptions
@@ -37,3 +39,9 @@ class Thompson(Bandit):
         sampled_means = statistics.means + deviation * noise
         # Untried options come first, in random order.
         return masked_values(torch.where(statistics.is_untried, 1e9 + noise, sampled_means), allowed).argmax(-1)
+
+    def session_values(self, rewards: SessionRewards) -> Tensor:
+        """Return samples of the mean rewards in each session; untried options come first, in random order."""
+        noise = torch.randn_like(rewards.means)
+        deviation = self.options.exploration * rewards.deviation / rewards.counts.clamp(min=1.0).sqrt()
+        return torch.where(rewards.is_untried, 1e9 + noise, rewards.means + deviation * noise)

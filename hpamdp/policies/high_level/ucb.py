@@ -6,7 +6,8 @@ Discounted and sliding-window UCB: Garivier and Moulines 2011, arXiv 0805.3415, 
 Differs from the sources:
 - rewards need not lie in [0, 1]: the width is in units of their standard deviation;
 - many environments decide at the same time. `UCB` simulates sequential decisions: each choice narrows the bound of its
-  option before the reward is known. Otherwise all environments would choose the same option.
+  option before the reward is known. Otherwise all environments would choose the same option;
+- with `memory=session` each environment has bounds of its own, on the rewards of its session's trips.
 """
 
 from __future__ import annotations
@@ -15,17 +16,17 @@ import torch
 from pydantic import PositiveFloat
 from torch import Tensor
 
-from hpamdp.policies.shared.bandit import Bandit, BanditOptions
+from hpamdp.policies.shared.session_bandit import SessionBandit, SessionBanditOptions, SessionRewards
 
 
-class UCBOptions(BanditOptions):
+class UCBOptions(SessionBanditOptions):
     """Settings of `UCB`; with `memory=all` it is UCB1."""
 
     exploration: PositiveFloat = 2.0
     """Width of the bounds, in standard deviations of the rewards. It falls with every choice of an option."""
 
 
-class UCB(Bandit):
+class UCB(SessionBandit):
     """Choose the option with the highest mean reward + exploration x standard deviation x sqrt(2 ln t / n).
 
     The mean is that of the known rewards. n counts the choices of the option and t the choices of all options, whether
@@ -52,3 +53,10 @@ class UCB(Bandit):
             bounds = bounds.masked_fill(~allowed.unsqueeze(-1), -torch.inf)
         chosen = bounds.flatten().topk(num).indices // num
         return chosen[torch.randperm(num, device=chosen.device)]
+
+    def session_values(self, rewards: SessionRewards) -> Tensor:
+        """Return the bounds of each session; infinite for untried options, the first of which is chosen."""
+        time = rewards.counts.sum(-1, keepdim=True) + 1.0
+        width = (2.0 * time.clamp(min=2.0).log() / rewards.counts.clamp(min=1.0)).sqrt()
+        bounds = rewards.means + self.options.exploration * rewards.deviation * width
+        return torch.where(rewards.is_untried, torch.inf, bounds)

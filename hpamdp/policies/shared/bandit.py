@@ -1,7 +1,7 @@
 """The base of context-free bandits, and the statistics of each option's rewards.
 
 The reward of a bandit is here the return of an option. A bandit does not bootstrap, so its options must last as long as
-their episodes.
+their episodes, or as the trips in these.
 """
 
 from __future__ import annotations

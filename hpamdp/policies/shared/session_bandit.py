@@ -1,0 +1,115 @@
+"""The base of bandits that may count the rewards of a session alone: those of its trips so far.
+
+In each session a bandit of its own begins with nothing, as in Auer, Cesa-Bianchi and Fischer 2002 with as many rounds
+as the session has trips. So nothing is learned across sessions, and exploring is part of the greedy policy.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn import functional as F
+
+from hpamdp import keys
+from hpamdp.policies.masks import masked_values
+from hpamdp.policies.shared.bandit import Bandit, BanditOptions
+from hpamdp.specs import PAMDPSpecs
+
+# Counts, sums and sums of squares of the rewards of each option in the session, float64 `[*B, 3, num_options]`.
+SESSION_REWARDS = "session_rewards"
+
+
+class SessionBanditOptions(BanditOptions):
+    """Settings of a bandit that may count the rewards of a session alone."""
+
+    memory: Literal["all", "discounted", "sliding_window", "session"] = "discounted"  # type: ignore[assignment]
+    """Which rewards count: `all` equally, recent ones more (`discounted`), or the last ones only (`sliding_window`).
+
+    `session`: those of the session's earlier trips, if an episode is a session of trips. Each session begins anew.
+    """
+
+
+class SessionRewards:
+    """The rewards of the options in each environment's session so far.
+
+    Args:
+        rewards: counts, sums and sums of squares, `[*B, 3, num_options]`.
+
+    Attributes:
+        counts, means: of each option's rewards, `[*B, num_options]`; the mean of an untried option is 0.
+        deviation: standard deviation of all rewards of the session, `[*B, 1]`; close to 0 without rewards.
+        is_untried: whether an option has no reward, bool `[*B, num_options]`.
+    """
+
+    def __init__(self, rewards: Tensor) -> None:
+        self.counts, sums, squares = rewards.unbind(-2)
+        self.is_untried = self.counts == 0.0
+        self.means = sums / self.counts.clamp(min=1.0)
+        total = self.counts.sum(-1, keepdim=True).clamp(min=1.0)
+        variance = squares.sum(-1, keepdim=True) / total - (sums.sum(-1, keepdim=True) / total).square()
+        self.deviation = variance.clamp(min=1e-12).sqrt()
+
+
+class SessionBandit(Bandit):
+    """A bandit that counts the rewards of all episodes, or with `memory=session` those of each session alone.
+
+    The rewards of a session are the policy's state in its environment. They travel in the tensordict as the choice
+    does, so there may be any number of environments, and a resumed run goes on with them. A subclass writes
+    `session_values`.
+    """
+
+    Options = SessionBanditOptions
+
+    def __init__(self, specs: PAMDPSpecs, options: SessionBanditOptions | None = None, **settings: Any) -> None:
+        super().__init__(specs, options, **settings)
+        if self.options.memory == "session":
+            self.memory_key = SESSION_REWARDS
+            self.in_keys += [keys.OPTION_RETURN, keys.EPISODE_STEPS, SESSION_REWARDS]
+            self.out_keys += [SESSION_REWARDS]
+            self.export_refusal = f"remembers {SESSION_REWARDS}"
+
+    @abstractmethod
+    def session_values(self, rewards: SessionRewards) -> Tensor:
+        """Return the number of each option `[*B, num_options]`, of which the choice takes the highest."""
+        raise NotImplementedError
+
+    def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return the options `[*B]` and, with `memory=session`, the rewards that they were chosen by."""
+        if self.memory_key is None:
+            return super().choose(td)
+        rewards = self._rewards(td)
+        values = masked_values(self.session_values(SessionRewards(rewards)), td.get(keys.OPTION_MASK, None))
+        return {keys.OPTION: values.argmax(-1), SESSION_REWARDS: rewards}
+
+    def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return uniformly random options `[*B]` and, with `memory=session`, the rewards of the session so far."""
+        chosen = super().choose_uniformly(td)
+        return chosen if self.memory_key is None else {**chosen, SESSION_REWARDS: self._rewards(td)}
+
+    def _rewards(self, td: TensorDictBase) -> Tensor:
+        """Return the rewards of the session before a decision, `[*B, 3, num_options]`, the last option's included."""
+        before, option = td.get(SESSION_REWARDS, None), td.get(keys.OPTION, None)
+        reward = td.get(keys.OPTION_RETURN).double()
+        if before is None or option is None:
+            return reward.new_zeros(*td.batch_size, 3, self.specs.num_options)
+        is_held = F.one_hot(option, self.specs.num_options).double()
+        added = torch.stack([is_held, is_held * reward, is_held * reward.square()], -2)
+        begins = (td.get(keys.EPISODE_STEPS) == 0).unsqueeze(-1)
+        return torch.where(begins, 0.0, before + added)
+
+    def has_updated(self) -> bool:
+        """Return whether any reward is known, or none is learned from."""
+        return self.memory_key is not None or super().has_updated()
+
+    def learn(self, decisions: TensorDictBase) -> dict[str, float]:
+        """Do as `Bandit.learn` does; with `memory=session` learn nothing, and return the mean rewards."""
+        if self.memory_key is None:
+            return super().learn(decisions)
+        option = decisions.get(keys.OPTION)
+        reward = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1)
+        numbers = {name: i for i, name in enumerate(self.specs.option_names) if (option == i).any()}
+        return {f"reward_{name}": reward[option == i].mean().item() for name, i in numbers.items()}
