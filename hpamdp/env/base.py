@@ -273,8 +273,12 @@ class PAMDPEnv(EnvBase):
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return results of episodes, `[M]` each, from the leaves `result_keys` of their last steps.
 
-        Comparisons of agents use `score`, if there is one, instead of the return. `success` is bool.
+        Comparisons of agents use `score`, if there is one, instead of the return. `success` is bool, or a share.
         """
+        return {}
+
+    def played(self) -> dict[str, Tensor]:
+        """Return what the environment has noted of the episodes of an evaluation, `[N, ...]` each, once all are over."""
         return {}
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:

@@ -107,7 +107,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     options: Any  # of the class Options
     outcomes: ClassVar[tuple[str, ...]]  # names: going on, success, ..., time limit
     observation_names: tuple[str, ...]
-    extra_names: tuple[str, ...] = ()  # of values `[N, 1]` in [0, 1] beside the observation and the outcome
+    extra_names: tuple[str, ...] = ()  # of values `[N, 1]` beside the observation and the outcome, see `extra_spec`
     start_keys: frozenset[str] = frozenset()  # keys of a tensordict that `reset` takes, to start from
     action_names: ClassVar[tuple[str, str]] = ("discrete", "parameters")  # what errors call an action
     # Bounds of the parameters of all discrete actions, side by side.
@@ -348,9 +348,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _make_specs(self, low: Tensor, high: Tensor) -> None:
         n, device = self.num_envs, self.device
-        extras = {
-            name: Bounded(0.0, 1.0, shape=(n, 1), device=device, dtype=torch.float32) for name in self.extra_names
-        }
+        extras = {name: self.extra_spec(name) for name in self.extra_names}
+        self._extra_types = [spec.dtype for spec in extras.values()]
         observation = self.observed_spec()
         outcome = Categorical(len(self.outcomes), shape=(n,), device=device)
         knowledge = self._knowledge_specs()
@@ -362,6 +361,10 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         self.action_spec = self.make_action_spec(low, high, has_option=self._chooses)
         self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=self.float_type)
         self.done_spec = self.make_done_spec()
+
+    def extra_spec(self, name: str) -> TensorSpec:
+        """Return the spec of one of the `extra_names`: float32 `[N, 1]` in [0, 1]."""
+        return Bounded(0.0, 1.0, shape=(self.num_envs, 1), device=self.device, dtype=torch.float32)
 
     def observed_spec(self) -> TensorSpec:
         """Return the spec of the observations; override it together with `shown`."""
@@ -583,8 +586,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             keys.OUTCOME: torch.from_numpy(results.outcomes[number]),
             **self._flags(*flags.unbind(0)),
         }
-        for place, name in enumerate(self.extra_names):
-            leaves[name] = torch.from_numpy(results.extras[number, place]).unsqueeze(-1)
+        for place, (name, dtype) in enumerate(zip(self.extra_names, self._extra_types, strict=True)):
+            leaves[name] = torch.from_numpy(results.extras[number, place]).unsqueeze(-1).to(dtype)
         if has_reward:
             leaves[keys.REWARD] = torch.from_numpy(results.rewards).unsqueeze(-1)
         # The checks of the constructor would take longer than a hundred rows.

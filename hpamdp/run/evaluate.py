@@ -116,7 +116,7 @@ class Evaluation:
             played["option_length"] = torch.stack(lengths).nanmean(0)
         if path[0] is not None:
             played["path"] = torch.stack(path, 1)
-        played |= self.env.results(td)
+        played |= self.env.results(td) | self.problem.played()
         return {name: value.cpu().numpy() for name, value in played.items()}
 
     def run_agent(self, agent: HierarchicalAgent) -> dict[str, np.ndarray]:

@@ -80,7 +80,7 @@ _NUM_INTEGERS = 11
 _F = np.float32
 _CUBIC, _QUARTIC = _F(100.0 / 3.0), _F(5.0 / 3.0)
 _SQUARE, _CUBE = _F(100.0), _F(20.0 / 3.0)
-_TOTAL, _GLIDE = _F(1.0 + task.GLIDE), _F(task.GLIDE)
+GLIDE, PRESS_AND_GLIDE = _F(task.GLIDE), _F(1.0 + task.GLIDE)
 _LONGEST, _TANK, _DRY = _F(task.MAX_DURATION), _F(task.TANK), _F(task.DRY)
 _DOCK_SQUARED, _HARBOUR_SQUARED = _F(task.DOCK_RADIUS**2), _F(task.HARBOUR_RADIUS**2)
 _DOCK, _HARBOUR, _LAYOUT = _F(task.DOCK_RADIUS), _F(task.HARBOUR_RADIUS), _F(task.LAYOUT_RADIUS)
@@ -126,11 +126,30 @@ def _length(x: Any, y: Any) -> Any:
 
 
 @inlined
-def _press(x: Any, y: Any, fuel: Any, goal_x: Any, goal_y: Any, dir_x: Any, dir_y: Any, duration: Any) -> Any:
-    """Return x, y, fuel, speed and outcome after a press, as `physics.press` does for columns."""
+def press(
+    x: Any,
+    y: Any,
+    fuel: Any,
+    goal_x: Any,
+    goal_y: Any,
+    dir_x: Any,
+    dir_y: Any,
+    duration: Any,
+    strength: Any = ONE,
+    glide: Any = GLIDE,
+    whole: Any = PRESS_AND_GLIDE,
+) -> Any:
+    """Return x, y, fuel, speed and outcome after a press, as `physics.press` does for columns.
+
+    Args:
+        x, y, fuel, goal_x, goal_y, dir_x, dir_y, duration: of the row.
+        strength: its speed, as a multiple of that of people's boats.
+        glide: length of the glide, as a multiple of the way while the key is down.
+        whole: 1 + `glide`.
+    """
     duration = min(duration, fuel)
-    pressed = _pressed_distance(duration)
-    total = _TOTAL * pressed
+    pressed = strength * _pressed_distance(duration)
+    total = whole * pressed
     ahead = (goal_x - x) * dir_x + (goal_y - y) * dir_y
     aside = (goal_x - x) * dir_y - (goal_y - y) * dir_x
     half_chord_squared = _DOCK_SQUARED - aside * aside
@@ -143,14 +162,14 @@ def _press(x: Any, y: Any, fuel: Any, goal_x: Any, goal_y: Any, dir_x: Any, dir_
     leaves = (to_harbour < total) & (not docks)
     travelled = to_dock if docks else (to_harbour if leaves else total)
     in_glide = travelled > pressed
-    virtual = min(_duration_for((total - travelled) / _GLIDE if in_glide else travelled), duration)
+    virtual = min(_duration_for(((total - travelled) / glide if in_glide else travelled) / strength), duration)
     burnt = duration if in_glide else virtual
     left = fuel - burnt
     left = left if left > _DRY else ZERO
-    docked = task.SUCCESS if _speed(virtual) <= _DOCKING_SPEED else task.TOO_FAST
+    docked = task.SUCCESS if strength * _speed(virtual) <= _DOCKING_SPEED else task.TOO_FAST
     rested = task.SAILING if left > ZERO else task.OUT_OF_FUEL
     outcome = docked if docks else (task.OUT_OF_BOUNDS if leaves else rested)
-    return x + travelled * dir_x, y + travelled * dir_y, left, _speed(burnt), int32(outcome)
+    return x + travelled * dir_x, y + travelled * dir_y, left, strength * _speed(burnt), int32(outcome)
 
 
 @inlined
@@ -171,6 +190,22 @@ def _attempt(bits: Any, step: Any, first: Any) -> Any:
     start, goal = uniform(bits, step, first), uniform(bits, step, first + 1)
     turn = TURN * uniform(bits, step, first + 2)
     return start, goal, turn, start + goal - TWO * math.sqrt(start * goal) * sin_cos(turn)[1] < _NEAR
+
+
+@inlined
+def layout(bits: Any, step: Any) -> Any:
+    """Return start x, start y, goal x and goal y of a row's layout, as `harbour.sample_layout` does for columns."""
+    start, goal, turn, is_near = _attempt(bits, step, 0)
+    for attempt in range(1, task.LAYOUT_TRIES):
+        if is_near:
+            start, goal, turn, is_near = _attempt(bits, step, 3 * attempt)
+    if is_near:
+        goal, turn = _QUARTER, _PI
+    angle = TURN * uniform(bits, step, task.INDEX_ANGLE)
+    start_radius, goal_radius = _LAYOUT * math.sqrt(start), _LAYOUT * math.sqrt(goal)
+    start_sin, start_cos = sin_cos(angle)
+    goal_sin, goal_cos = sin_cos(angle + turn)
+    return start_radius * start_cos, start_radius * start_sin, goal_radius * goal_cos, goal_radius * goal_sin
 
 
 @part
@@ -292,7 +327,7 @@ def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: A
         moves = (numbers[_MOVES * _BLOCK + j] != 0) & (old_outcome == task.SAILING)
 
         dir_x, dir_y = scratch[_DIR_X * _BLOCK + j], scratch[_DIR_Y * _BLOCK + j]
-        new_x, new_y, left, speed, outcome = _press(
+        new_x, new_y, left, speed, outcome = press(
             x, y, fuel, goal_x, goal_y, dir_x, dir_y, scratch[_DURATION * _BLOCK + j]
         )
         is_late = (presses + 1 >= task.MAX_PRESSES) & (outcome == task.SAILING)

@@ -1,0 +1,209 @@
+"""Boats that nobody has sailed, as a batched TorchRL environment: an episode is a session of trips with one boat.
+
+People were never told where the keys push. This is their task with boats that the agent has not met, either. It finds
+out on the first trips what the keys do, and uses it on the later ones. Duan et al. 2016, *RL^2*, arXiv:1611.02779, call
+a session a trial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, TensorSpec, Unbounded
+
+from hpamdp import keys
+from hpamdp.env import counter_rng, kernels
+from hpamdp.env.base import Metric
+from hpamdp.env.batched_env import Action, BatchedEnv
+from hpamdp.env.boatdock import harbour, task
+from hpamdp.env.boatdock_unseen import fleet, kernel, rules
+from hpamdp.env.boatdock_unseen.fleet import FAMILIES
+from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
+from hpamdp.env.boatdock_unseen.rules import SessionRules, SessionState
+from hpamdp.env.counter_rng import RngKey
+from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.rng_streams import EVALUATION, TRAINING
+
+SESSION_SCORE, SESSION_SUCCESS = "session_score", "session_success"  # entries of the tensordict
+_FIRST_TRIPS = 2  # whose scores have metrics of their own
+
+
+class UnseenBoatsEnv(BatchedEnv[SessionState]):
+    """Dock unknown boats in `num_envs` harbours at once.
+
+    An episode is a session of `trips` trips. Each trip is an episode of the boats' task, with a layout and a tank of
+    its own; the session's boat stays. The press that ends a trip is followed by the start of the next.
+
+    Action leaves:
+    - `("action", "discrete")` int64 `[N]` in {0, 1, 2}: the key to press;
+    - `("action", "parameters")` float32 `[N, 3]`: how long to press each key, seconds in [`shortest_press`, 2], of
+      which only the pressed key's counts; values outside are clipped, NaN and infinite ones refused;
+    - with `boats=2`, `option` int64 `[N]`: the boat, 0 or 1, read at a trip's first press and held until its end.
+
+    What the keys do is not observed. The observation shows what the last press did, see
+    `hpamdp.env.boatdock_unseen.rules.OBSERVATION_NAMES`.
+
+    Entries beside it: `trip_ended` bool `[N, 1]`, whether a trip ended with the last press; `session_score` float32
+    `[N, 1]`, the sum of the scores of the trips that have ended, divided by `trips`; `session_success` `[N, 1]`, the
+    share of the session's trips that have ended at the dock.
+
+    For the constructor's arguments and errors see `BatchedEnv`.
+    """
+
+    Options = UnseenBoatsOptions
+    options: UnseenBoatsOptions
+    has_trips = True
+    parameter_dims = (1,) * task.NUM_KEYS
+    outcomes = rules.OUTCOMES
+    observation_names = rules.OBSERVATION_NAMES
+    extra_names = (keys.TRIP_ENDED, SESSION_SCORE, SESSION_SUCCESS)
+    result_keys = (keys.OUTCOME, SESSION_SCORE, SESSION_SUCCESS)
+    action_names = ("key", "durations")
+    row_kernel = staticmethod(kernel.advance)
+    choice_setting: ClassVar[str] = "env.boats=2"
+    no_choice_setting: ClassVar[str] = "env.boats=1"
+    table_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("score", "score of a trip"),
+        Metric("score_trip_1", "score of the first trip"),
+        Metric("score_trip_2", "score of the second trip"),
+        Metric("score_later", "score of the later trips"),
+        Metric("success", "trips that dock", "share"),
+        Metric("presses", "presses a trip", "count"),
+    )
+    curve_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("score", "Score of a trip"),
+        Metric("score_trip_1", "Score of the first trip"),
+        Metric("score_later", "Score of the later trips"),
+        Metric("success", "Trips that dock", "share"),
+    )
+
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem."""
+        return options.facts(cls.__name__)
+
+    def _prepare(self) -> None:
+        options = self.options
+        self.rules = SessionRules(
+            options.fleet, options.trips, options.reward, options.motor_noise, options.sensor_noise
+        )
+        self.max_steps = options.trips * task.MAX_PRESSES
+        self.parameter_low = (options.shortest_press,) * task.NUM_KEYS
+        self.parameter_high = (task.MAX_DURATION,) * task.NUM_KEYS
+        self._fleet_seed = counter_rng.seed_tensor(options.fleet_seed, self.device)
+        self._trip_scores = torch.full((self.num_envs, options.trips), torch.nan, device=self.device)
+        self._trip_presses = torch.zeros(self.num_envs, options.trips, dtype=torch.int32, device=self.device)
+
+    def kernel_settings(self) -> Sequence[float]:
+        """Return the rules in numbers."""
+        options = self.options
+        return [
+            options.trips,
+            options.reward == "sparse",
+            options.motor_noise,
+            options.sensor_noise,
+            FAMILIES.index(options.family),
+            options.fleet.separation,
+            options.spread,
+            options.fleet_size or 0,
+            kernels.folded(options.fleet_seed),
+            options.scored_boats == "new",
+        ]
+
+    def extra_spec(self, name: str) -> TensorSpec:
+        """Return the spec of one of the values beside the observation."""
+        shape = (self.num_envs, 1)
+        if name == keys.TRIP_ENDED:
+            return Binary(1, shape=shape, device=self.device, dtype=torch.bool)
+        if name == SESSION_SCORE:
+            return Unbounded(shape=shape, device=self.device, dtype=torch.float32)
+        return Bounded(0.0, 1.0, shape=shape, device=self.device, dtype=torch.float32)
+
+    def start(self, episode: Tensor, rng: RngKey) -> SessionState:
+        """Return the states at the start of sessions."""
+        layout = harbour.sample_layout(self._session_rng(episode, 0))
+        return rules.start(episode, layout, self._draw_boats(episode), has_choice=self._chooses)
+
+    def act(self, state: SessionState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[SessionState, Tensor]:
+        """Return the states after one press, and the rewards `[N]`."""
+        next_layout = harbour.sample_layout(self._session_rng(state.episode, state.trip + 1))
+        duration = action.parameters.squeeze(-1)
+        return rules.act(
+            state, action.option, action.discrete, duration, next_layout=next_layout, rng=rng, rules=self.rules
+        )
+
+    def observe(self, state: SessionState) -> Tensor:
+        """Return the observations, `[N, 22]`."""
+        rng = self._noise_rng(state) if self.rules.sensor_noise > 0.0 else None
+        return rules.observe(state, rng, self.rules)
+
+    def extras(self, state: SessionState) -> Sequence[Tensor]:
+        """Return the entries `extra_names`."""
+        trips = self.options.trips
+        return state.trip_ended.to(torch.bool), state.total_score / trips, state.docked.to(torch.float32) / trips
+
+    def _session_rng(self, episode: Tensor, number: Tensor | int) -> RngKey:
+        """Return one of the random-number keys of each session, `[N]`."""
+        numbered = episode * rules.NUMBERS_PER_SESSION + number
+        return counter_rng.rng_key(self._seed, self._streams[0], self._environment, numbered)
+
+    def _draw_boats(self, episode: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the bits of both boats of each session, int32 `[N]` each. Those of training are even, others odd."""
+        first, second = (self._session_rng(episode, rules.FIRST_BOAT + number) for number in range(2))
+        if self._streams[0] == EVALUATION and self.options.scored_boats == "new":
+            return first.bits | 1, second.bits | 1
+        size = self.options.fleet_size
+        if size is None:
+            return first.bits & -2, second.bits & -2
+        number = (counter_rng.uniform(first, 0) * size).to(torch.int32).clamp(max=size - 1)
+        beside = (counter_rng.uniform(first, 1) * (size - 1)).to(torch.int32).clamp(max=max(size - 2, 0))
+        other = (number + 1 + beside) % size
+        fleet_key = torch.full_like(episode, rules.FLEET)
+        drawn = (counter_rng.rng_key(self._fleet_seed, TRAINING, each, fleet_key).bits & -2 for each in (number, other))
+        return next(drawn), next(drawn)
+
+    @property
+    def position(self) -> Tensor:
+        """Positions of the boats, px from the harbour's centre, `[N, 2]`."""
+        return torch.stack([self._state.x, self._state.y], -1)
+
+    def known_boats(self, state: SessionState) -> list[fleet.Boats]:
+        """Return what the boats of each session do, which no agent is told: the first and, with two, the second."""
+        bits = (state.first_boat, state.second_boat)[: self.options.boats]
+        return [fleet.boats(each, self.rules.fleet) for each in bits]
+
+    def _on_start(self, mask: Tensor) -> None:
+        self._trip_scores[mask] = torch.nan
+        self._trip_presses[mask] = 0
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Step, and note how trips ended, for `played`."""
+        before = self.state
+        td = super()._step(tensordict)
+        moved = (self._state.steps > before.steps).nonzero().squeeze(-1)
+        trip = before.trip[moved].long()
+        self._trip_presses[moved, trip] += 1
+        ended = moved[self._state.trip_ended[moved] > 0]
+        self._trip_scores[ended, before.trip[ended].long()] = self._state.last_score[ended]
+        return td
+
+    def results(self, last: TensorDictBase) -> dict[str, Tensor]:
+        """Return the mean `score` and `success` of the trips of finished (or abandoned) sessions, `[M]`."""
+        return {"score": last.get(SESSION_SCORE).squeeze(-1), "success": last.get(SESSION_SUCCESS).squeeze(-1)}
+
+    def played(self) -> dict[str, Tensor]:
+        """Return `trip_score` and `trip_presses` `[N, trips]` of the sessions of an evaluation."""
+        return {"trip_score": self._trip_scores.clone(), "trip_presses": self._trip_presses.clone()}
+
+    def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return the mean score by number of the trip, and the mean number of presses of a trip."""
+        score = played["trip_score"].mean(0)
+        means = {f"score_trip_{number}": float(each) for number, each in enumerate(score[:_FIRST_TRIPS], start=1)}
+        if len(score) > _FIRST_TRIPS:
+            means["score_later"] = float(score[_FIRST_TRIPS:].mean())
+        return means | {"presses": float(played["trip_presses"].mean())}

@@ -1,0 +1,296 @@
+"""The rules of sessions for one row, and the loop over all rows that Numba compiles.
+
+It states what `rules` and `fleet` say of columns, for the CPU alone; a test compares the two.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import int32
+
+from hpamdp.env import kernels
+from hpamdp.env.boatdock import kernel as boats
+from hpamdp.env.boatdock import task
+from hpamdp.env.boatdock_unseen import fleet, rules
+from hpamdp.env.kernels import (
+    EPISODE_ROW,
+    EPISODE_STREAM,
+    FIRST_ENV,
+    NOISE_STREAM,
+    ONE,
+    OUTCOME_ROW,
+    OWN,
+    SEED,
+    STEPS_ROW,
+    TURN,
+    TWO,
+    ZERO,
+    episode_hash,
+    inlined,
+    kernel,
+    normal,
+    sin_cos,
+    stream_hash,
+    stream_step,
+    uniform,
+)
+from hpamdp.env.rng_streams import EVALUATION, TRAINING
+
+# Rows of the state's two arrays, in the order of SessionState.
+(
+    START_X,
+    START_Y,
+    GOAL_X,
+    GOAL_Y,
+    X,
+    Y,
+    VELOCITY_X,
+    VELOCITY_Y,
+    FUEL,
+    MOVED_X,
+    MOVED_Y,
+    LAST_DURATION,
+    LAST_SCORE,
+    TOTAL_SCORE,
+) = range(14)
+FIRST_BOAT, SECOND_BOAT, BOAT, LAST_BOAT, LAST_KEY, TRIP, PRESSES, DOCKED, TRIP_ENDED = range(9)
+
+# Places of the sessions' own settings.
+(
+    TRIPS,
+    IS_SPARSE,
+    MOTOR_NOISE,
+    SENSOR_NOISE,
+    FAMILY,
+    SEPARATION,
+    SPREAD,
+    FLEET_SIZE,
+    FLEET_SEED,
+    SCORES_NEW,
+) = range(OWN, OWN + 10)
+
+_F = np.float32
+_ANY, _STRENGTH = fleet.FAMILIES.index("any"), fleet.FAMILIES.index("strength")
+_THIRD = _F(2.0 * math.pi / task.NUM_KEYS)
+_KEYS, _ORDERS = int32(task.NUM_KEYS), _F(fleet.NUM_ORDERS)
+_UNIT, _SPEED = _F(1.0 / task.HARBOUR_RADIUS), _F(1.0 / task.SPEED_SCALE)
+_GLIDE, _TANK, _LONGEST = _F(task.GLIDE), _F(task.TANK), _F(task.MAX_DURATION)
+_SUCCESS, _FAILURE = _F(task.SUCCESS_REWARD), _F(task.FAILURE_REWARD)
+_NEAREST = _F(task.DOCK_RADIUS / task.HARBOUR_RADIUS)
+_NUM_SEEN = 8  # positions and displacements that sensors measure
+
+
+@inlined
+def _direction(bits: Any, key: Any, settings: Any) -> Any:
+    """Return the unit direction of a boat's key, as `fleet.direction` does for columns."""
+    step = stream_step(int32(TRAINING))
+    order = int32(uniform(bits, step, fleet.ORDER) * _ORDERS)
+    shift = order % _KEYS
+    slot = int32(((key + shift) if order < _KEYS else (shift - key + _KEYS)) % _KEYS)
+    offset = _F(slot) * _THIRD
+    if settings[FAMILY] == _ANY:
+        first, second = uniform(bits, step, fleet.FIRST_GAP), uniform(bits, step, fleet.SECOND_GAP)
+        separation = _F(settings[SEPARATION])
+        free = TURN - _F(task.NUM_KEYS) * separation
+        one, two = separation + free * min(first, second), TWO * separation + free * max(first, second)
+        offset = ZERO if slot == 0 else (one if slot == 1 else two)
+    sine, cosine = sin_cos(TURN * uniform(bits, step, fleet.TURN) + offset)
+    return cosine, sine
+
+
+@inlined
+def _strength_and_glide(bits: Any, settings: Any) -> Any:
+    """Return speed and glide of a boat, as `fleet.strength_and_glide` does for columns."""
+    if settings[FAMILY] != _STRENGTH:
+        return ONE, ONE
+    step, spread = stream_step(int32(TRAINING)), _F(settings[SPREAD])
+    strength = ONE + spread * (TWO * uniform(bits, step, fleet.STRENGTH) - ONE)
+    return strength, ONE + spread * (TWO * uniform(bits, step, fleet.GLIDE) - ONE)
+
+
+@inlined
+def _session_hash(settings: Any, row: Any, episode: Any, number: Any) -> Any:
+    """Return the bits of a random-number key of a session, as `UnseenBoatsEnv` numbers them."""
+    base = stream_hash(settings[SEED], int32(settings[EPISODE_STREAM]))
+    return episode_hash(base, int32(settings[FIRST_ENV]) + row, episode * int32(rules.NUMBERS_PER_SESSION) + number)
+
+
+@inlined
+def _draw_boats(settings: Any, row: Any, episode: Any) -> Any:
+    """Return the bits of a session's two boats, as `UnseenBoatsEnv` draws them."""
+    stream = int32(settings[EPISODE_STREAM])
+    first = _session_hash(settings, row, episode, int32(rules.FIRST_BOAT))
+    second = _session_hash(settings, row, episode, int32(rules.FIRST_BOAT + 1))
+    is_test = stream == EVALUATION and settings[SCORES_NEW] != 0.0
+    if is_test:
+        return int32(first) | int32(1), int32(second) | int32(1)
+    size = int32(settings[FLEET_SIZE])
+    if size > 0:
+        step = stream_step(stream)
+        number = min(int32(uniform(first, step, 0) * _F(size)), size - int32(1))
+        beside = min(int32(uniform(first, step, 1) * _F(size - int32(1))), max(size - int32(2), int32(0)))
+        base = stream_hash(settings[FLEET_SEED], int32(TRAINING))
+        other = (number + int32(1) + beside) % size
+        first = episode_hash(base, number, int32(rules.FLEET))
+        second = episode_hash(base, other, int32(rules.FLEET))
+    return int32(first) & int32(-2), int32(second) & int32(-2)
+
+
+@inlined
+def _begin_trip(floats: Any, integers: Any, row: Any, trip: Any, settings: Any) -> None:
+    """Put the boat at the start of a trip with a full tank."""
+    bits = _session_hash(settings, row, integers[EPISODE_ROW, row], int32(trip))
+    start_x, start_y, goal_x, goal_y = boats.layout(bits, stream_step(int32(settings[EPISODE_STREAM])))
+    floats[START_X, row], floats[START_Y, row] = start_x, start_y
+    floats[GOAL_X, row], floats[GOAL_Y, row] = goal_x, goal_y
+    floats[X, row], floats[Y, row], floats[FUEL, row] = start_x, start_y, _TANK
+    integers[BOAT, row] = task.NOT_CHOSEN if settings[kernels.NUM_OPTIONS] > 0 else 0
+    integers[TRIP, row], integers[PRESSES, row] = trip, 0
+
+
+@inlined
+def _start(floats: Any, integers: Any, row: Any, settings: Any) -> None:
+    """Begin a session in a row, as `rules.start` does for columns."""
+    kernels.new_episode(integers, row, settings)
+    for column in range(VELOCITY_X, TOTAL_SCORE + 1):
+        floats[column, row] = ZERO
+    first, second = _draw_boats(settings, row, integers[EPISODE_ROW, row])
+    integers[FIRST_BOAT, row], integers[SECOND_BOAT, row] = first, second
+    integers[LAST_BOAT, row], integers[LAST_KEY, row] = task.NOT_CHOSEN, -1
+    integers[DOCKED, row], integers[TRIP_ENDED, row] = 0, 0
+    _begin_trip(floats, integers, row, 0, settings)
+
+
+@inlined
+def _act(floats: Any, integers: Any, row: Any, option: Any, key: Any, duration: Any, settings: Any) -> Any:
+    """Press a key in a row, as `rules.act` does for columns, and return the reward."""
+    boat = integers[BOAT, row]
+    if boat == task.NOT_CHOSEN:
+        boat = int32(option)
+    steps, noise = integers[STEPS_ROW, row], _F(settings[MOTOR_NOISE])
+    if noise > ZERO:
+        bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
+        drawn = normal(bits, step, steps * (rules.NUMBERS_PER_PRESS // 2) + rules.MOTOR)
+        duration = min(duration * _F(math.exp(noise * drawn)), _LONGEST)
+    own = integers[SECOND_BOAT, row] if boat == 1 else integers[FIRST_BOAT, row]
+    dir_x, dir_y = _direction(own, int32(key), settings)
+    strength, glide = _strength_and_glide(own, settings)
+    x, y, goal_x, goal_y = floats[X, row], floats[Y, row], floats[GOAL_X, row], floats[GOAL_Y, row]
+    start_x, start_y = floats[START_X, row], floats[START_Y, row]
+    new_x, new_y, left, speed, outcome = boats.press(
+        x,
+        y,
+        floats[FUEL, row],
+        goal_x,
+        goal_y,
+        dir_x,
+        dir_y,
+        duration,
+        strength,
+        _GLIDE * glide,
+        ONE + _GLIDE * glide,
+    )
+    presses = integers[PRESSES, row] + 1
+    if presses >= task.MAX_PRESSES and outcome == task.SAILING:
+        outcome = int32(task.TIME_LIMIT)
+    docks, ends = outcome == task.SUCCESS, outcome != task.SAILING
+    final = _SUCCESS * left / _TANK if docks else ZERO
+    reward = final
+    if settings[IS_SPARSE] == 0.0:
+        before = math.sqrt((goal_x - x) ** 2 + (goal_y - y) ** 2)
+        after = math.sqrt((goal_x - new_x) ** 2 + (goal_y - new_y) ** 2)
+        failed = (outcome > task.SUCCESS) & (outcome < task.TIME_LIMIT)
+        at_start = math.sqrt((goal_x - start_x) ** 2 + (goal_y - start_y) ** 2)
+        reward = (before - after) / at_start + (_FAILURE if failed else final)
+    floats[X, row], floats[Y, row], floats[FUEL, row] = new_x, new_y, left
+    floats[VELOCITY_X, row], floats[VELOCITY_Y, row] = speed * dir_x, speed * dir_y
+    floats[MOVED_X, row], floats[MOVED_Y, row] = new_x - x, new_y - y
+    floats[LAST_DURATION, row] = duration
+    integers[BOAT, row], integers[LAST_BOAT, row], integers[LAST_KEY, row] = boat, boat, int32(key)
+    integers[PRESSES, row], integers[STEPS_ROW, row] = presses, steps + 1
+    integers[TRIP_ENDED, row] = int32(ends)
+    if ends:
+        score = final if docks else _FAILURE
+        floats[LAST_SCORE, row] = score
+        floats[TOTAL_SCORE, row] += score
+        integers[DOCKED, row] += int32(docks)
+        trip = integers[TRIP, row] + 1
+        if trip < settings[TRIPS]:
+            _begin_trip(floats, integers, row, trip, settings)
+        else:
+            integers[OUTCOME_ROW, row] = rules.FINISHED
+    return reward
+
+
+@inlined
+def _observe(floats: Any, integers: Any, row: Any, settings: Any, observation: Any) -> None:
+    """Write the observation of a row, as `rules.observe` does for columns."""
+    for place in range(Y + 1):  # start, goal and boat
+        observation[place] = floats[place, row]
+    observation[19], observation[20] = floats[MOVED_X, row], floats[MOVED_Y, row]
+    noise, last_key = _F(settings[SENSOR_NOISE]), integers[LAST_KEY, row]
+    if noise > ZERO:
+        bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
+        index = integers[STEPS_ROW, row] * (rules.NUMBERS_PER_PRESS // 2) + rules.SENSOR
+        for number in range(_NUM_SEEN if last_key >= 0 else _NUM_SEEN - 2):
+            place = number if number < 6 else 13 + number
+            observation[place] += noise * normal(bits, step, index + number)
+    for place in range(Y + 1):
+        observation[place] *= _UNIT
+    observation[19] *= _UNIT
+    observation[20] *= _UNIT
+    to_goal_x, to_goal_y = observation[2] - observation[4], observation[3] - observation[5]
+    across, along = observation[2] - observation[0], observation[3] - observation[1]
+    at_start = max(math.sqrt(across * across + along * along), _NEAREST)
+    observation[6], observation[7] = to_goal_x, to_goal_y
+    observation[8] = floats[FUEL, row] / _TANK
+    observation[9] = math.sqrt(to_goal_x * to_goal_x + to_goal_y * to_goal_y) / at_start
+    observation[10], observation[11] = floats[VELOCITY_X, row] * _SPEED, floats[VELOCITY_Y, row] * _SPEED
+    observation[12] = _F(integers[TRIP, row]) / _F(settings[TRIPS])
+    observation[13], observation[14] = _F(integers[BOAT, row]), _F(integers[LAST_BOAT, row])
+    for key in range(task.NUM_KEYS):
+        observation[15 + key] = ONE if last_key == key else ZERO
+    observation[18] = floats[LAST_DURATION, row] / _LONGEST
+    observation[21] = floats[LAST_SCORE, row] / _SUCCESS
+
+
+@kernel
+def advance(
+    floats: Any,
+    integers: Any,
+    option: Any,
+    discrete: Any,
+    parameters: Any,
+    places: Any,
+    bounds: Any,
+    mask: Any,
+    settings: Any,
+    mode: Any,
+    observations: Any,
+    outcomes: Any,
+    extras: Any,
+    flags: Any,
+    rewards: Any,
+) -> int:
+    """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
+    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
+    trips = _F(settings[TRIPS])
+    for row in range(len(mask)):
+        was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
+        if mode != kernels.RESTART and mask[row] and not was_over:
+            duration = kernels.parameter(parameters, row, 0, discrete[row], places, bounds)
+            rewards[row] = _act(floats, integers, row, option[row], discrete[row], duration, settings)
+        for reading in range(len(observations)):
+            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
+                _start(floats, integers, row, settings)
+            _observe(floats, integers, row, settings, observations[reading, row])
+            extras[reading, 0, row] = _F(integers[TRIP_ENDED, row])
+            extras[reading, 1, row] = floats[TOTAL_SCORE, row] / trips
+            extras[reading, 2, row] = _F(integers[DOCKED, row]) / trips
+            kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1

@@ -1,0 +1,77 @@
+"""The settings of sessions with unknown boats."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+from typing_extensions import Self
+
+from hpamdp.env.boatdock.task import RewardForm
+from hpamdp.env.boatdock_unseen.fleet import Family, FleetRules
+from hpamdp.env.facts import ProblemFacts
+from hpamdp.settings import Settings
+
+MOST_TRIPS = 24
+BOAT_NAMES = ("first", "second")
+
+
+class UnseenBoatsOptions(Settings):
+    """Settings of `UnseenBoatsEnv`."""
+
+    trips: Annotated[int, Field(ge=1, le=MOST_TRIPS)] = 8
+    """Trips of a session, each with a layout and a full tank of its own."""
+    boats: Literal[1, 2] = 1
+    """Boats of a session. With 2 the agent chooses one at a trip's first press, and keeps it for the trip."""
+    family: Family = "turned"
+    """What boats differ in. `turned`: people's three directions, turned by any angle, with the keys in any order.
+
+    `any`: any three directions that are `separation` apart. `strength`: as `turned`, and speed and glide differ, too.
+    """
+    separation: Annotated[float, Field(ge=0.0, le=110.0)] = 60.0
+    """With `family=any`: least angle between two directions, in degrees."""
+    spread: Annotated[float, Field(ge=0.0, le=0.5)] = 0.3
+    """With `family=strength`: speed and glide are up to this share above or below those of people's boats."""
+    fleet_size: Annotated[int, Field(ge=1, le=2**24)] | None = None
+    """Number of different boats in training. If None, each session draws new ones."""
+    fleet_seed: int = 0
+    """With a `fleet_size`: which boats these are."""
+    scored_boats: Literal["new", "training"] = "new"
+    """Boats of evaluations: `new` ones, which no training meets, or those of training; the latter need a `fleet_size`."""
+    shortest_press: Annotated[float, Field(ge=0.0, le=1.0)] = 0.15
+    """Seconds of the shortest press; the default is the fifth percentile of people's presses.
+
+    A shorter press could show a direction for nothing.
+    """
+    reward: RewardForm = "paper"
+    """`paper`: progress at each press, 5 x the fuel left on success, -1 on failure. `sparse`: only the success term."""
+    motor_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
+    """Standard deviation of the log of the executed duration."""
+    sensor_noise: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    """Standard deviation of the positions and of the displacement that are seen, in pixels."""
+    compile_rules: bool = False
+    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
+
+    @model_validator(mode="after")
+    def _check_fleet(self) -> Self:
+        if self.fleet_size is None and self.scored_boats == "training":
+            raise ValueError("scored_boats=training: needs a fleet_size; without one training draws new boats each time")
+        if self.fleet_size is not None and self.fleet_size < self.boats:
+            raise ValueError(f"fleet_size={self.fleet_size}: a session has boats={self.boats}, so it needs as many")
+        return self
+
+    @property
+    def fleet(self) -> FleetRules:
+        """The boats that sessions draw from."""
+        return FleetRules(self.family, math.radians(self.separation), self.spread)
+
+    def facts(self, title: str) -> ProblemFacts:
+        """Return what these settings tell of the problem, which errors call `title`."""
+        has_choice = self.boats > 1
+        return ProblemFacts(
+            title=title,
+            option_names=BOAT_NAMES if has_choice else (),
+            has_choice=has_choice,
+            can_change_option=False,
+        )

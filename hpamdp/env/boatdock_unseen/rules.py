@@ -1,0 +1,296 @@
+"""A session of trips as pure functions on columns: how it starts, a press, the observation.
+
+A press is that of the boats' task, see `hpamdp.env.boatdock.physics`. A trip is one episode of that task; the press that
+ends it is followed by the next trip's layout. Positions are px from the harbour's centre.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from hpamdp.env import counter_rng
+from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock.harbour import Layout
+from hpamdp.env.boatdock.task import (
+    DOCK_RADIUS,
+    FAILURE_REWARD,
+    HARBOUR_RADIUS,
+    MAX_DURATION,
+    MAX_PRESSES,
+    NOT_CHOSEN,
+    NUM_KEYS,
+    SAILING,
+    SPEED_SCALE,
+    SUCCESS,
+    SUCCESS_REWARD,
+    TANK,
+    TIME_LIMIT,
+    RewardForm,
+)
+from hpamdp.env.boatdock_unseen import fleet
+from hpamdp.env.boatdock_unseen.fleet import FleetRules
+from hpamdp.env.counter_rng import RngKey
+
+OUTCOMES = ("sailing", "finished", "time_limit")  # of sessions; no session reaches the limit of its presses
+GOING_ON, FINISHED, _ = range(len(OUTCOMES))
+
+# A session's random-number keys count from `NUMBERS_PER_SESSION` times its number: the layouts of its trips, then the
+# boats.
+NUMBERS_PER_SESSION = 32
+FIRST_BOAT = 30
+# The number in place of a session's for the keys of a fleet's boats.
+FLEET = -(2**30)
+
+# Each press has this many random numbers for noise. MOTOR and SENSOR count Gaussian ones, SENSOR is the first of eight.
+NUMBERS_PER_PRESS = 24
+MOTOR, SENSOR = 0, 1
+
+OBSERVATION_NAMES = (
+    "start_x",
+    "start_y",
+    "goal_x",
+    "goal_y",
+    "boat_x",
+    "boat_y",
+    "to_goal_x",
+    "to_goal_y",
+    "fuel",
+    "distance",
+    "velocity_x",
+    "velocity_y",
+    "trip",
+    "boat",
+    "last_boat",
+    "last_key_1",
+    "last_key_2",
+    "last_key_3",
+    "last_duration",
+    "moved_x",
+    "moved_y",
+    "last_score",
+)
+
+
+class SessionRules(NamedTuple):
+    """The rules of sessions. The settings of UnseenBoatsEnv explain the fields."""
+
+    fleet: FleetRules = FleetRules()
+    trips: int = 8
+    reward: RewardForm = "paper"
+    motor_noise: float = 0.0
+    sensor_noise: float = 0.0
+
+
+class SessionState(NamedTuple):
+    """The state of N sessions, columns `[N]`: positions in px, fuel in seconds, int32 integers.
+
+    The velocity is the one at the end of the last press, before the glide. `moved` is the displacement by the last
+    press, `last_score` the score of the trip before this one, and `total_score` the sum of the scores of all trips that
+    have ended. `boat` and `last_boat` are the numbers of this trip's boat and of the boat of the last press, or
+    NOT_CHOSEN. `last_key` is -1 before the first press. `trip_ended` is 1 if a trip ended with the last press.
+    `episode` is the number of the session, -1 before the first reset.
+    """
+
+    start_x: Tensor
+    start_y: Tensor
+    goal_x: Tensor
+    goal_y: Tensor
+    x: Tensor
+    y: Tensor
+    velocity_x: Tensor
+    velocity_y: Tensor
+    fuel: Tensor
+    moved_x: Tensor
+    moved_y: Tensor
+    last_duration: Tensor
+    last_score: Tensor
+    total_score: Tensor
+    first_boat: Tensor  # bits, see `fleet`
+    second_boat: Tensor
+    boat: Tensor
+    last_boat: Tensor
+    last_key: Tensor
+    trip: Tensor
+    presses: Tensor  # of this trip
+    docked: Tensor  # number of trips that have ended at the dock
+    trip_ended: Tensor
+    steps: Tensor
+    outcome: Tensor
+    episode: Tensor
+
+
+def start(episode: Tensor, layout: Layout, boats: tuple[Tensor, Tensor], *, has_choice: bool) -> SessionState:
+    """Return the states at the start of sessions.
+
+    Args:
+        episode: numbers of the sessions, int32 `[N]`.
+        layout: layouts of their first trips.
+        boats: bits of the first and of the second boat, int32 `[N]` each.
+        has_choice: whether the agent chooses between the two.
+    """
+    zeros, none = torch.zeros_like(layout.start_x), torch.zeros_like(episode)
+    return SessionState(
+        *layout,
+        x=layout.start_x,
+        y=layout.start_y,
+        velocity_x=zeros,
+        velocity_y=zeros,
+        fuel=zeros + TANK,
+        moved_x=zeros,
+        moved_y=zeros,
+        last_duration=zeros,
+        last_score=zeros,
+        total_score=zeros,
+        first_boat=boats[0],
+        second_boat=boats[1],
+        boat=none + (NOT_CHOSEN if has_choice else 0),
+        last_boat=none + NOT_CHOSEN,
+        last_key=none - 1,
+        trip=none,
+        presses=none,
+        docked=none,
+        trip_ended=none,
+        steps=none,
+        outcome=none + GOING_ON,
+        episode=episode,
+    )
+
+
+def act(
+    state: SessionState,
+    option: Tensor | None,
+    key: Tensor,
+    duration: Tensor,
+    *,
+    next_layout: Layout,
+    rng: RngKey,
+    rules: SessionRules,
+) -> tuple[SessionState, Tensor]:
+    """Return the sessions after a press, as if none were over, and the rewards `[N]`.
+
+    Args:
+        state: states before the press.
+        option: chosen boats, integers `[N]`, which count at a trip's first press. None if there is one boat.
+        key: 0, 1 or 2, integers `[N]`.
+        duration: seconds of the press, `[N]`.
+        next_layout: layouts of the next trips.
+        rng: random-number keys of the noise, `[N]`.
+        rules: rules of the sessions.
+    """
+    key = key.to(torch.int32)
+    boat = state.boat if option is None else torch.where(state.boat == NOT_CHOSEN, option.to(torch.int32), state.boat)
+    if rules.motor_noise > 0.0:
+        index = state.steps * (NUMBERS_PER_PRESS // 2) + MOTOR
+        duration = (duration * (rules.motor_noise * counter_rng.normal(rng, index)).exp()).clamp(max=MAX_DURATION)
+    bits = torch.where(boat == 1, state.second_boat, state.first_boat)
+    dir_x, dir_y = fleet.direction(bits, key, rules.fleet)
+    strength, glide = fleet.strength_and_glide(bits, rules.fleet)
+    pressed = physics.press(
+        state.x,
+        state.y,
+        state.fuel,
+        state.goal_x,
+        state.goal_y,
+        dir_x,
+        dir_y,
+        duration,
+        strength=strength,
+        glide=glide,
+    )
+    is_late = (state.presses + 1 >= MAX_PRESSES) & (pressed.outcome == SAILING)
+    outcome = torch.where(is_late, TIME_LIMIT, pressed.outcome)
+    ends, docks = outcome != SAILING, outcome == SUCCESS
+    score = harbour.score(outcome, pressed.fuel / TANK)
+    at_start = harbour.separation(_layout(state))
+    final = torch.where(docks, SUCCESS_REWARD * pressed.fuel / TANK, 0.0)
+    if rules.reward == "sparse":
+        reward = final
+    else:
+        failed = (outcome > SUCCESS) & (outcome < TIME_LIMIT)
+        before = _distance(state.x, state.y, state)
+        progress = (before - _distance(pressed.x, pressed.y, state)) / at_start
+        reward = progress + torch.where(failed, FAILURE_REWARD, final)
+    is_last = state.trip + 1 >= rules.trips
+    begins = ends & ~is_last
+    zeros = torch.zeros_like(state.x)
+    after = SessionState(
+        *(torch.where(begins, new, old) for new, old in zip(next_layout, _layout(state), strict=True)),
+        x=torch.where(begins, next_layout.start_x, pressed.x),
+        y=torch.where(begins, next_layout.start_y, pressed.y),
+        velocity_x=pressed.speed * dir_x,
+        velocity_y=pressed.speed * dir_y,
+        fuel=torch.where(begins, TANK, pressed.fuel),
+        moved_x=pressed.x - state.x,
+        moved_y=pressed.y - state.y,
+        last_duration=duration + zeros,
+        last_score=torch.where(ends, score, state.last_score),
+        total_score=state.total_score + torch.where(ends, score, 0.0),
+        first_boat=state.first_boat,
+        second_boat=state.second_boat,
+        boat=boat if option is None else torch.where(begins, NOT_CHOSEN, boat),
+        last_boat=boat,
+        last_key=key,
+        trip=state.trip + begins.to(torch.int32),
+        presses=torch.where(begins, 0, state.presses + 1),
+        docked=state.docked + docks.to(torch.int32),
+        trip_ended=ends.to(torch.int32),
+        steps=state.steps + 1,
+        outcome=torch.where(ends & is_last, FINISHED, GOING_ON).to(torch.int32),
+        episode=state.episode,
+    )
+    return after, reward
+
+
+def observe(state: SessionState, rng: RngKey | None, rules: SessionRules) -> Tensor:
+    """Return the observations, float32 `[N, 22]`, with the entries OBSERVATION_NAMES.
+
+    Args:
+        state: states of the sessions.
+        rng: random-number keys of the noise, `[N]`. None if the sensors have no noise.
+        rules: rules of the sessions.
+    """
+    seen = [state.start_x, state.start_y, state.goal_x, state.goal_y, state.x, state.y, state.moved_x, state.moved_y]
+    has_pressed = state.last_key >= 0
+    if rng is not None:
+        first = state.steps * (NUMBERS_PER_PRESS // 2) + SENSOR
+        seen = [each + rules.sensor_noise * counter_rng.normal(rng, first + i) for i, each in enumerate(seen)]
+        seen[6:] = [torch.where(has_pressed, each, 0.0) for each in seen[6:]]
+    start_x, start_y, goal_x, goal_y, x, y, moved_x, moved_y = (each * (1.0 / HARBOUR_RADIUS) for each in seen)
+    to_goal_x, to_goal_y = goal_x - x, goal_y - y
+    # The clamp is needed because sensor noise can bring start and goal together.
+    at_start = ((goal_x - start_x).square() + (goal_y - start_y).square()).sqrt().clamp(min=DOCK_RADIUS / HARBOUR_RADIUS)
+    columns = [
+        start_x,
+        start_y,
+        goal_x,
+        goal_y,
+        x,
+        y,
+        to_goal_x,
+        to_goal_y,
+        state.fuel / TANK,
+        (to_goal_x.square() + to_goal_y.square()).sqrt() / at_start,
+        state.velocity_x * (1.0 / SPEED_SCALE),
+        state.velocity_y * (1.0 / SPEED_SCALE),
+        state.trip.to(torch.float32) / rules.trips,
+        state.boat.to(torch.float32),
+        state.last_boat.to(torch.float32),
+        *((state.last_key == key).to(torch.float32) for key in range(NUM_KEYS)),
+        state.last_duration / MAX_DURATION,
+        moved_x,
+        moved_y,
+        state.last_score / SUCCESS_REWARD,
+    ]
+    return torch.stack(columns, -1)
+
+
+def _layout(state: SessionState) -> Layout:
+    return Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
+
+
+def _distance(x: Tensor, y: Tensor, state: SessionState) -> Tensor:
+    """Return the distance of a point from the goal, px `[N]`."""
+    return ((state.goal_x - x).square() + (state.goal_y - y).square()).sqrt()
