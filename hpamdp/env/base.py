@@ -278,7 +278,7 @@ class PAMDPEnv(EnvBase):
         return {}
 
     def played(self) -> dict[str, Tensor]:
-        """Return what the environment has noted of the episodes of an evaluation, `[N, ...]` each, once all are over."""
+        """Return what the environment has noted of an evaluation's episodes, `[N, ...]` each, once all are over."""
         return {}
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,8 +17,19 @@ from hpamdp.env.boatdock.rendering import Leg, Scene
 from hpamdp.env.boatdock.task import MAX_PRESSES, Boats, BoatState, Rules
 
 
+class Engine(NamedTuple):
+    """How a boat moves, as multiples of people's boats; see `physics.press`."""
+
+    strength: float = 1.0
+    glide: float = 1.0
+
+
 def film(
-    track: Sequence[Mapping[str, Tensor]], fps: float, size: int, rules: Rules | None = None
+    track: Sequence[Mapping[str, Tensor]],
+    fps: float,
+    size: int,
+    rules: Rules | None = None,
+    engine: Engine | None = None,
 ) -> Iterator[np.ndarray]:
     """Yield the pictures of one episode, uint8 `[size, size, 3]` each, from its start to its end.
 
@@ -26,8 +38,10 @@ def film(
         fps: pictures per second.
         size: width and height of a picture, px.
         rules: rules of the environment. If None, the default ones.
+        engine: how the boat moves. If None, as people's boats.
     """
     rules = Rules() if rules is None else rules
+    engine = Engine() if engine is None else engine
     states = [BoatState(*(columns[name].double() for name in BoatState._fields)) for columns in track]
     scene = _scene(states[0], states[min(1, len(states) - 1)], rules.boats)
     yield rendering.draw(scene, size)
@@ -38,12 +52,12 @@ def film(
         before = before._replace(fuel=rendering.fuel_at_press(before, after, rules.switch_cost))
         length = math.hypot((after.x - before.x).item(), (after.y - before.y).item())
         burnt = (before.fuel - after.fuel).clamp(min=0.0)  # how long the key was down
-        seconds = physics.time_at(burnt, burnt.new_tensor([length])).item()
+        seconds = physics.time_at(burnt, burnt.new_tensor([length]), *engine).item()
         times = np.arange(late, seconds, 1.0 / fps)
         for time in times.tolist():
-            yield rendering.draw(_underway(scene, before, after, burnt, length, time), size)
+            yield rendering.draw(_underway(scene, before, after, burnt, length, time, engine), size)
         late += len(times) / fps - seconds
-        scene = _rested(scene, before, after, burnt, length)
+        scene = _rested(scene, before, after, burnt, length, engine)
     yield rendering.draw(scene, size)
 
 
@@ -60,14 +74,22 @@ def _scene(first: BoatState, second: BoatState, boats: Boats | None) -> Scene:
     )
 
 
-def _underway(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, length: float, seconds: float) -> Scene:
+def _underway(
+    scene: Scene,
+    before: BoatState,
+    after: BoatState,
+    burnt: Tensor,
+    length: float,
+    seconds: float,
+    engine: Engine,
+) -> Scene:
     """Return the scene `seconds` after the beginning of a press."""
     elapsed = burnt.new_tensor([seconds])
-    fraction = min(physics.distance_at(burnt, elapsed).item() / length, 1.0) if length > 0.0 else 0.0
+    fraction = min(physics.distance_at(burnt, elapsed, *engine).item() / length, 1.0) if length > 0.0 else 0.0
     start = (before.x.item(), before.y.item())
     end = (after.x.item(), after.y.item())
     boat = (start[0] + fraction * (end[0] - start[0]), start[1] + fraction * (end[1] - start[1]))
-    pressed = physics.pressed_distance(torch.minimum(burnt, elapsed)).item()
+    pressed = engine.strength * physics.pressed_distance(torch.minimum(burnt, elapsed)).item()
     made = fraction * length
     leg = Leg(start, boat, min(pressed / made, 1.0) if made > 0.0 else 1.0)
     return replace(
@@ -81,10 +103,11 @@ def _underway(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, 
     )
 
 
-def _rested(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, length: float) -> Scene:
+def _rested(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, length: float, engine: Engine) -> Scene:
     """Return the scene at the end of a press."""
     start, end = (before.x.item(), before.y.item()), (after.x.item(), after.y.item())
-    pressed = min(physics.pressed_distance(burnt).item() / length, 1.0) if length > 0.0 else 1.0
+    pressed = engine.strength * physics.pressed_distance(burnt).item()
+    pressed = min(pressed / length, 1.0) if length > 0.0 else 1.0
     outcome = int(after.outcome)
     is_over = outcome != physics.SAILING
     return replace(

@@ -7,7 +7,7 @@ a session a trial.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -96,7 +96,9 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         self.parameter_low = (options.shortest_press,) * task.NUM_KEYS
         self.parameter_high = (task.MAX_DURATION,) * task.NUM_KEYS
         self._fleet_seed = counter_rng.seed_tensor(options.fleet_seed, self.device)
-        self._trip_scores = torch.full((self.num_envs, options.trips), torch.nan, device=self.device)
+        self._trip_scores = torch.full(
+            (self.num_envs, options.trips), torch.nan, device=self.device, dtype=torch.float32
+        )
         self._trip_presses = torch.zeros(self.num_envs, options.trips, dtype=torch.int32, device=self.device)
 
     def kernel_settings(self) -> Sequence[float]:
@@ -171,6 +173,12 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
     def position(self) -> Tensor:
         """Positions of the boats, px from the harbour's centre, `[N, 2]`."""
         return torch.stack([self._state.x, self._state.y], -1)
+
+    def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
+        """Return the pictures of one session, in which boats move as they do in the task."""
+        from hpamdp.env.boatdock_unseen import film  # only films need it
+
+        return film.film(track, fps, size, self.rules, self.options.boats)
 
     def known_boats(self, state: SessionState) -> list[fleet.Boats]:
         """Return what the boats of each session do, which no agent is told: the first and, with two, the second."""

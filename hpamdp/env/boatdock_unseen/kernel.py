@@ -19,7 +19,6 @@ from hpamdp.env.kernels import (
     EPISODE_ROW,
     EPISODE_STREAM,
     FIRST_ENV,
-    NOISE_STREAM,
     ONE,
     OUTCOME_ROW,
     OWN,

@@ -38,7 +38,7 @@ class UnseenBoatsOptions(Settings):
     fleet_seed: int = 0
     """With a `fleet_size`: which boats these are."""
     scored_boats: Literal["new", "training"] = "new"
-    """Boats of evaluations: `new` ones, which no training meets, or those of training; the latter need a `fleet_size`."""
+    """Boats of evaluations: `new` ones, which no training meets, or with a `fleet_size` those of `training`."""
     shortest_press: Annotated[float, Field(ge=0.0, le=1.0)] = 0.15
     """Seconds of the shortest press; the default is the fifth percentile of people's presses.
 
@@ -56,7 +56,9 @@ class UnseenBoatsOptions(Settings):
     @model_validator(mode="after")
     def _check_fleet(self) -> Self:
         if self.fleet_size is None and self.scored_boats == "training":
-            raise ValueError("scored_boats=training: needs a fleet_size; without one training draws new boats each time")
+            raise ValueError(
+                "scored_boats=training: needs a fleet_size; without one training draws new boats each time"
+            )
         if self.fleet_size is not None and self.fleet_size < self.boats:
             raise ValueError(f"fleet_size={self.fleet_size}: a session has boats={self.boats}, so it needs as many")
         return self

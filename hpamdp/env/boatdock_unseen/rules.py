@@ -1,7 +1,7 @@
 """A session of trips as pure functions on columns: how it starts, a press, the observation.
 
-A press is that of the boats' task, see `hpamdp.env.boatdock.physics`. A trip is one episode of that task; the press that
-ends it is followed by the next trip's layout. Positions are px from the harbour's centre.
+A press is that of the boats' task, see `hpamdp.env.boatdock.physics`. A trip is one episode of that task. The press
+that ends it is followed by the next trip's layout. Positions are px from the harbour's centre.
 """
 
 from __future__ import annotations
@@ -216,8 +216,14 @@ def act(
     is_last = state.trip + 1 >= rules.trips
     begins = ends & ~is_last
     zeros = torch.zeros_like(state.x)
+    start_x, start_y, goal_x, goal_y = (
+        torch.where(begins, new, old) for new, old in zip(next_layout, _layout(state), strict=True)
+    )
     after = SessionState(
-        *(torch.where(begins, new, old) for new, old in zip(next_layout, _layout(state), strict=True)),
+        start_x=start_x,
+        start_y=start_y,
+        goal_x=goal_x,
+        goal_y=goal_y,
         x=torch.where(begins, next_layout.start_x, pressed.x),
         y=torch.where(begins, next_layout.start_y, pressed.y),
         velocity_x=pressed.speed * dir_x,
@@ -261,7 +267,9 @@ def observe(state: SessionState, rng: RngKey | None, rules: SessionRules) -> Ten
     start_x, start_y, goal_x, goal_y, x, y, moved_x, moved_y = (each * (1.0 / HARBOUR_RADIUS) for each in seen)
     to_goal_x, to_goal_y = goal_x - x, goal_y - y
     # The clamp is needed because sensor noise can bring start and goal together.
-    at_start = ((goal_x - start_x).square() + (goal_y - start_y).square()).sqrt().clamp(min=DOCK_RADIUS / HARBOUR_RADIUS)
+    at_start = (
+        ((goal_x - start_x).square() + (goal_y - start_y).square()).sqrt().clamp(min=DOCK_RADIUS / HARBOUR_RADIUS)
+    )
     columns = [
         start_x,
         start_y,
