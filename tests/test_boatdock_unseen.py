@@ -217,11 +217,29 @@ def test_nothing_of_the_boat_is_seen_before_the_first_press_and_its_displacement
     assert keys_seen.equal(first[keys.DISCRETE])
 
 
+def test_in_the_frame_of_the_first_press_all_vectors_are_turned_so_that_this_press_points_along_x():
+    screen, own = (UnseenBoatsEnv(500, frame=frame, seed=2) for frame in ("screen", "first_press"))
+    seen = {env: [env.reset()] for env in (screen, own)}
+    assert (entry(seen[own][0], "goal_y") - entry(seen[own][0], "start_y")).abs().max() < 1e-5
+    for step in range(8):
+        for env, readings in seen.items():
+            readings.append(env.step(presses(env, readings[-1].clone(), step, longest=0.5))["next"])
+    at_sea = (own.state.steps == 8) & (own.state.outcome == 0)
+    assert at_sea.sum() > 400
+    axis = torch.atan2(entry(seen[screen][1], "moved_y"), entry(seen[screen][1], "moved_x"))
+    for name in ("start", "goal", "boat", "to_goal", "velocity", "moved"):
+        x, y = (entry(seen[screen][8], f"{name}_{each}") for each in "xy")
+        turned = torch.stack([x * axis.cos() + y * axis.sin(), y * axis.cos() - x * axis.sin()], -1)
+        ours = torch.stack([entry(seen[own][8], f"{name}_{each}") for each in "xy"], -1)
+        torch.testing.assert_close(ours[at_sea], turned[at_sea], atol=1e-4, rtol=0.0)
+    assert entry(seen[own][1], "moved_y").abs().max() < 1e-5 and (entry(seen[own][1], "moved_x") > 0.0).all()
+
+
 def test_sensor_noise_disturbs_what_is_seen_and_not_the_boat():
     noisy, exact = (UnseenBoatsEnv(3000, sensor_noise=noise, seed=1) for noise in (12.0, 0.0))
     seen = [env.step(presses(env, env.reset(), 0))["next"][keys.OBSERVATION] for env in (noisy, exact)]
     for name, state in noisy.state._asdict().items():
-        assert state.equal(getattr(exact.state, name))
+        assert state.equal(getattr(exact.state, name)) or name in ("frame_x", "frame_y")
     error = seen[0] - seen[1]
     for name in ("start_x", "goal_y", "boat_x", "moved_x", "moved_y"):
         assert error[:, rules.OBSERVATION_NAMES.index(name)].std() == pytest.approx(0.1, abs=0.005)
@@ -240,7 +258,9 @@ def test_motor_noise_changes_the_executed_duration():
 
 
 @every_family
-@pytest.mark.parametrize("settings", [{}, {"boats": 2, "fleet_size": 5}, {"reward": "sparse", "trips": 1}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"boats": 2, "fleet_size": 5, "frame": "first_press"}, {"reward": "sparse", "trips": 1}]
+)
 @pytest.mark.parametrize("is_evaluation", [False, True])
 def test_the_kernel_does_what_the_tensor_functions_do(family, settings, is_evaluation):
     settings = {"family": family, "seed": 3, "sensor_noise": 2.0, "motor_noise": 0.1, **settings}

@@ -90,7 +90,12 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
     def _prepare(self) -> None:
         options = self.options
         self.rules = SessionRules(
-            options.fleet, options.trips, options.reward, options.motor_noise, options.sensor_noise
+            options.fleet,
+            options.trips,
+            options.reward,
+            options.motor_noise,
+            options.sensor_noise,
+            options.frame == "first_press",
         )
         self.max_steps = options.trips * task.MAX_PRESSES
         self.parameter_low = (options.shortest_press,) * task.NUM_KEYS
@@ -115,6 +120,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
             options.fleet_size or 0,
             kernels.folded(options.fleet_seed),
             options.scored_boats == "new",
+            options.frame == "first_press",
         ]
 
     def extra_spec(self, name: str) -> TensorSpec:

@@ -54,7 +54,9 @@ from hpamdp.env.rng_streams import EVALUATION, TRAINING
     LAST_DURATION,
     LAST_SCORE,
     TOTAL_SCORE,
-) = range(14)
+    FRAME_X,
+    FRAME_Y,
+) = range(16)
 FIRST_BOAT, SECOND_BOAT, BOAT, LAST_BOAT, LAST_KEY, TRIP, PRESSES, DOCKED, TRIP_ENDED = range(9)
 
 # Places of the sessions' own settings.
@@ -69,7 +71,8 @@ FIRST_BOAT, SECOND_BOAT, BOAT, LAST_BOAT, LAST_KEY, TRIP, PRESSES, DOCKED, TRIP_
     FLEET_SIZE,
     FLEET_SEED,
     SCORES_NEW,
-) = range(OWN, OWN + 10)
+    HAS_OWN_FRAME,
+) = range(OWN, OWN + 11)
 
 _F = np.float32
 _ANY, _STRENGTH = fleet.FAMILIES.index("any"), fleet.FAMILIES.index("strength")
@@ -79,6 +82,7 @@ _UNIT, _SPEED = _F(1.0 / task.HARBOUR_RADIUS), _F(1.0 / task.SPEED_SCALE)
 _GLIDE, _TANK, _LONGEST = _F(task.GLIDE), _F(task.TANK), _F(task.MAX_DURATION)
 _SUCCESS, _FAILURE = _F(task.SUCCESS_REWARD), _F(task.FAILURE_REWARD)
 _NEAREST = _F(task.DOCK_RADIUS / task.HARBOUR_RADIUS)
+_SHORTEST_AXIS = _F(rules._SHORTEST_AXIS)
 _NUM_SEEN = 8  # positions and displacements that sensors measure
 
 
@@ -154,7 +158,7 @@ def _begin_trip(floats: Any, integers: Any, row: Any, trip: Any, settings: Any) 
 def _start(floats: Any, integers: Any, row: Any, settings: Any) -> None:
     """Begin a session in a row, as `rules.start` does for columns."""
     kernels.new_episode(integers, row, settings)
-    for column in range(VELOCITY_X, TOTAL_SCORE + 1):
+    for column in range(VELOCITY_X, FRAME_Y + 1):
         floats[column, row] = ZERO
     first, second = _draw_boats(settings, row, integers[EPISODE_ROW, row])
     integers[FIRST_BOAT, row], integers[SECOND_BOAT, row] = first, second
@@ -208,6 +212,13 @@ def _act(floats: Any, integers: Any, row: Any, option: Any, key: Any, duration: 
     floats[VELOCITY_X, row], floats[VELOCITY_Y, row] = speed * dir_x, speed * dir_y
     floats[MOVED_X, row], floats[MOVED_Y, row] = new_x - x, new_y - y
     floats[LAST_DURATION, row] = duration
+    if integers[LAST_KEY, row] < 0:
+        floats[FRAME_X, row], floats[FRAME_Y, row] = new_x - x, new_y - y
+        if settings[SENSOR_NOISE] > 0.0:
+            bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
+            index = (steps + 1) * (rules.NUMBERS_PER_PRESS // 2) + rules.SENSOR + 6
+            floats[FRAME_X, row] += _F(settings[SENSOR_NOISE]) * normal(bits, step, index)
+            floats[FRAME_Y, row] += _F(settings[SENSOR_NOISE]) * normal(bits, step, index + 1)
     integers[BOAT, row], integers[LAST_BOAT, row], integers[LAST_KEY, row] = boat, boat, int32(key)
     integers[PRESSES, row], integers[STEPS_ROW, row] = presses, steps + 1
     integers[TRIP_ENDED, row] = int32(ends)
@@ -241,13 +252,23 @@ def _observe(floats: Any, integers: Any, row: Any, settings: Any, observation: A
         observation[place] *= _UNIT
     observation[19] *= _UNIT
     observation[20] *= _UNIT
+    observation[10], observation[11] = floats[VELOCITY_X, row] * _SPEED, floats[VELOCITY_Y, row] * _SPEED
+    if settings[HAS_OWN_FRAME] != 0.0:
+        axis_x, axis_y = floats[FRAME_X, row], floats[FRAME_Y, row]
+        if axis_x == ZERO and axis_y == ZERO:
+            axis_x, axis_y = observation[2] - observation[0], observation[3] - observation[1]
+        length = max(math.sqrt(axis_x * axis_x + axis_y * axis_y), _SHORTEST_AXIS)
+        cosine, sine = axis_x / length, axis_y / length
+        for place in (0, 2, 4, 10, 19):
+            across, along = observation[place], observation[place + 1]
+            observation[place] = across * cosine + along * sine
+            observation[place + 1] = along * cosine - across * sine
     to_goal_x, to_goal_y = observation[2] - observation[4], observation[3] - observation[5]
     across, along = observation[2] - observation[0], observation[3] - observation[1]
     at_start = max(math.sqrt(across * across + along * along), _NEAREST)
     observation[6], observation[7] = to_goal_x, to_goal_y
     observation[8] = floats[FUEL, row] / _TANK
     observation[9] = math.sqrt(to_goal_x * to_goal_x + to_goal_y * to_goal_y) / at_start
-    observation[10], observation[11] = floats[VELOCITY_X, row] * _SPEED, floats[VELOCITY_Y, row] * _SPEED
     observation[12] = _F(integers[TRIP, row]) / _F(settings[TRIPS])
     observation[13], observation[14] = _F(integers[BOAT, row]), _F(integers[LAST_BOAT, row])
     for key in range(task.NUM_KEYS):

@@ -46,6 +46,12 @@ class UnseenBoatsOptions(Settings):
     """
     reward: RewardForm = "paper"
     """`paper`: progress at each press, 5 x the fuel left on success, -1 on failure. `sparse`: only the success term."""
+    frame: Literal["screen", "first_press"] = "screen"
+    """Axes of positions, displacements and velocities that are seen: the screen's, or those of the first press.
+
+    With `first_press` the x axis points to where the session's first press moved the boat, as far as it was seen. Until
+    then it points from the start to the goal. So turned sessions look alike, and only the order of the keys is unknown.
+    """
     motor_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
     """Standard deviation of the log of the executed duration."""
     sensor_noise: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0

@@ -48,6 +48,8 @@ FLEET = -(2**30)
 NUMBERS_PER_PRESS = 24
 MOTOR, SENSOR = 0, 1
 
+_SHORTEST_AXIS = 1e-6  # keeps the division finite
+
 OBSERVATION_NAMES = (
     "start_x",
     "start_y",
@@ -82,6 +84,7 @@ class SessionRules(NamedTuple):
     reward: RewardForm = "paper"
     motor_noise: float = 0.0
     sensor_noise: float = 0.0
+    has_own_frame: bool = False  # frame=first_press
 
 
 class SessionState(NamedTuple):
@@ -91,7 +94,8 @@ class SessionState(NamedTuple):
     press, `last_score` the score of the trip before this one, and `total_score` the sum of the scores of all trips that
     have ended. `boat` and `last_boat` are the numbers of this trip's boat and of the boat of the last press, or
     NOT_CHOSEN. `last_key` is -1 before the first press. `trip_ended` is 1 if a trip ended with the last press.
-    `episode` is the number of the session, -1 before the first reset.
+    `frame` is the displacement by the session's first press as it was seen, (0, 0) before. `episode` is the number of
+    the session, -1 before the first reset.
     """
 
     start_x: Tensor
@@ -108,6 +112,8 @@ class SessionState(NamedTuple):
     last_duration: Tensor
     last_score: Tensor
     total_score: Tensor
+    frame_x: Tensor
+    frame_y: Tensor
     first_boat: Tensor  # bits, see `fleet`
     second_boat: Tensor
     boat: Tensor
@@ -144,6 +150,8 @@ def start(episode: Tensor, layout: Layout, boats: tuple[Tensor, Tensor], *, has_
         last_duration=zeros,
         last_score=zeros,
         total_score=zeros,
+        frame_x=zeros,
+        frame_y=zeros,
         first_boat=boats[0],
         second_boat=boats[1],
         boat=none + (NOT_CHOSEN if has_choice else 0),
@@ -216,6 +224,9 @@ def act(
     is_last = state.trip + 1 >= rules.trips
     begins = ends & ~is_last
     zeros = torch.zeros_like(state.x)
+    moved_x, moved_y = pressed.x - state.x, pressed.y - state.y
+    frame_x, frame_y = _seen_displacement(moved_x, moved_y, state.steps + 1, rng, rules)
+    is_first = state.last_key < 0
     start_x, start_y, goal_x, goal_y = (
         torch.where(begins, new, old) for new, old in zip(next_layout, _layout(state), strict=True)
     )
@@ -229,11 +240,13 @@ def act(
         velocity_x=pressed.speed * dir_x,
         velocity_y=pressed.speed * dir_y,
         fuel=torch.where(begins, TANK, pressed.fuel),
-        moved_x=pressed.x - state.x,
-        moved_y=pressed.y - state.y,
+        moved_x=moved_x,
+        moved_y=moved_y,
         last_duration=duration + zeros,
         last_score=torch.where(ends, score, state.last_score),
         total_score=state.total_score + torch.where(ends, score, 0.0),
+        frame_x=torch.where(is_first, frame_x, state.frame_x),
+        frame_y=torch.where(is_first, frame_y, state.frame_y),
         first_boat=state.first_boat,
         second_boat=state.second_boat,
         boat=boat if option is None else torch.where(begins, NOT_CHOSEN, boat),
@@ -258,13 +271,25 @@ def observe(state: SessionState, rng: RngKey | None, rules: SessionRules) -> Ten
         rng: random-number keys of the noise, `[N]`. None if the sensors have no noise.
         rules: rules of the sessions.
     """
-    seen = [state.start_x, state.start_y, state.goal_x, state.goal_y, state.x, state.y, state.moved_x, state.moved_y]
-    has_pressed = state.last_key >= 0
+    seen = [state.start_x, state.start_y, state.goal_x, state.goal_y, state.x, state.y]
+    moved = [state.moved_x, state.moved_y]
     if rng is not None:
         first = state.steps * (NUMBERS_PER_PRESS // 2) + SENSOR
         seen = [each + rules.sensor_noise * counter_rng.normal(rng, first + i) for i, each in enumerate(seen)]
-        seen[6:] = [torch.where(has_pressed, each, 0.0) for each in seen[6:]]
-    start_x, start_y, goal_x, goal_y, x, y, moved_x, moved_y = (each * (1.0 / HARBOUR_RADIUS) for each in seen)
+        noisy = _seen_displacement(state.moved_x, state.moved_y, state.steps, rng, rules)
+        moved = [torch.where(state.last_key >= 0, each, 0.0) for each in noisy]
+    velocity_x, velocity_y = state.velocity_x * (1.0 / SPEED_SCALE), state.velocity_y * (1.0 / SPEED_SCALE)
+    start_x, start_y, goal_x, goal_y, x, y, moved_x, moved_y = (each * (1.0 / HARBOUR_RADIUS) for each in seen + moved)
+    if rules.has_own_frame:
+        is_known = (state.frame_x != 0.0) | (state.frame_y != 0.0)
+        axis_x = torch.where(is_known, state.frame_x, goal_x - start_x)
+        axis_y = torch.where(is_known, state.frame_y, goal_y - start_y)
+        length = (axis_x.square() + axis_y.square()).sqrt().clamp(min=_SHORTEST_AXIS)
+        cosine, sine = axis_x / length, axis_y / length
+        pairs = ((start_x, start_y), (goal_x, goal_y), (x, y), (moved_x, moved_y), (velocity_x, velocity_y))
+        (start_x, start_y), (goal_x, goal_y), (x, y), (moved_x, moved_y), (velocity_x, velocity_y) = (
+            (a * cosine + b * sine, b * cosine - a * sine) for a, b in pairs
+        )
     to_goal_x, to_goal_y = goal_x - x, goal_y - y
     # The clamp is needed because sensor noise can bring start and goal together.
     at_start = (
@@ -281,8 +306,8 @@ def observe(state: SessionState, rng: RngKey | None, rules: SessionRules) -> Ten
         to_goal_y,
         state.fuel / TANK,
         (to_goal_x.square() + to_goal_y.square()).sqrt() / at_start,
-        state.velocity_x * (1.0 / SPEED_SCALE),
-        state.velocity_y * (1.0 / SPEED_SCALE),
+        velocity_x,
+        velocity_y,
         state.trip.to(torch.float32) / rules.trips,
         state.boat.to(torch.float32),
         state.last_boat.to(torch.float32),
@@ -293,6 +318,19 @@ def observe(state: SessionState, rng: RngKey | None, rules: SessionRules) -> Ten
         state.last_score / SUCCESS_REWARD,
     ]
     return torch.stack(columns, -1)
+
+
+def _seen_displacement(
+    moved_x: Tensor, moved_y: Tensor, steps: Tensor, rng: RngKey, rules: SessionRules
+) -> tuple[Tensor, Tensor]:
+    """Return the displacement by a session's press number `steps` as it is seen, px `[N]` each."""
+    if rules.sensor_noise == 0.0:
+        return moved_x, moved_y
+    first = steps * (NUMBERS_PER_PRESS // 2) + SENSOR + 6
+    return (
+        moved_x + rules.sensor_noise * counter_rng.normal(rng, first),
+        moved_y + rules.sensor_noise * counter_rng.normal(rng, first + 1),
+    )
 
 
 def _layout(state: SessionState) -> Layout:
