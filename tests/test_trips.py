@@ -17,6 +17,7 @@ from hpamdp import keys
 from hpamdp.acting import acting
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import choosing_class
+from hpamdp.env.base import ProblemError
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent, ended_with_trips, with_option
 from hpamdp.policies.base import Learner, Selector
@@ -92,6 +93,13 @@ def test_options_of_a_fixed_length_end_with_their_trips_too():
     env = with_decisions(SessionsOfOptions(1, trips=2, length=3), option_length=2)
     rolled = env.rollout(6, steppers(Uniform(PAMDPSpecs.from_env(env)), PAMDPSpecs.from_env(env)).policy)
     assert rolled[keys.IS_DECISION][0, :, 0].tolist() == [True, False, True] * 2
+
+
+def test_an_environment_with_trips_must_say_where_they_end():
+    env = Sessions(1)
+    del env.observation_spec[keys.TRIP_ENDED]
+    with pytest.raises(ProblemError, match="Sessions: has_trips is true, but its observation_spec has no trip_ended"):
+        with_decisions(env)
 
 
 def test_without_a_choice_a_session_is_one_history():
@@ -411,6 +419,29 @@ def test_trips_make_decisions_that_a_selector_can_remember():
     more = {"high.memory": "gru", "agent.sharing": "shared", "low.memory": "gru", "agent.values_end": "trip"}
     agent = hpamdp.train(HiddenOption, low="hppo", high="actor", **SMALL, **more)
     assert agent.history[-1]["eval/option_changes"] >= 0.0
+
+
+def test_an_agent_holds_its_option_until_it_is_told_that_the_trip_ended():
+    more = {"high.memory": "gru", "agent.sharing": "shared", "low.memory": "gru"}
+    agent = hpamdp.train(HiddenOption, low="hppo", high="actor", **SMALL, **more)
+    agent._env.max_steps = 6  # it was trained in shorter sessions
+    with acting(ExplorationType.DETERMINISTIC), torch.no_grad():
+        rolled = with_decisions(HiddenOption(2, trips=3)).rollout(6, agent.policy)
+    for step in rolled.unbind(1):
+        agent.act(step[keys.OBSERVATION].numpy(), {"trip_ended": step[keys.TRIP_ENDED][:, 0].numpy()})
+        for name in (keys.IS_DECISION, keys.OPTION, keys.OPTION_STEPS, *agent._kept):
+            torch.testing.assert_close(agent._last[name], step[name])
+    with pytest.raises(ValueError, match="give the info of the step with its trip_ended"):
+        agent.act(step[keys.OBSERVATION].numpy())
+
+
+def test_an_agent_that_chooses_by_the_rewards_of_a_session_does_not_act_without_them():
+    agent = hpamdp.train(HiddenOption, low="hppo", high="ucb", **SMALL, **{"high.memory": "session"})
+    assert agent.evaluate(episodes=4)["return"] == 0.0  # each option in one of two trips
+    with pytest.raises(ValueError, match="act: high=ucb chooses by the rewards of earlier trips; use evaluate"):
+        agent.act([0.0, 0.0, 0.0], {"trip_ended": False})
+    with pytest.raises(ConfigError, match="export: UCB cannot be exported: it remembers session_rewards"):
+        agent.export("agent.onnx")
 
 
 @pytest.mark.parametrize(

@@ -95,12 +95,14 @@ class Agent:
 
         Args:
             observation: one observation, or a batch, in which every leaf has a leading `[N]`.
-            info: the info of the same step. Its masks count if the problem gives them there.
+            info: the info of the same step. Its masks count if the problem gives them there, and its `trip_ended` if
+                options end with trips.
             greedy: whether to take the best action. Otherwise the agent explores as in training.
 
         Raises:
-            ValueError: an argument is wrong, the batch has another size than the last one, or the running episode is
-                longer than the problem allows, so that a `reset` is missing.
+            ValueError: an argument is wrong, the agent chooses by rewards, which no argument tells, the batch has
+                another size than the last one, or the running episode is longer than the problem allows, so that a
+                `reset` is missing.
 
         Example:
             >>> import hpamdp
@@ -118,6 +120,9 @@ class Agent:
         except ValueError as error:
             raise ValueError(f"act: {error}") from error
         seen = self._seen(fresh.to(self._env.device))
+        selector = self._agent.selector
+        if selector is not None and keys.OPTION_RETURN in selector.in_keys:
+            raise ValueError(f"act: {self._config.high} chooses by the rewards of earlier trips; use evaluate")
         exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
         with acting(exploration), torch.no_grad():
             self._last = self.policy(seen)

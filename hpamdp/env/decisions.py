@@ -226,7 +226,13 @@ class DecisionEnv(TransformedEnv):
 
 
 def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLength = None) -> DecisionTracker:
-    """Return a tracker for this environment; arguments as for `DecisionTracker`."""
+    """Return a tracker for this environment; arguments as for `DecisionTracker`.
+
+    Raises:
+        ProblemError: it has trips, but does not say where they end.
+    """
+    if env.has_trips and keys.TRIP_ENDED not in env.observation_spec.keys():
+        raise ProblemError(f"{env.title}: has_trips is true, but its observation_spec has no {keys.TRIP_ENDED}")
     option_actions = None
     observed = env.observation_spec.keys()
     if env.option_actions is not None and (keys.ACTION_MASK in observed or keys.PAIR_MASK in observed):
@@ -243,5 +249,5 @@ def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLen
 
 
 def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLength = None) -> DecisionEnv:
-    """Return the environment with its decisions tracked; arguments as for `DecisionTracker`."""
+    """Return the environment with its decisions tracked; arguments and errors as for `decision_tracker`."""
     return DecisionEnv(env, decision_tracker(env, gamma, option_length))

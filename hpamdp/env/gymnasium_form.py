@@ -95,6 +95,7 @@ class VectorForm(GymnasiumForm):
             if name in observed.keys()
         }
         self._bounds = [name for name in (keys.PARAMETER_LOW, keys.PARAMETER_HIGH) if name in observed.keys()]
+        self._needs_trips = env.has_trips and env.has_choice  # with which options end
         self._num_parameters = sum(env.parameter_dims)
         self.num_entries = observed[keys.OBSERVATION].shape[-1]
         entries = env.observation_entries
@@ -148,6 +149,9 @@ class VectorForm(GymnasiumForm):
         for name in self._bounds:
             bound = self._entry(name, "has other bounds in each state", info, (num, self._num_parameters))
             rows[name] = torch.from_numpy(bound.astype(np.float32))
+        if self._needs_trips:
+            ended = self._entry(keys.TRIP_ENDED, "has options that end with trips", info, (num,))
+            rows[keys.TRIP_ENDED] = torch.from_numpy(ended.astype(bool)).unsqueeze(-1)
         return TensorDict(rows, batch_size=[num]).to(self._device), is_batch
 
     def _vectors(self, observation: Any) -> tuple[np.ndarray, bool]:
