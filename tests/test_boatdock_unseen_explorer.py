@@ -1,0 +1,135 @@
+"""The hand-written player finds out what the keys do while it docks, and then sails as the planner does."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from hpamdp import keys
+from hpamdp.env.boatdock.task import TANK
+from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
+from hpamdp.env.boatdock_unseen.explorer import Explorer
+from hpamdp.env.boatdock_unseen.planner import best_plan
+
+
+def explorer_for(env: UnseenBoatsEnv) -> Explorer:
+    options = env.options
+    return Explorer(
+        env.num_envs,
+        options.fleet,
+        num_boats=options.boats,
+        trips=options.trips,
+        shortest_press=options.shortest_press,
+    )
+
+
+def press(env: UnseenBoatsEnv, explorer: Explorer) -> Tensor | None:
+    """Let the player press once and return the boats that it chose."""
+    td = env.read()
+    boat, key, duration = explorer.act(td[keys.OBSERVATION])
+    td[keys.ACTION] = {"discrete": key, "parameters": duration[:, None].expand(-1, 3)}
+    if boat is not None:
+        td[keys.OPTION] = boat
+    env.step(td)
+    return boat
+
+
+def ceiling(env: UnseenBoatsEnv) -> Tensor:
+    """Return the best score `[N]` of the trips that begin now, with each session's best boat."""
+    state = env.state
+    place = state.start_x, state.start_y, state.goal_x, state.goal_y, torch.full_like(state.start_x, TANK)
+    shortest = env.options.shortest_press
+    plans = [best_plan(*place, *boats, shortest_press=shortest) for boats in env.known_boats(state)]
+    return torch.stack([plan.score for plan in plans]).amax(0)
+
+
+def sail(env: UnseenBoatsEnv) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """Sail one session in every row; return scores and ceilings `[N, trips]`, and the boats chosen at each press."""
+    env.reset()
+    explorer = explorer_for(env)
+    ceilings = torch.full((env.num_envs, env.options.trips), torch.nan)
+    chosen = []
+    for _ in range(env.max_steps):
+        rows = torch.arange(env.num_envs)
+        begins = env.state.presses == 0
+        ceilings[rows[begins], env.state.trip[begins].long()] = ceiling(env)[begins]
+        boat = press(env, explorer)
+        if boat is not None:
+            chosen.append(boat)
+        if (env.state.outcome != 0).all():
+            break
+    return env.played()["trip_score"], ceilings, chosen
+
+
+@pytest.mark.parametrize("frame", ["screen", "first_press"])
+def test_the_player_pays_for_finding_out_in_the_first_trip_and_then_reaches_the_ceiling(frame):
+    scores, ceilings, _ = sail(UnseenBoatsEnv(12, trips=2, frame=frame, seed=1))
+    loss = (ceilings - scores).mean(0)
+    assert 0.1 < loss[0] < 0.5
+    assert loss[1].abs() < 0.02
+
+
+@pytest.mark.parametrize("family", ["strength", "any"])
+def test_after_two_trips_the_player_knows_the_boats_that_it_could_dock(family):
+    scores, ceilings, _ = sail(UnseenBoatsEnv(8, trips=3, family=family, seed=2))
+    can_dock = ceilings > 0.0
+    loss = (ceilings - scores)[:, 2][can_dock[:, 2]]
+    assert loss.median() < 0.02 and loss.mean() < 0.3
+
+
+def test_with_two_boats_both_are_tried_and_then_the_better_one_is_taken():
+    env = UnseenBoatsEnv(6, boats=2, trips=4, seed=3)
+    scores, ceilings, chosen = sail(env)
+    assert not chosen[0].any()
+    assert torch.stack(chosen).amax(0).all()  # every session has tried the second boat
+    assert (ceilings - scores)[:, 2:].mean().abs() < 0.05
+
+
+def known_after(env: UnseenBoatsEnv, presses: list[tuple[int, float]]) -> Explorer:
+    """Return a player that has seen these presses of the first boat, (key, seconds)."""
+    env.reset()
+    explorer = explorer_for(env)
+    for key, seconds in presses:
+        td = env.read()
+        explorer.act(td[keys.OBSERVATION])
+        td[keys.ACTION] = {
+            "discrete": torch.full((env.num_envs,), key),
+            "parameters": torch.full((env.num_envs, 3), seconds),
+        }
+        env.step(td)
+    explorer.act(env.read()[keys.OBSERVATION])
+    return explorer
+
+
+def test_one_press_shows_direction_strength_and_glide_and_two_show_the_third_direction():
+    env = UnseenBoatsEnv(3, family="strength", seed=4)
+    known = known_after(env, [(1, 0.2), (2, 0.2)])._known
+    (boats,) = env.known_boats(env.state)
+    assert known.seen.all() and known.is_measured.all()
+    torch.testing.assert_close(known.directions[:, 0], boats.directions, atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(known.strength[:, 0], boats.strength, atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(known.glide[:, 0], boats.glide, atol=1e-2, rtol=0.0)
+
+
+@pytest.mark.parametrize("family", ["turned", "strength", "any"])
+@pytest.mark.parametrize("presses", [[], [(1, 0.15)], [(0, 0.15), (2, 0.15)]])
+def test_sampled_boats_belong_to_the_family_and_agree_with_what_was_seen(family, presses):
+    env = UnseenBoatsEnv(2, family=family, seed=5)
+    explorer = known_after(env, presses)
+    known = type(explorer._known)(*(field[:, 0] for field in explorer._known))
+    boats = explorer._sampled_boats(known, int(known.seen[0].sum()))
+    (true,) = env.known_boats(env.state)
+    for key in known.seen[0].nonzero().flatten():
+        difference = boats.directions[:, :, key] - true.directions[:, None, key]
+        assert difference.abs().max() < 1e-3
+    cosines = boats.directions @ boats.directions.mT
+    largest = (cosines - 2.0 * torch.eye(3)).amax()
+    assert largest < (0.501 if family == "any" else -0.498)
+
+
+def test_a_new_session_forgets_the_boat():
+    env = UnseenBoatsEnv(4, seed=6)
+    explorer = known_after(env, [(0, 0.15), (1, 0.15)])
+    explorer.reset(torch.tensor([True, False, False, True]))
+    assert explorer._known.seen[:, 0].all(-1).tolist() == [False, True, True, False]
