@@ -28,6 +28,9 @@ def best_plan(
     Every row has a boat of its own. Strength and glide only scale the distance of a press, because the best last press
     still comes to rest at the dock.
 
+    Plans have at most three presses. For boats with any directions, a fourth press would dock 2 more layouts in 100 and
+    raise the mean score by 0.04 (2,000 layouts). For boats with people's angles three are enough.
+
     With a `shortest_press`, a last press that meets the dock before its release counts with all its seconds, although
     it burns fewer. The score is then too low, by at most 5/6 of the shortest press. This needs a last leg shorter than
     the shortest press covers before its release: 0.3 px in 0.2 s.
