@@ -431,7 +431,7 @@ def test_the_page_of_the_browser_and_python_know_the_same_episode(browser, page_
                 const physics = makePhysics(window.HPAMDP_DATA.rules);
                 const name = episode.controller === "congruent" ? "congruent" : `incongruent_${episode.keymap}`;
                 const directions = window.HPAMDP_DATA.directions[name];
-                return physics.sail(episode, directions, physics.settle(episode.events), Infinity);
+                return physics.sail(episode, { directions }, physics.settle(episode.events), Infinity);
             }""",
             made,
         )

@@ -149,8 +149,8 @@ def in_node(script, given, tmp_path):
     (tmp_path / "given.json").write_text(json.dumps(given))
     source = f"""
         const given = JSON.parse(require("fs").readFileSync({str(tmp_path / "given.json")!r}));
-        const {{ makePhysics }} = require({str(BoatPage.folder / "physics.js")!r});
-        const {{ makeAgents }} = require({str(BoatPage.folder / "network.js")!r});
+        const {{ makePhysics }} = require({str(BoatPage.files["physics.js"])!r});
+        const {{ makeAgents }} = require({str(BoatPage.files["network.js"])!r});
         console.log(JSON.stringify((() => {{ {script} }})()));
     """
     ended = subprocess.run([NODE, "-e", source], capture_output=True, text=True, check=True, timeout=60)
@@ -180,7 +180,7 @@ def test_ten_thousand_random_presses_end_where_python_ends_them(tmp_path, page_d
         const p = makePhysics(given.rules);
         return given.episodes.map((e) => {
           const row = e.controller === "congruent" ? "congruent" : `incongruent_${e.keymap}`;
-          return p.sail(e, given.directions[row], p.settle(e.events), Infinity);
+          return p.sail(e, { directions: given.directions[row] }, p.settle(e.events), Infinity);
         });
     """
     found = in_node(script, {**page_data, "episodes": given}, tmp_path)
@@ -209,7 +209,7 @@ def test_the_boat_on_the_page_moves_without_a_jump(tmp_path, page_data):
         const way = [];
         for (let t = 0; t < 2.5; t += 0.005) {
           const known = given.events.filter((event) => event.t <= t);
-          const boat = p.sail(given, given.directions.congruent, p.settle(known), t);
+          const boat = p.sail(given, { directions: given.directions.congruent }, p.settle(known), t);
           way.push([boat.x, boat.y, boat.speed]);
         }
         return way;

@@ -15,7 +15,7 @@ ENDED = task.OUTCOMES[1:]
 
 
 def script(name):
-    return (BoatPage.folder / name).read_text(encoding="utf-8")
+    return BoatPage.files[name].read_text(encoding="utf-8")
 
 
 def test_every_place_that_names_the_outcomes_names_all_of_them():
@@ -36,7 +36,7 @@ def test_the_page_gets_its_constants_from_the_task_and_its_own_are_equal(monkeyp
     text = script("physics.js")
     assert f"const DRY = {task.DRY:g};".replace("e-06", "e-6") in text
     assert f"({task.SUCCESS_REWARD:g} * fuel) / rules.tank : {task.FAILURE_REWARD:g}" in text
-    assert "speed(virtual) <= rules.docking_speed ? OUTCOMES.success : OUTCOMES.tooFast" in text
+    assert "strength * speed(virtual) <= rules.docking_speed ? OUTCOMES.success : OUTCOMES.tooFast" in text
     assert re.search(r"const speed = \(t\) => t \* t \* \(100 - \(20 / 3\) \* t\);", text)
 
 

@@ -126,7 +126,7 @@ def test_play_serves_its_page_its_scripts_and_the_agents(installed, site):
         address = re.search(r"http://[\w.:]+", server.stdout.readline()).group()
         page = fetched(address)
         parts = re.findall(r'(?:src|href)="([\w.]+\.(?:js|css))"', page)
-        assert {"game.js", "physics.js", "network.js", "data.js", "style.css"} <= {*parts}
+        assert {"game.js", "boats.js", "physics.js", "network.js", "data.js", "style.css"} <= {*parts}
         texts = {part: fetched(f"{address}/{part}") for part in parts}
         assert all(texts.values()) and '"linucb_hppo"' in texts["data.js"]
         server.send_signal(signal.SIGINT)

@@ -15,13 +15,13 @@ class PlayPage(Protocol):
     """A page in a browser on which people play a problem.
 
     Attributes:
-        folder: of its static files.
-        files: their names, `index.html` first. The page also loads `data.js`, a script that sets
-            `window.HPAMDP_DATA` to what `data` returns.
+        files: its static files by their names, one of which is `index.html`. The page also loads `data.js`, a script
+            that sets `window.HPAMDP_DATA` to what `data` returns.
+        shows_agents: whether agents can play beside people.
     """
 
-    folder: Path
-    files: Sequence[str]
+    files: Mapping[str, Path]
+    shows_agents: bool
 
     def data(self, agents: Sequence[Mapping[str, Any]], *, has_server: bool) -> dict[str, Any]:
         """Return the JSON values that the page's script starts with.
@@ -44,6 +44,9 @@ class PlayPage(Protocol):
         Raises:
             EpisodeError: it is no episode, or nobody can have played it.
         """
+
+    def told(self, episodes: Sequence[Mapping[str, Any]]) -> str:
+        """Return a sentence about checked episodes, for the end of the command; an empty text tells nothing."""
 
     def identity(self, episode: Mapping[str, Any]) -> str:
         """Return what tells a checked episode from all others, so that one that is sent twice is stored once."""

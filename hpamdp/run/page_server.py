@@ -63,6 +63,9 @@ class EpisodeFile:
         path: the file, which is created at the first episode.
         page: the page, which recognises equal episodes.
 
+    Attributes:
+        added: the episodes that were added through this object.
+
     Raises:
         EpisodeError: the file holds no episode, cannot be written, or its folder is missing.
     """
@@ -70,7 +73,7 @@ class EpisodeFile:
     def __init__(self, path: Path, page: PlayPage) -> None:
         self.path = path
         self.page = page
-        self.num_added = 0
+        self.added: list[Mapping[str, Any]] = []
         self._lock = threading.Lock()
         lock_path = path.parent / f".{path.name[:_NAME_LENGTH]}.lock"
         self._file_lock = FileLock(lock_path)
@@ -100,7 +103,10 @@ class EpisodeFile:
             raise TimeoutError
         try:
             with self._file_lock.acquire(timeout=max(until - time.monotonic(), 0.0)):
-                return self._append(identity, line)
+                is_new = self._append(identity, line)
+                if is_new:
+                    self.added.append(episode)
+                return is_new
         finally:
             self._lock.release()
 
@@ -133,7 +139,6 @@ class EpisodeFile:
                 raise
             self._read_to = size + len(line)
         self._known.add(identity)
-        self.num_added += 1
         return True
 
     def _check_file(self) -> None:
@@ -206,8 +211,8 @@ class PageServer(ThreadingHTTPServer):
     ) -> None:
         self.page = page
         self.episodes = episodes
-        self.contents = {f"/{name}": (page.folder / name).read_bytes() for name in page.files}
-        self.contents["/"] = self.contents[f"/{page.files[0]}"]
+        self.contents = {f"/{name}": file.read_bytes() for name, file in page.files.items()}
+        self.contents["/"] = self.contents["/index.html"]
         self.contents[f"/{DATA_NAME}"] = as_script(data)
         super().__init__(address, _Handler)
         host, port = str(self.server_address[0]), self.server_port

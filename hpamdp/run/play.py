@@ -71,14 +71,14 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     with composed(settings) as cfg:
         config = read(cfg)
     page = _page(config, options.seed)
-    agents = own_agents(config) if options.agent is None else given_agents(options.agent, config, settings)
+    agents = _agents(page, options.agent, config, settings)
     try:
         data = page.data(agents, has_server=options.export is None)
     except EpisodeError as error:
         raise ConfigError(f"--agent {error}") from error
     if options.export is not None:
         export(page, data, options.export)
-        say(f"{options.export / page.files[0]}: open it in a browser, or put the folder on any web server")
+        say(f"{options.export / 'index.html'}: open it in a browser, or put the folder on any web server")
         return 0
     return serve(page, data, options)
 
@@ -93,6 +93,17 @@ def _page(config: Config, seed: int) -> PlayPage:
     if page is None:
         raise ConfigError(f"{config.env}: there is no page to play it on")
     return page
+
+
+def _agents(
+    page: PlayPage, names: Sequence[str] | None, config: Config, settings: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Return the named agents in the page's form; those of this package if `names` is None."""
+    if page.shows_agents:
+        return own_agents(config) if names is None else given_agents(names, config, settings)
+    if names is not None and (name := next((each for each in names if each != "none"), None)) is not None:
+        raise ConfigError(f"--agent {name}: people play {config.env} alone; leave it out")
+    return []
 
 
 def own_agents(config: Config) -> list[dict[str, Any]]:
@@ -171,9 +182,9 @@ def export(page: PlayPage, data: dict[str, Any], folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in page.files:
+        for name, file in page.files.items():
             with replacing(folder / name) as partial:
-                shutil.copyfile(page.folder / name, partial)
+                shutil.copyfile(file, partial)
         with replacing(folder / DATA_NAME) as partial:
             partial.write_bytes(as_script(data))
     except OSError as error:
@@ -201,5 +212,7 @@ def serve(page: PlayPage, data: dict[str, Any], options: argparse.Namespace) -> 
         try:
             server.serve_forever(poll_interval=0.2)
         except KeyboardInterrupt:
-            say(f"{options.to}: {episodes.num_added} episodes added")
+            say(f"{options.to}: {len(episodes.added)} episodes added")
+            if told := page.told(episodes.added):
+                say(told)
     return 0

@@ -27,6 +27,20 @@ _PRACTICE, _FREE = 10, 120
 _PLAIN = {"boats": None, "switch_cost": None, "motor_noise": 0.0, "sensor_noise": 0.0, "slip": 0.0}
 _OF_PEOPLE = {**_PLAIN, "controller": "choose", "keymap": 1}  # the player chooses both on the page
 _OF_AGENTS = {**_PLAIN, "observation": "scaled"}
+_FOLDER = Path(__file__).resolve().parent / "page"
+
+
+def shared_rules() -> dict[str, float]:
+    """Return the constants of the boats' motion and of an episode, which every page of boats needs."""
+    return {
+        "harbour_radius": physics.HARBOUR_RADIUS,
+        "dock_radius": physics.DOCK_RADIUS,
+        "glide": physics.GLIDE,
+        "docking_speed": physics.DOCKING_SPEED,
+        "tank": physics.TANK,
+        "max_duration": physics.MAX_DURATION,
+        "max_presses": MAX_PRESSES,
+    }
 
 
 class BoatPage:
@@ -40,8 +54,10 @@ class BoatPage:
         ValueError: the rules differ from those of the page.
     """
 
-    folder = Path(__file__).resolve().parent / "page"
-    files: Sequence[str] = ("index.html", "style.css", "physics.js", "network.js", "game.js")
+    files: Mapping[str, Path] = {
+        name: _FOLDER / name for name in ("index.html", "style.css", "physics.js", "network.js", "game.js", "boats.js")
+    }
+    shows_agents = True
 
     def __init__(self, seed: int, rules: Rules | None = None) -> None:
         other = _other_setting({} if rules is None else rules._asdict(), _OF_PEOPLE)
@@ -57,17 +73,7 @@ class BoatPage:
             "format": episodes.FORMAT,
             "software": __version__,
             "has_server": has_server,
-            "rules": {
-                "harbour_radius": physics.HARBOUR_RADIUS,
-                "dock_radius": physics.DOCK_RADIUS,
-                "glide": physics.GLIDE,
-                "docking_speed": physics.DOCKING_SPEED,
-                "tank": physics.TANK,
-                "max_duration": physics.MAX_DURATION,
-                "max_presses": MAX_PRESSES,
-                "block": BLOCK,
-                "num_blocks": NUM_BLOCKS,
-            },
+            "rules": {**shared_rules(), "block": BLOCK, "num_blocks": NUM_BLOCKS},
             "directions": {
                 "incongruent_1": harbour.DIRECTIONS[0],
                 "incongruent_2": harbour.DIRECTIONS[1],
@@ -101,6 +107,10 @@ class BoatPage:
     def identity(self, episode: Mapping[str, Any]) -> str:
         """Return a text that identifies an episode: the player and the episode's number."""
         return episodes.identity(episode["player"], episode["index"])
+
+    def told(self, episodes: Sequence[Mapping[str, Any]]) -> str:
+        """Tell nothing: the page has the means, and `python -m hpamdp.data.human summary` those of a file."""
+        return ""
 
     def _layouts(self) -> dict[str, list[dict[str, Any]]]:
         """Return the layouts of each mode: start, goal, people's choice, and each boat's best score and plan.

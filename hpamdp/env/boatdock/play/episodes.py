@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -38,13 +38,13 @@ Seconds = Annotated[float, Field(ge=0.0, le=_LONGEST)]
 Key = Annotated[int, Field(ge=0, lt=harbour.NUM_KEYS)]
 Point = tuple[float, float]
 
-_STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class RawEvent(BaseModel):
     """A key event as the browser reported it."""
 
-    model_config = _STRICT
+    model_config = STRICT
 
     t: Seconds
     type: Literal["down", "up", "blur"]
@@ -55,29 +55,34 @@ class RawEvent(BaseModel):
 class SettledPress(BaseModel):
     """A press as the game counted it."""
 
-    model_config = _STRICT
+    model_config = STRICT
 
     key: Key
     start: Seconds
     duration: Annotated[float, Field(gt=0.0, le=physics.TANK)]
 
 
-class Episode(BaseModel):
-    """One line of the file.
+class Record(BaseModel):
+    """What every line of a file has."""
 
-    Lengths are px from the harbour's centre (y down), times are s since the boat was chosen.
-    """
-
-    model_config = _STRICT
+    model_config = STRICT
 
     format: Literal[1]
     software: Annotated[str, Field(max_length=32, pattern=r"^[\w.+-]+$")]
     consent: Literal[True]
     player: Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
     index: Annotated[int, Field(ge=0, lt=1_000_000)]
-    mode: Literal["practice", "round", "free"]
-    keymap: Literal[1, 2]
-    controller: Literal["incongruent", "congruent"]
+    resolution: Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class Trip(BaseModel):
+    """How somebody sailed a boat from its start to an outcome.
+
+    Lengths are px from the harbour's centre (y down), times are s since the boat was chosen.
+    """
+
+    model_config = STRICT
+
     start: Point
     goal: Point
     events: Annotated[list[RawEvent], Field(min_length=1, max_length=_MAX_EVENTS)]
@@ -86,7 +91,17 @@ class Episode(BaseModel):
     fuel: Annotated[float, Field(ge=0.0, le=1.0)]
     score: Annotated[float, Field(ge=-1.0, le=5.0)]
     end: Point
-    resolution: Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class Episode(Record, Trip):
+    """One line of the file."""
+
+    mode: Literal["practice", "round", "free"]
+    keymap: Literal[1, 2]
+    controller: Literal["incongruent", "congruent"]
+
+
+RecordT = TypeVar("RecordT", bound=Record)
 
 
 def check(value: object) -> Episode:
@@ -95,7 +110,7 @@ def check(value: object) -> Episode:
     Raises:
         EpisodeError: the episode is not valid. The message is one line.
     """
-    episode = _parse(value)
+    episode = parse(Episode, value)
     (problem,) = _problems([episode])
     if problem is not None:
         raise EpisodeError(problem)
@@ -109,16 +124,40 @@ def identity(player: object, index: object) -> str:
 
 def sail(episodes: Sequence[Episode], presses: Sequence[Sequence[Press | SettledPress]] | None = None) -> Replay:
     """Replay episodes from the given presses. If None, from their own presses."""
-    rows = [episode.presses for episode in episodes] if presses is None else presses
-    num, longest = len(episodes), max(map(len, rows), default=0)
+    return sail_trips(episodes, _directions(episodes), presses)
+
+
+def sail_trips(
+    trips: Sequence[Trip],
+    directions: Tensor,
+    presses: Sequence[Sequence[Press | SettledPress]] | None = None,
+    *,
+    strength: Tensor | float = 1.0,
+    glide: Tensor | float = 1.0,
+) -> Replay:
+    """Replay trips with any boats.
+
+    Args:
+        trips: E trips.
+        directions: unit directions of the keys of each trip's boat, float64 `[E, 3, 2]`.
+        presses: the presses to replay. If None, the trips' own presses.
+        strength, glide: factors of each boat's speed and glide, see `physics`, float64 `[E]` or a number.
+    """
+    rows = [trip.presses for trip in trips] if presses is None else presses
+    num, longest = len(trips), max(map(len, rows), default=0)
     keys = torch.zeros(num, longest, dtype=torch.long)
     starts = torch.full((num, longest), HELD, dtype=torch.float64)
     durations = torch.zeros(num, longest, dtype=torch.float64)
     for i, row in enumerate(rows):
         for j, press in enumerate(row):
             keys[i, j], starts[i, j], durations[i, j] = press.key, press.start, press.duration
-    start, goal = (_points([getattr(episode, name) for episode in episodes]) for name in ("start", "goal"))
-    return replay(start, goal, direction_rows(episodes), keys, starts, durations)
+    start, goal = (_points([getattr(trip, name) for trip in trips]) for name in ("start", "goal"))
+    return replay(start, goal, directions, keys, starts, durations, strength=strength, glide=glide)
+
+
+def _directions(episodes: Sequence[Episode]) -> Tensor:
+    """Return the directions of the keys of each episode's boat, float64 `[E, 3, 2]`."""
+    return torch.tensor(harbour.DIRECTIONS, dtype=torch.float64)[direction_rows(episodes)]
 
 
 def direction_rows(episodes: Sequence[Episode]) -> Tensor:
@@ -157,7 +196,7 @@ def read_with_problems(path: Path) -> tuple[dict[int, Episode], dict[int, str]]:
     problems: dict[int, str] = {}
     for number, line in lines_of(data):
         try:
-            parsed[number] = _parse(read_json(line))
+            parsed[number] = parse(Episode, read_json(line))
         except ValueError as error:
             problems[number] = str(error)
     episodes: dict[int, Episode] = {}
@@ -183,10 +222,15 @@ def warn_once(message: str) -> None:
     warn(message)
 
 
-def _parse(value: object) -> Episode:
+def parse(form: type[RecordT], value: object) -> RecordT:
+    """Return what a line holds, with the fields of `form`. Whether anybody can have played it is not checked.
+
+    Raises:
+        EpisodeError: it does not have this form. The message is one line.
+    """
     try:
         # Validate JSON text, for which the strict mode accepts lists as tuples.
-        return Episode.model_validate_json(json.dumps(value, allow_nan=False))
+        return form.model_validate_json(json.dumps(value, allow_nan=False))
     except ValidationError as error:
         wrong = error.errors(include_url=False, include_input=False, include_context=False)[0]
         where = ".".join(map(str, wrong["loc"])) or "episode"
@@ -200,16 +244,33 @@ def _points(points: Sequence[Point]) -> Tensor:
 
 
 def _problems(episodes: Sequence[Episode]) -> list[str | None]:
-    """Return the problem of each episode, or None if its presses and its end follow from its key events."""
-    settled = [settle((event.t, event.type, event.key) for event in episode.events) for episode in episodes]
-    from_events, from_presses = sail(episodes, settled), sail(episodes)
+    return problems_of_trips(episodes, _directions(episodes))
+
+
+def problems_of_trips(
+    trips: Sequence[Trip],
+    directions: Tensor,
+    *,
+    strength: Tensor | float = 1.0,
+    glide: Tensor | float = 1.0,
+    shortest: float = 0.0,
+    longest: float = HELD,
+) -> list[str | None]:
+    """Return the problem of each trip, or None if its presses and its end follow from its key events.
+
+    `sail_trips` explains the boats, and `replay.settle` the shortest and the longest press.
+    """
+    settled = [settle(((event.t, event.type, event.key) for event in trip.events), shortest, longest) for trip in trips]
+    from_events, from_presses = (
+        sail_trips(trips, directions, presses, strength=strength, glide=glide) for presses in (settled, None)
+    )
     problems: list[str | None] = []
-    for i, episode in enumerate(episodes):
+    for i, trip in enumerate(trips):
         try:
-            _check_layout(episode)
-            _check_presses(episode, settled[i], from_events, i)
-            _check_end(episode, from_events, i)
-            _check_outcome(episode, from_presses, i)
+            _check_layout(trip)
+            _check_presses(trip, settled[i], from_events, i)
+            _check_end(trip, from_events, i)
+            _check_outcome(trip, from_presses, i)
         except EpisodeError as error:
             problems.append(str(error))
         else:
@@ -217,42 +278,42 @@ def _problems(episodes: Sequence[Episode]) -> list[str | None]:
     return problems
 
 
-def _check_layout(episode: Episode) -> None:
+def _check_layout(trip: Trip) -> None:
     for name in ("start", "goal"):
-        if math.hypot(*getattr(episode, name)) > harbour.LAYOUT_RADIUS + 1e-3:
+        if math.hypot(*getattr(trip, name)) > harbour.LAYOUT_RADIUS + 1e-3:
             raise EpisodeError(f"{name}: not within {harbour.LAYOUT_RADIUS:g} px of the harbour's centre")
-    if math.dist(episode.start, episode.goal) < harbour.MIN_SEPARATION - 1e-3:
+    if math.dist(trip.start, trip.goal) < harbour.MIN_SEPARATION - 1e-3:
         raise EpisodeError(f"goal: not {harbour.MIN_SEPARATION:g} px from the start")
 
 
-def _check_presses(episode: Episode, settled: Sequence[Press], played: Replay, row: int) -> None:
-    times = [event.t for event in episode.events]
+def _check_presses(trip: Trip, settled: Sequence[Press], played: Replay, row: int) -> None:
+    times = [event.t for event in trip.events]
     if times != sorted(times):
         raise EpisodeError("events: times must not decrease")
     num = int(played.num_presses[row])
-    if len(episode.presses) != num:
-        raise EpisodeError(f"presses: {len(episode.presses)}, but the events give {num}")
+    if len(trip.presses) != num:
+        raise EpisodeError(f"presses: {len(trip.presses)}, but the events give {num}")
     burnt = played.burnt[row].tolist()
-    for i, (said, found) in enumerate(zip(episode.presses, settled[:num], strict=True)):
+    for i, (said, found) in enumerate(zip(trip.presses, settled[:num], strict=True)):
         errors = (said.start - found.start, said.duration - burnt[i])
         if said.key != found.key or max(map(abs, errors)) > _TOLERANCE:
             raise EpisodeError(f"presses.{i}: does not follow from the events")
 
 
-def _check_outcome(episode: Episode, played: Replay, row: int) -> None:
+def _check_outcome(trip: Trip, played: Replay, row: int) -> None:
     outcome = physics.OUTCOMES[int(played.outcome[row])]
-    if outcome != episode.outcome:
-        raise EpisodeError(f"outcome: {episode.outcome}, but the presses lead to {outcome}")
+    if outcome != trip.outcome:
+        raise EpisodeError(f"outcome: {trip.outcome}, but the presses lead to {outcome}")
 
 
-def _check_end(episode: Episode, played: Replay, row: int) -> None:
+def _check_end(trip: Trip, played: Replay, row: int) -> None:
     if int(played.outcome[row]) == physics.SAILING:
         raise EpisodeError("outcome: the boat rests with fuel left, so the episode is not over")
-    _check_outcome(episode, played, row)
+    _check_outcome(trip, played, row)
     fuel = played.fuel[row] / physics.TANK
     score = harbour.score(played.outcome[row], fuel)
-    end = math.dist(episode.end, (played.end_x[row].item(), played.end_y[row].item()))
-    for name, error in (("fuel", episode.fuel - fuel.item()), ("score", episode.score - score.item()), ("end", end)):
+    end = math.dist(trip.end, (played.end_x[row].item(), played.end_y[row].item()))
+    for name, error in (("fuel", trip.fuel - fuel.item()), ("score", trip.score - score.item()), ("end", end)):
         if abs(error) > _TOLERANCE:
             raise EpisodeError(f"{name}: does not follow from the presses")
 

@@ -4,6 +4,9 @@ In the environment a press lasts until the boat is at rest again. In people's ga
 boat still glides, or while another key is down. That ends the previous press and its glide, and the boat starts again
 from rest where it is. A press that begins and ends at the same reading of the clock does not count.
 
+Sessions with unknown boats (`hpamdp.env.boatdock_unseen`) have a shortest press. A key that is released earlier stays
+down until then, and the next key counts only from then on.
+
 The page's script `page/physics.js` has the same functions, and a test compares them. Positions are px from the
 harbour's centre, times are seconds since the boat was chosen, and all computations are in float64.
 """
@@ -17,7 +20,6 @@ import torch
 from torch import Tensor
 
 from hpamdp.env.boatdock import physics
-from hpamdp.env.boatdock.harbour import DIRECTIONS
 from hpamdp.env.boatdock.task import MAX_PRESSES
 
 DOWN, UP, BLUR = "down", "up", "blur"
@@ -58,28 +60,31 @@ class Replay(NamedTuple):
     num_presses: Tensor
 
 
-def settle(events: Iterable[tuple[float, str, int]]) -> list[Press]:
+def settle(events: Iterable[tuple[float, str, int]], shortest: float = 0.0, longest: float = HELD) -> list[Press]:
     """Return the presses that follow from raw key events.
 
     Only one key is down at a time. A press ends with the release of its key, with the next key, or with a blur.
 
     Args:
         events: time (s), kind (DOWN, UP or BLUR) and key, in ascending order of time. The key of a BLUR is ignored.
+        shortest: seconds that a press lasts at least. The next one begins only then; if its key is released before, it
+            does not count.
+        longest: seconds that a press lasts at most.
 
     Returns:
-        At most MAX_PRESSES presses. If the last key is still down, its press lasts HELD seconds.
+        At most MAX_PRESSES presses. If the last key is still down, its press lasts `longest` seconds.
     """
     presses: list[Press] = []
     open_key, begun = -1, 0.0
 
     def close(time: float) -> None:
         if open_key >= 0 and time > begun:
-            presses.append(Press(open_key, begun, time - begun))
+            presses.append(Press(open_key, begun, min(max(time - begun, shortest), longest)))
 
     for time, kind, key in events:
         if kind == DOWN:
             close(time)
-            open_key, begun = key, time
+            open_key, begun = key, max(time, presses[-1].start + shortest) if presses else time
         elif kind == BLUR or key == open_key:
             close(time)
             open_key = -1
@@ -90,40 +95,44 @@ def settle(events: Iterable[tuple[float, str, int]]) -> list[Press]:
 def replay(
     start: Tensor,
     goal: Tensor,
-    row: Tensor,
+    directions: Tensor,
     keys: Tensor,
     starts: Tensor,
     durations: Tensor,
+    *,
+    strength: Tensor | float = 1.0,
+    glide: Tensor | float = 1.0,
 ) -> Replay:
     """Replay E episodes from their settled presses.
 
     Args:
         start, goal: positions of start and goal, float64 `[E, 2]`.
-        row: row of DIRECTIONS with the keys of each boat, int64 `[E]`.
+        directions: unit directions of the keys of each boat, float64 `[E, 3, 2]`.
         keys: key of each press, int64 `[E, T]`.
         starts: beginning of each press, s, ascending, `[E, T]`. It is `inf` past an episode's last press.
         durations: duration of each press, s, `[E, T]`.
+        strength, glide: factors of each boat's speed and glide, see `physics`, float64 `[E]` or a number.
     """
     (x, y), (goal_x, goal_y) = start.unbind(-1), goal.unbind(-1)
     fuel = torch.full_like(x, physics.TANK)
+    row = torch.arange(len(x))
     outcome = torch.full_like(row, physics.SAILING, dtype=torch.int32)
     ended = torch.zeros_like(x)
     num_presses = torch.zeros_like(row)
-    table = torch.tensor(DIRECTIONS, dtype=torch.float64)
     following = torch.cat([starts[:, 1:], torch.full_like(x, HELD).unsqueeze(-1)], 1)
     columns: list[tuple[Tensor, Tensor, Tensor]] = []
     for i in range(keys.shape[1]):
         is_pressed = (outcome == physics.SAILING) & starts[:, i].isfinite()
-        dir_x, dir_y = table[row, keys[:, i]].unbind(-1)
+        dir_x, dir_y = directions[row, keys[:, i]].unbind(-1)
         duration = torch.minimum(durations[:, i], fuel)
-        whole = physics.press(x, y, fuel, goal_x, goal_y, dir_x, dir_y, duration)
+        whole = physics.press(x, y, fuel, goal_x, goal_y, dir_x, dir_y, duration, strength=strength, glide=glide)
         length = (whole.x - x) * dir_x + (whole.y - y) * dir_y
-        seconds = physics.time_at(duration, length)
+        seconds = physics.time_at(duration, length, strength, glide)
         # After the tank has run dry, a new press has no fuel, so it cannot interrupt the last glide.
         is_last = (whole.outcome == physics.OUT_OF_FUEL) | (i + 1 == MAX_PRESSES)
         available = following[:, i] - starts[:, i]
         is_cut = (available < seconds) & ~is_last
-        way = torch.where(is_cut, physics.distance_at(duration, available), length)
+        way = torch.where(is_cut, physics.distance_at(duration, available, strength, glide), length)
         columns.append((x, y, torch.where(is_cut, duration, fuel - whole.fuel) * is_pressed))
         out_of_time = (whole.outcome == physics.SAILING) & (i + 1 == MAX_PRESSES)
         became = torch.where(out_of_time, physics.TIME_LIMIT, whole.outcome).to(torch.int32)

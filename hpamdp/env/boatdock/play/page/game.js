@@ -1,13 +1,63 @@
 "use strict";
-// The game: screens, keys and touches, the picture, the table and the curve. Key times come from the browser's events
-// (`event.timeStamp`), not from the pictures. Every picture is computed again from all events so far. So an event that
-// the browser reports late still counts from the time when it happened.
+// The game that the pages of boats have in common: screens, keys and touches, the picture, the table and the curve. Key
+// times come from the browser's events (`event.timeStamp`), not from the pictures. Every picture is computed again from
+// all events so far. So an event that the browser reports late still counts from the time when it happened.
+//
+// What people play on a page is its task, an object that `makeTask(game, tools)` returns:
+//   noun              what one line of the file is called
+//   showsDirections   whether boats and keys have arrows
+//   begin(mode)       called when a mode is chosen on the first screen
+//   status()          the text in the page's head
+//   next()            prepares the next episode: { layout, text, onlyBoat }; with an `onlyBoat` nothing is chosen
+//   boat(name)        what a boat does: `directions`, and if it is unlike people's, `strength` and `glide`
+//   sailText(name)    the text beside an episode that begins with this boat
+//   add(result)       completes the result of an episode
+//   record(result)    what is to be stored after this episode, or null
+//   describe(result)  the text after an episode, and tracks(result) what is drawn of it: { points, colour, dashes }
+//   isPause()         whether the screen with the curve comes next, and isDone() whether nothing comes after it
+//   endText(), table(results), curve(results): what that screen shows
+//   leave()           called if an episode is left before it ends
 
-(function () {
+// The page's `main` gets these sections beside its own first screen and its buttons `#boats`.
+const STAGE = `
+  <section id="game" hidden>
+    <div id="stage">
+      <canvas id="harbour" width="480" height="480" aria-label="The harbour from above"></canvas>
+      <div id="gauges">
+        <div class="gauge"><span>fuel</span><div class="bar" id="fuel"><i></i></div><b id="fuel-text"></b></div>
+        <div class="gauge"><span>speed</span><div class="bar" id="speed"><i></i><em></em></div><b id="speed-text"></b></div>
+      </div>
+      <div id="keys" class="row">
+        <button class="key" data-key="0"></button>
+        <button class="key" data-key="1"></button>
+        <button class="key" data-key="2"></button>
+      </div>
+    </div>
+    <aside>
+      <div id="result" aria-live="polite"></div>
+      <button id="next" class="main">Next <kbd>Enter</kbd></button>
+      <table id="table"></table>
+    </aside>
+  </section>
+
+  <section id="end" hidden>
+    <h2>Your curve</h2>
+    <p id="end-text"></p>
+    <canvas id="curve" width="720" height="360" aria-label="Your scores"></canvas>
+    <table id="end-table"></table>
+    <div class="row">
+      <button id="go-on" class="main">Go on</button>
+      <button id="download"></button>
+      <button id="again">Back to the start</button>
+    </div>
+  </section>`;
+
+function playGame(makeTask) {
   const data = window.HPAMDP_DATA;
   const { rules } = data;
   const physics = makePhysics(rules);
-  const crew = makeAgents(data, physics);
+  document.querySelector("main").insertAdjacentHTML("beforeend", STAGE);
+  document.querySelector("#gauges").after(document.querySelector("#boats"));
 
   const LATE = 0.12; // s for which the end of an episode waits for earlier events that are reported late
   const LONGEST = 3600; // s
@@ -21,14 +71,12 @@
     success: "Docked", too_fast: "Too fast", out_of_bounds: "Out of the harbour", out_of_fuel: "Out of fuel",
     time_limit: `${rules.max_presses} presses and no dock`,
   };
-  const MODES = { practice: "Practice", round: "Rounds", free: "Free play" };
 
   const $ = (selector) => document.querySelector(selector);
   const harbour = $("#harbour");
   const game = {
-    screen: "loading", mode: null, keymap: 1, number: 0, layout: null, controller: null, origin: 0, events: [],
-    state: null, results: { practice: [], round: [], free: [] }, stored: [], unsent: [], sent: 0, refused: 0, downloaded: 0,
-    player: null, resolution: 0,
+    screen: "loading", mode: null, layout: null, boat: null, origin: 0, events: [], state: null,
+    results: {}, stored: [], unsent: [], sent: 0, refused: 0, downloaded: 0, player: null, resolution: 0,
   };
   window.hpamdpGame = game;
 
@@ -41,53 +89,45 @@
     $("#game").hidden = !["choose", "sail", "result"].includes(screen);
     $("#end").hidden = screen !== "end";
     window.scrollTo(0, 0);
-    $("#status").textContent = screen === "start" ? "" : statusText();
-  }
-
-  function statusText() {
-    const number = game.results[game.mode].length + (game.screen === "result" || game.screen === "end" ? 0 : 1);
-    if (game.mode === "free") return `Free play, episode ${number}`;
-    if (game.mode === "practice") return `Practice, episode ${number} of ${data.layouts.practice.length}`;
-    const inBlock = ((number - 1) % rules.block) + 1;
-    return `Round ${Math.floor((number - 1) / rules.block) + 1} of ${rules.num_blocks}, episode ${inBlock} of ${rules.block}`;
+    $("#status").textContent = screen === "start" ? "" : task.status();
   }
 
   function begin(mode) {
     game.mode = mode;
-    game.keymap = Number($("input[name=keymap]:checked").value);
-    if (mode !== "free" && game.results[mode].length >= data.layouts[mode].length) game.results[mode] = [];
+    task.begin(mode);
     choose();
   }
 
+  const shownResults = () => game.results[game.mode];
+
   function choose() {
-    const layouts = data.layouts[game.mode];
-    game.layout = layouts[game.results[game.mode].length % layouts.length];
-    game.controller = null;
-    game.state = null;
+    const { layout, text, onlyBoat } = task.next();
+    Object.assign(game, { layout, boat: null, state: null });
     show("choose");
-    $("#result").innerHTML = "<p>Choose a boat. The arrows show where its keys push it.</p>";
-    for (const card of document.querySelectorAll(".boat")) {
-      card.querySelector("svg").replaceChildren(...compass(crew.directionsOf(card.dataset.boat, game.keymap)));
+    $("#result").innerHTML = `<p>${text}</p>`;
+    if (task.showsDirections) {
+      for (const card of document.querySelectorAll(".boat")) {
+        card.querySelector("svg").replaceChildren(...compass(task.boat(card.dataset.boat).directions));
+      }
     }
-    fillTable($("#table"));
+    $("#table").innerHTML = task.table(shownResults());
     setGauges(rules.tank, 0);
     draw();
+    if (onlyBoat !== undefined) sail(onlyBoat, performance.now());
   }
 
-  function sail(controller, time) {
-    game.controller = controller;
+  function sail(boat, time) {
+    game.boat = boat;
     game.origin = time;
     game.events = [];
     show("sail");
-    const directions = crew.directionsOf(controller, game.keymap);
+    const { directions } = task.boat(boat);
     document.querySelectorAll(".key").forEach((button, key) => {
-      const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
-      svg.setAttribute("viewBox", "-50 -50 100 100");
-      svg.append(arrow(directions[key], -32, 32));
-      button.replaceChildren(document.createTextNode(String(key + 1)), svg);
+      button.replaceChildren(document.createTextNode(String(key + 1)));
+      if (task.showsDirections) button.append(picture([arrow(directions[key], -32, 32)]));
       button.setAttribute("aria-label", `key ${key + 1}`);
     });
-    $("#result").innerHTML = `<p>The ${controller} boat. Hold a key; release it to glide.</p>`;
+    $("#result").innerHTML = `<p>${task.sailText(boat)}</p>`;
     requestAnimationFrame(frame);
   }
 
@@ -103,10 +143,11 @@
     game.events.push({ t, type, key, code });
   }
 
-  // The check of episodes allows at most an hour. A longer episode starts again, with the choice of a boat.
+  // The check of episodes allows at most an hour. A longer episode starts again.
   function leaveOpen() {
+    task.leave();
     choose();
-    $("#result").innerHTML = "<p>This episode was open for more than an hour. Choose a boat to start it again.</p>";
+    $("#result").insertAdjacentHTML("afterbegin", "<p>The last one was open for more than an hour and does not count.</p>");
   }
 
   function releaseAll(event) {
@@ -121,8 +162,8 @@
       if (event.repeat) return;
       note("down", KEYS[event.code], event.code, event.timeStamp);
       keyButton(KEYS[event.code]).classList.add("down");
-    } else if (game.screen === "choose" && !event.repeat && (event.code === "KeyC" || event.code === "KeyI")) {
-      sail(event.code === "KeyC" ? "congruent" : "incongruent", event.timeStamp);
+    } else if (game.screen === "choose" && !event.repeat && cardOf(event.code)) {
+      sail(cardOf(event.code).dataset.boat, event.timeStamp);
     } else if (game.screen === "result" && !event.repeat && (event.code === "Enter" || event.code === "Space")) {
       if (event.target.closest("button:not(#next)")) return; // the focused button handles the key itself
       event.preventDefault();
@@ -137,6 +178,7 @@
   window.addEventListener("blur", releaseAll);
   document.addEventListener("visibilitychange", (event) => document.hidden && releaseAll(event));
 
+  const cardOf = (code) => Array.from(document.querySelectorAll(".boat")).find((card) => card.dataset.code === code);
   const keyButton = (key) => document.querySelector(`.key[data-key="${key}"]`);
   for (const button of document.querySelectorAll(".key")) {
     const key = Number(button.dataset.key);
@@ -161,7 +203,10 @@
     button.addEventListener("click", () => begin(button.dataset.mode));
   }
   $("#next").addEventListener("click", next);
-  $("#finish").addEventListener("click", () => end(true));
+  $("#finish").addEventListener("click", () => {
+    if (game.screen === "sail") task.leave();
+    end(true);
+  });
   $("#again").addEventListener("click", () => show("start"));
   $("#go-on").addEventListener("click", choose);
   $("#download").addEventListener("click", download);
@@ -172,8 +217,7 @@
     if (game.screen !== "sail") return;
     const last = game.events.length ? game.events[game.events.length - 1].t : 0;
     const time = Math.max((now - game.origin) / 1000, last, 0);
-    const directions = crew.directionsOf(game.controller, game.keymap);
-    game.state = physics.sail(game.layout, directions, physics.settle(game.events), time);
+    game.state = physics.sail(game.layout, task.boat(game.boat), physics.settle(game.events), time);
     setGauges(game.state.fuel, game.state.speed);
     draw();
     if (game.state.outcome !== "sailing" && time > game.state.ended + LATE) finish();
@@ -181,70 +225,63 @@
   }
 
   function finish() {
-    const { layout, state } = game;
-    const best = Math.max(layout.best.congruent.score, layout.best.incongruent.score);
-    const better = layout.best.congruent.score >= layout.best.incongruent.score ? "congruent" : "incongruent";
+    const { state } = game;
     const result = {
-      controller: game.controller, outcome: state.outcome, fuel: state.fuel / rules.tank,
-      score: physics.score(state.outcome, state.fuel), best, better,
-      agents: crew.agents.map((agent) => agent.sail(layout)),
-      plan: crew.sailPlan(layout, better),
+      boat: game.boat, outcome: state.outcome, fuel: state.fuel / rules.tank, score: physics.score(state.outcome, state.fuel),
     };
-    game.results[game.mode].push(result);
+    task.add(result);
+    shownResults().push(result);
     record(result);
     document.querySelectorAll(".key.down").forEach((button) => button.classList.remove("down"));
     show("result");
-    describe(result);
-    fillTable($("#table"));
+    $("#result").innerHTML = outcomeText(result) + task.describe(result);
+    $("#table").innerHTML = task.table(shownResults());
     draw(result);
     $("#next").focus({ preventScroll: true });
   }
 
   function next() {
     if (game.screen !== "result") return;
-    const played = game.results[game.mode].length;
-    const isBlock = game.mode === "round" && played % rules.block === 0;
-    if (isBlock || (game.mode === "practice" && played >= data.layouts.practice.length)) end(false);
+    if (task.isPause()) end(false);
     else choose();
   }
 
   function end(isStopped) {
-    const results = game.results[game.mode];
-    const isDone = game.mode !== "free" && results.length >= data.layouts[game.mode].length;
+    const results = shownResults();
     if (!results.length) return show("start");
     show("end");
-    $("#go-on").hidden = isDone;
+    $("#go-on").hidden = task.isDone();
     $("#download").disabled = game.stored.length === 0;
-    $("#download").title = game.stored.length ? "" : "Nothing was recorded, because you did not agree at the start";
-    $("#end-text").textContent = `${MODES[game.mode]}: ${results.length} episodes${isStopped || isDone ? "" : " so far"}, ` +
-      `mean score ${mean(results.map((r) => r.score)).toFixed(2)}, ${percent(share(results))} docked.`;
-    if (game.mode === "round") {
-      const blocks = data.people.success_by_block.map((people, i) => {
-        const own = results.slice(i * rules.block, (i + 1) * rules.block);
-        return own.length === rules.block ? `Round ${i + 1}: you docked ${percent(share(own))}, people ${percent(people)}.` : "";
-      });
-      $("#end-text").textContent += ` ${blocks.filter(Boolean).join(" ")}`;
-    }
-    drawCurve(results);
-    fillTable($("#end-table"));
+    $("#download").title = game.stored.length ? "" : "Nothing is recorded yet, or you did not agree at the start";
+    $("#end-text").textContent = task.endText(isStopped);
+    drawCurve(task.curve(results));
+    $("#end-table").innerHTML = task.table(results);
   }
 
   // ---- what is kept ----
 
   function record(result) {
     if (!$("#consent").checked) return;
-    const { state, layout } = game;
+    const own = task.record(result);
+    if (own === null) return;
     const episode = {
       format: data.format, software: data.software, consent: true, player: game.player, index: game.stored.length,
-      mode: game.mode, keymap: game.keymap, controller: game.controller, start: layout.start, goal: layout.goal,
-      events: game.events.map((event) => ({ ...event })), presses: state.presses, outcome: state.outcome,
-      fuel: result.fuel, score: result.score, end: [state.x, state.y], resolution: game.resolution,
+      resolution: game.resolution, ...own,
     };
     game.stored.push(episode);
     if (data.has_server) {
       game.unsent.push(episode);
       send();
     }
+  }
+
+  // What a line says of the episode that has just ended.
+  function sailed(result) {
+    const { state, layout, events } = game;
+    return {
+      start: layout.start, goal: layout.goal, events: events.map((event) => ({ ...event })), presses: state.presses,
+      outcome: state.outcome, fuel: result.fuel, score: result.score, end: [state.x, state.y],
+    };
   }
 
   let isSending = false;
@@ -260,7 +297,7 @@
         if (answer.ok) game.sent += 1;
         else {
           game.refused += 1;
-          notice(`An episode was refused: ${await answer.text()}`);
+          notice(`The ${task.noun} was refused: ${await answer.text()}`);
         }
         game.unsent.shift();
       }
@@ -268,7 +305,7 @@
       isWaiting = false;
     } catch (error) {
       const num = game.unsent.length;
-      notice(`${num} ${num === 1 ? "episode waits" : "episodes wait"} for the server (${error.message}). You can go on playing.`);
+      notice(`${num} ${task.noun}${num === 1 ? " waits" : "s wait"} for the server (${error.message}). You can go on playing.`);
       isWaiting = true;
       setTimeout(send, 3000);
     } finally {
@@ -298,48 +335,21 @@
   const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
   const share = (results) => mean(results.map((r) => (r.outcome === "success" ? 1 : 0)));
   const cssPercent = (value) => `${100 * value}%`;
-  const titleOf = (agent) => agent.title + (agent.controller === "choose" ? "" : `, ${agent.controller}`);
   const percent = (value) => `${(100 * value).toFixed(0)} %`;
   const colourOf = (i) => COLOURS.agents[i % COLOURS.agents.length];
   const swatch = (colour, dashes) => `<span class="swatch" style="border-color:${colour};border-top-style:${dashes}"></span>`;
+  const escape = (text) => text.replace(/[&<>"]/g, (c) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;" }[c]));
 
-  function describe(result) {
-    const isGood = result.outcome === "success";
+  function outcomeText(result) {
     const why = result.outcome === "too_fast"
       ? ` at ${game.state.speed.toFixed(0)} px/s; the limit is ${rules.docking_speed.toFixed(0)}` : "";
-    const chosen = game.layout.people;
-    const lines = [
-      `<h3 class="${isGood ? "good" : "bad"}">${OUTCOMES[result.outcome]}${why}</h3>`,
-      `<p>${swatch(COLOURS.you, "solid")}You, ${result.controller}: <b>${result.score.toFixed(2)}</b>, ` +
-        `${percent(result.fuel)} fuel left</p>`,
-      `<p>${swatch(COLOURS.plan, "dashed")}Best plan, ${result.better}: ${result.best.toFixed(2)}</p>`,
-      ...result.agents.map((sailed, i) =>
-        `<p>${swatch(colourOf(i), "solid")}${escape(data.agents[i].title)}, ${sailed.controller}: ${sailed.score.toFixed(2)}</p>`),
-      `<p>People at this bearing: ${percent(chosen)} chose the congruent boat, ${percent(1 - chosen)} the incongruent one.</p>`,
-    ];
-    $("#result").innerHTML = lines.join("");
+    return `<h3 class="${result.outcome === "success" ? "good" : "bad"}">${OUTCOMES[result.outcome]}${why}</h3>`;
   }
 
-  function fillTable(table) {
-    const results = game.results[game.mode];
-    const rows = [];
-    const has = results.length > 0;
-    const write = (value) => (has ? value.toFixed(2) : "");
-    rows.push(["you", `You, ${results.length} ${results.length === 1 ? "episode" : "episodes"}`,
-      has ? write(mean(results.map((r) => r.score))) : "", has ? percent(share(results)) : ""]);
-    rows.push(["", "People, mean", data.people.mean.toFixed(2), percent(data.people.success)]);
-    rows.push(["", "Best of 40 people", data.people.best.toFixed(2), percent(data.people.best_success)]);
-    data.agents.forEach((agent, i) => {
-      const own = results.map((r) => r.agents[i]);
-      rows.push(["", escape(titleOf(agent)), has ? write(mean(own.map((r) => r.score))) : "", has ? percent(share(own)) : ""]);
-    });
-    rows.push(["", "Ceiling", has ? write(mean(results.map((r) => r.best))) : "", has ? "100 %" : ""]);
-    table.innerHTML = "<caption>Means; agents and ceiling on your layouts</caption>" +
-      "<tr><th></th><th>score</th><th>docked</th></tr>" +
-      rows.map(([kind, ...cells]) => `<tr class="${kind}">${cells.map((c) => `<td>${c}</td>`).join("")}</tr>`).join("");
-  }
-
-  const escape = (text) => text.replace(/[&<>"]/g, (c) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;" }[c]));
+  // A table from its caption, its head and its rows, whose first cell is a class.
+  const tableOf = (caption, head, rows) => `<caption>${caption}</caption>` +
+    `<tr>${head.map((cell) => `<th>${cell}</th>`).join("")}</tr>` +
+    rows.map(([kind, ...cells]) => `<tr class="${kind}">${cells.map((c) => `<td>${c}</td>`).join("")}</tr>`).join("");
 
   function setGauges(fuel, speed) {
     const left = fuel / rules.tank;
@@ -374,6 +384,13 @@
     return group;
   }
 
+  function picture(parts) {
+    const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+    svg.setAttribute("viewBox", "-50 -50 100 100");
+    svg.append(...parts);
+    return svg;
+  }
+
   const compass = (directions) => directions.map((dir, key) => arrow(dir, 6, 30, String(key + 1)));
 
   function draw(result) {
@@ -391,10 +408,7 @@
     const dock = outcome === "sailing" ? ["#f4dfb0", "#c8963e"] : outcome === "success" ? ["#c3e3c6", "#3c8a55"] : ["#f1cbbd", "#b9503a"];
     disc(pen, layout.goal, rules.dock_radius, dock[0], dock[1], 0.9);
     disc(pen, layout.goal, 1.6, dock[1]);
-    if (result) {
-      result.agents.forEach((sailed, i) => track(pen, sailed.points, colourOf(i), []));
-      track(pen, result.plan.points, COLOURS.plan, [3.5, 3.5]);
-    }
+    if (result) task.tracks(result).forEach(({ points, colour, dashes }) => track(pen, points, colour, dashes));
     if (state) {
       for (const leg of state.legs) {
         const at = leg.way > 0 ? leg.pressed / leg.way : 0;
@@ -452,7 +466,8 @@
     disc(pen, [x - 1.8 * dx, y - 1.8 * dy], 1.4, "#f6f4ef");
   }
 
-  function drawCurve(results) {
+  // `dots` and the `values` of `curves` are pairs of a number (from 1 to `total`) and a score; `levels` are scores.
+  function drawCurve({ axis, total, dots, curves, levels }) {
     const canvas = $("#curve");
     const pen = canvas.getContext("2d");
     const ratio = window.devicePixelRatio || 1;
@@ -463,8 +478,7 @@
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
     pen.font = "13px system-ui, sans-serif";
-    const total = Math.max(results.length, 2);
-    const X = (n) => left + ((n - 1) / (total - 1)) * (width - left - right);
+    const X = (n) => left + ((n - 1) / (Math.max(total, 2) - 1)) * (width - left - right);
     const Y = (score) => top + ((5 - score) / 6) * (height - top - bottom);
     pen.textAlign = "right";
     for (let score = -1; score <= 5; score++) {
@@ -473,26 +487,21 @@
       pen.fillText(String(score), left - 8, Y(score) + 4);
     }
     pen.textAlign = "left";
-    pen.fillText("episode", left, height - 10);
+    pen.fillText(axis, left, height - 10);
     pen.textAlign = "right";
-    pen.fillText(String(results.length), width - right, height - 10);
-    const window_ = Math.max(1, Math.min(10, Math.floor(results.length / 3)));
-    const curve = (values) => values.map((_, i) => mean(values.slice(Math.max(0, i - window_ + 1), i + 1)));
+    pen.fillText(String(total), width - right, height - 10);
     const labels = [];
-    const level = (value, colour, text, dashes) => {
+    for (const { value, colour, text, dashes } of levels) {
       line(pen, [left, Y(value)], [width - right, Y(value)], colour, 1.3, dashes);
       labels.push([Y(value), colour, `${text} ${value.toFixed(2)}`]);
-    };
-    level(mean(results.map((r) => r.best)), "#2b2b2b", "ceiling", []);
-    level(data.people.mean, "#D98200", "people", [6, 4]);
-    level(data.people.best, "#D98200", "best person", [2, 3]);
-    data.agents.forEach((agent, i) => level(mean(results.map((r) => r.agents[i].score)), colourOf(i), titleOf(agent), []));
-    results.forEach((r, i) => disc(pen, [X(i + 1), Y(r.score)], 2.5, "#9fb3c0"));
-    const smooth = curve(results.map((r) => r.score));
-    for (let i = 1; i < smooth.length; i++) {
-      line(pen, [X(i), Y(smooth[i - 1])], [X(i + 1), Y(smooth[i])], COLOURS.you, 3, []);
     }
-    labels.push([Y(smooth[smooth.length - 1]), COLOURS.you, `you${window_ > 1 ? `, last ${window_}` : ""} ${smooth[smooth.length - 1].toFixed(2)}`]);
+    for (const [n, score] of dots) disc(pen, [X(n), Y(score)], 2.5, "#9fb3c0");
+    for (const { values, colour, text, thickness } of curves) {
+      values.slice(1).forEach(([n, score], i) =>
+        line(pen, [X(values[i][0]), Y(values[i][1])], [X(n), Y(score)], colour, thickness, []));
+      const [, last] = values[values.length - 1];
+      labels.push([Y(last), colour, `${text} ${last.toFixed(2)}`]);
+    }
     labels.sort((a, b) => a[0] - b[0]);
     let lowest = 0;
     pen.textAlign = "left";
@@ -521,13 +530,16 @@
   const bytes = crypto.getRandomValues(new Uint8Array(8));
   game.player = Array.from(bytes, (byte) => byte.toString(16).padStart(2, "0")).join("");
   game.resolution = clockStep();
-  $("#consent-text").textContent = "Record my episodes: the times and keys of my presses, the layout, the boat and the " +
+  const task = makeTask(game, { data, physics, sailed, mean, share, percent, escape, swatch, colourOf, tableOf, picture,
+    compass, COLOURS });
+  $("#consent-text").textContent = `Record my ${task.noun}s: the times and keys of my presses, the layout, the boat and the ` +
     "outcome. They carry a random number, which changes each time the page is loaded. " +
     (data.has_server ? "They are stored in a file on the computer that serves this page." :
       "They stay in this page until you download them as a file.") + " If you do not agree, nothing is recorded.";
+  $("#download").textContent = `Download the ${task.noun}s`;
   window.addEventListener("resize", () => {
-    if (game.screen === "end") drawCurve(game.results[game.mode]);
-    else if (game.screen !== "start") draw(game.screen === "result" ? game.results[game.mode].at(-1) : undefined);
+    if (game.screen === "end") drawCurve(task.curve(shownResults()));
+    else if (game.screen !== "start") draw(game.screen === "result" ? shownResults().at(-1) : undefined);
   });
   show("start");
-})();
+}

@@ -1,0 +1,117 @@
+"use strict";
+// People's task: two boats whose arrows are shown, beside agents and the best plans.
+
+playGame((game, tools) => {
+  const { data, mean, share, percent, escape, swatch, colourOf, COLOURS } = tools;
+  const { rules } = data;
+  const crew = makeAgents(data, tools.physics);
+  const MODES = { practice: "Practice", round: "Rounds", free: "Free play" };
+  let keymap = 1;
+
+  game.results = { practice: [], round: [], free: [] };
+  const played = () => game.results[game.mode];
+  const isDone = () => game.mode !== "free" && played().length >= data.layouts[game.mode].length;
+  const titleOf = (agent) => agent.title + (agent.controller === "choose" ? "" : `, ${agent.controller}`);
+
+  function begin(mode) {
+    keymap = Number(document.querySelector("input[name=keymap]:checked").value);
+    if (isDone()) game.results[mode] = [];
+  }
+
+  function status() {
+    const number = played().length + (game.screen === "result" || game.screen === "end" ? 0 : 1);
+    if (game.mode === "free") return `Free play, episode ${number}`;
+    if (game.mode === "practice") return `Practice, episode ${number} of ${data.layouts.practice.length}`;
+    const inBlock = ((number - 1) % rules.block) + 1;
+    return `Round ${Math.floor((number - 1) / rules.block) + 1} of ${rules.num_blocks}, episode ${inBlock} of ${rules.block}`;
+  }
+
+  function next() {
+    const layouts = data.layouts[game.mode];
+    const text = "Choose a boat. The arrows show where its keys push it.";
+    return { layout: layouts[played().length % layouts.length], text };
+  }
+
+  function add(result) {
+    const { layout } = game;
+    const { congruent, incongruent } = layout.best;
+    const better = congruent.score >= incongruent.score ? "congruent" : "incongruent";
+    Object.assign(result, {
+      controller: result.boat, best: layout.best[better].score, better,
+      agents: crew.agents.map((agent) => agent.sail(layout)), plan: crew.sailPlan(layout, better),
+    });
+  }
+
+  const record = (result) => ({ mode: game.mode, keymap, controller: result.controller, ...tools.sailed(result) });
+
+  function describe(result) {
+    const chosen = game.layout.people;
+    return [
+      `<p>${swatch(COLOURS.you, "solid")}You, ${result.controller}: <b>${result.score.toFixed(2)}</b>, ` +
+        `${percent(result.fuel)} fuel left</p>`,
+      `<p>${swatch(COLOURS.plan, "dashed")}Best plan, ${result.better}: ${result.best.toFixed(2)}</p>`,
+      ...result.agents.map((sailed, i) =>
+        `<p>${swatch(colourOf(i), "solid")}${escape(data.agents[i].title)}, ${sailed.controller}: ${sailed.score.toFixed(2)}</p>`),
+      `<p>People at this bearing: ${percent(chosen)} chose the congruent boat, ${percent(1 - chosen)} the incongruent one.</p>`,
+    ].join("");
+  }
+
+  const tracks = (result) => [
+    ...result.agents.map((sailed, i) => ({ points: sailed.points, colour: colourOf(i), dashes: [] })),
+    { points: result.plan.points, colour: COLOURS.plan, dashes: [3.5, 3.5] },
+  ];
+
+  function isPause() {
+    const isBlock = game.mode === "round" && played().length % rules.block === 0;
+    return isBlock || (game.mode === "practice" && isDone());
+  }
+
+  function endText(isStopped) {
+    const results = played();
+    let text = `${MODES[game.mode]}: ${results.length} episodes${isStopped || isDone() ? "" : " so far"}, ` +
+      `mean score ${mean(results.map((r) => r.score)).toFixed(2)}, ${percent(share(results))} docked.`;
+    if (game.mode === "round") {
+      const blocks = data.people.success_by_block.map((people, i) => {
+        const own = results.slice(i * rules.block, (i + 1) * rules.block);
+        return own.length === rules.block ? `Round ${i + 1}: you docked ${percent(share(own))}, people ${percent(people)}.` : "";
+      });
+      text += ` ${blocks.filter(Boolean).join(" ")}`;
+    }
+    return text;
+  }
+
+  function table(results) {
+    const has = results.length > 0;
+    const meansOf = (own) => (has ? [mean(own.map((r) => r.score)).toFixed(2), percent(share(own))] : ["", ""]);
+    return tools.tableOf("Means; agents and ceiling on your layouts", ["", "score", "docked"], [
+      ["you", `You, ${results.length} ${results.length === 1 ? "episode" : "episodes"}`, ...meansOf(results)],
+      ["", "People, mean", data.people.mean.toFixed(2), percent(data.people.success)],
+      ["", "Best of 40 people", data.people.best.toFixed(2), percent(data.people.best_success)],
+      ...data.agents.map((agent, i) => ["", escape(titleOf(agent)), ...meansOf(results.map((r) => r.agents[i]))]),
+      ["", "Ceiling", has ? mean(results.map((r) => r.best)).toFixed(2) : "", has ? "100 %" : ""],
+    ]);
+  }
+
+  function curve(results) {
+    const window_ = Math.max(1, Math.min(10, Math.floor(results.length / 3)));
+    const scores = results.map((r) => r.score);
+    const smooth = scores.map((_, i) => [i + 1, mean(scores.slice(Math.max(0, i - window_ + 1), i + 1))]);
+    return {
+      axis: "episode", total: results.length, dots: scores.map((score, i) => [i + 1, score]),
+      curves: [{ values: smooth, colour: COLOURS.you, text: `you${window_ > 1 ? `, last ${window_}` : ""}`, thickness: 3 }],
+      levels: [
+        { value: mean(results.map((r) => r.best)), colour: "#2b2b2b", text: "ceiling", dashes: [] },
+        { value: data.people.mean, colour: "#D98200", text: "people", dashes: [6, 4] },
+        { value: data.people.best, colour: "#D98200", text: "best person", dashes: [2, 3] },
+        ...data.agents.map((agent, i) =>
+          ({ value: mean(results.map((r) => r.agents[i].score)), colour: colourOf(i), text: titleOf(agent), dashes: [] })),
+      ],
+    };
+  }
+
+  return {
+    noun: "episode", showsDirections: true, begin, status, next, add, record, describe, tracks, isPause, isDone, endText,
+    table, curve, boat: (name) => ({ directions: crew.directionsOf(name, keymap) }),
+    sailText: (name) => `The ${name} boat. Hold a key; release it to glide.`, leave: () => {},
+  };
+});
