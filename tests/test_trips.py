@@ -10,7 +10,7 @@ from test_resume import stop_and_resume, words_of
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import ExplorationType
 from toy_options import steppers
-from toy_trips import HiddenOption, Sessions, SessionsOfOptions
+from toy_trips import HiddenAction, HiddenOption, Sessions, SessionsOfOptions
 
 import hpamdp
 from hpamdp import keys
@@ -476,3 +476,40 @@ def test_a_memory_that_forgets_earlier_trips_is_told_of_in_one_line(sharing, cap
     warned = [line for line in capsys.readouterr().err.splitlines() if "forgets earlier trips" in line]
     assert len(warned) == (sharing == "per_option")
     assert all("agent.sharing=shared" in line for line in warned)
+
+
+# What a session shows once is of use until its end. In its first step or trip, guessing earns 0 on average.
+
+BUDGETS = {
+    "hppo": {"total_frames": 16_384, "low.minibatch_size": 128},
+    "pdqn": {"total_frames": 4000, "low.warmup_steps": 500, "low.epsilon_steps": 2000},
+    "hsac": {"total_frames": 3000, "low.warmup_steps": 500},
+}
+SCORED = {"eval.every": 0, "eval.layouts": 4, "progress": False, "num_envs": 16}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("memory", "best"), [("gru", 3.0), ("stack", 3.0), ("none", 1.0)])
+@pytest.mark.parametrize("low", BUDGETS)
+def test_a_learner_uses_in_later_trips_what_an_earlier_one_has_shown(low, memory, best):
+    settings = {**SCORED, "steps_per_batch": 32, **BUDGETS[low], "low.memory": memory}
+    agent = hpamdp.train(HiddenAction, low=low, **settings)
+    assert agent.evaluate(episodes=500)["return"] == pytest.approx(best, abs=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("high", "memory", "best"),
+    [
+        ("actor", "gru", 4.0),
+        ("meta_critic", "gru", 4.0),
+        ("actor", "none", 2.0),
+        ("ucb", "session", 2.0),  # of three trips it needs two to try both options
+        ("ucb", "discounted", 0.0),
+    ],
+)
+def test_a_selector_with_a_memory_uses_in_later_trips_what_an_earlier_one_has_shown(high, memory, best):
+    settings = {**SCORED, "steps_per_batch": 48, "total_frames": 12_288, "high.memory": memory}
+    settings |= {"agent.values_end": "trip"}  # what to choose in a trip changes nothing for later ones
+    agent = hpamdp.train({"name": HiddenOption, "trips": 3}, low="random", high=high, **settings)
+    assert agent.evaluate(episodes=500)["return"] == pytest.approx(best, abs=0.4)

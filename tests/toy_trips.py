@@ -17,7 +17,7 @@ from hpamdp.env.base import PAMDPEnv
 class Sessions(PAMDPEnv):
     """Take `length` steps in each of `trips` trips; every step earns 1.
 
-    The observation is the step in the trip and the number of the trip, both as fractions, and the last step's reward.
+    The observation is the step in the trip and the number of the trip, both as fractions, and what `shown` returns.
 
     Args:
         num_envs: environments of the batch.
@@ -87,9 +87,13 @@ class Sessions(PAMDPEnv):
         """Return what the actions of a step earn, `[N]`."""
         return torch.ones(self.batch_size)
 
+    def shown(self) -> Tensor:
+        """Return the last entry of the observation, `[N]`: the last step's reward."""
+        return self.last_reward
+
     def _read(self) -> TensorDict:
         place, trip = self.steps % self.length, self.steps // self.length
-        observation = torch.stack([place / self.length, trip * self.length / self.max_steps, self.last_reward], -1)
+        observation = torch.stack([place / self.length, trip * self.length / self.max_steps, self.shown()], -1)
         terminated = (self.steps >= self.max_steps).unsqueeze(-1)
         flags = {
             keys.TRIP_ENDED: ((place == 0) & (self.steps > 0)).unsqueeze(-1),
@@ -107,16 +111,30 @@ class SessionsOfOptions(Sessions):
 
 
 class HiddenAction(Sessions):
-    """One of the two discrete actions earns 1 through a session, the other one -1. Which one is hidden."""
+    """One of the two discrete actions earns 1 through a session, the other one -1.
+
+    Which one is hidden: only the observation after the session's first step shows it, as -1 or 1.
+    """
 
     def earned(self, tensordict: TensorDictBase) -> Tensor:
         """Return 1 for the hidden action, else -1."""
         return torch.where(tensordict[keys.DISCRETE] == self.hidden, 1.0, -1.0)
 
+    def shown(self) -> Tensor:
+        """Return what is hidden after the first step of a session, else 0."""
+        return torch.where(self.steps == 1, 2.0 * self.hidden - 1.0, 0.0)
+
 
 class HiddenOption(SessionsOfOptions):
-    """One of the two options earns 1 a step through a session, the other one -1. Which one is hidden."""
+    """One of the two options earns 1 a step through a session, the other one -1.
+
+    Which one is hidden: only the observation at the beginning of the second trip shows it, as -1 or 1.
+    """
 
     def earned(self, tensordict: TensorDictBase) -> Tensor:
         """Return 1 for the hidden option, else -1."""
         return torch.where(tensordict[keys.OPTION] == self.hidden, 1.0, -1.0)
+
+    def shown(self) -> Tensor:
+        """Return what is hidden at the beginning of the second trip, else 0."""
+        return torch.where(self.steps == self.length, 2.0 * self.hidden - 1.0, 0.0)
