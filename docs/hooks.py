@@ -48,6 +48,7 @@ FILLED = re.compile(r"^(<!-- (rows of|csv|runs) (.+?) -->\n)(?:[^<\n].*\n)*<!-- 
 TABLE_MARK = re.compile(r"^<!-- /?table.*-->\n", re.MULTILINE)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".csv": "text", ".toml": "toml", ".cff": "yaml"}
 PICTURES = {".png", ".gif", ".svg"}
+FEWEST_SEEDS = 3  # seeds that a setting needs to be shown, as in hpamdp.analysis.study
 # The columns of runs that are shown, and their heads.
 MEASURED = {"frames": "steps", "score": "score", "success": "success", "cpu_s": "CPU, s"}
 # How a JSON schema's types and bounds are shown.
@@ -425,6 +426,7 @@ def runs_table(words: str) -> str:
     """Return a table of the runs in a csv file whose column has one of some values, as `PATH: column=value, value`.
 
     The columns before `seed` tell settings apart; of those after it the table has the means over the seeds.
+    Settings with fewer than `FEWEST_SEEDS` seeds are left out.
     """
     path, _, condition = words.partition(": ")
     column, _, values = condition.partition("=")
@@ -442,13 +444,15 @@ def runs_table(words: str) -> str:
     for row in rows:
         if row[column] in wanted:
             settings.setdefault(tuple(row[name] for name in setting_columns), []).append(row)
-    if not settings:
-        return "No run of it has been finished yet."
     head = [*(MEASURED.get(name, name) for name in setting_columns), "seeds", *(MEASURED[name] for name in measured)]
     table = [head, ["---"] * len(head)]
     for setting, same in settings.items():
+        if len({row["seed"] for row in same}) < FEWEST_SEEDS:
+            continue
         numbers = [f"{int(value):,}" if value.isdecimal() else cell(value) for value in setting]
         table.append([*numbers, str(len(same)), *(mean_of(same, name) for name in measured)])
+    if len(table) == 2:
+        return f"No {FEWEST_SEEDS} seeds of it have been run yet."
     return "\n".join(f"| {' | '.join(row)} |" for row in table)
 
 

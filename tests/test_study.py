@@ -20,6 +20,7 @@ from hpamdp.analysis.study import (
     middle_half,
     read_csv,
     spread,
+    with_enough_seeds,
     write_tables,
 )
 
@@ -311,11 +312,15 @@ def test_domains_names_learners_that_differ_from_the_best_by_chance():
         name = {"domain": "goal", "learner": learner, "frames": 1000, "cpu_s": 1.0}
         return [name | {"seed": seed, "success": score} for seed, score in enumerate(scores)]
 
-    results = (
-        runs("hppo", 0.9, 0.8, 0.7) + runs("pdqn", 0.9, 0.7, 0.7) + runs("hyar", 0.1, 0.1, 0.2) + runs("dlpa", 0.75)
-    )
+    results = runs("hppo", 0.9, 0.8, 0.7) + runs("pdqn", 0.9, 0.7, 0.7) + runs("hyar", 0.1, 0.1, 0.2)
     cells = domains.best_table(results, []).splitlines()[-1].split("|")
-    assert [cell.strip() for cell in cells[5:9]] == ["0.552 to 1.048", "pdqn (3)", "0.61", "pdqn; one seed: dlpa"]
+    assert [cell.strip() for cell in cells[5:9]] == ["0.552 to 1.048", "pdqn (3)", "0.61", "pdqn"]
+
+
+def test_cells_with_one_or_two_seeds_get_no_place_in_a_table():
+    cells = {"hppo": (0, 1, 2), "pdqn": (0, 1), "hyar": (5, 5, 5)}
+    rows = [{"learner": learner, "seed": seed} for learner, seeds in cells.items() for seed in seeds]
+    assert {row["learner"] for row in with_enough_seeds(rows, "learner")} == {"hppo"}
 
 
 def test_a_share_on_crossing_is_of_the_best_return_from_the_same_places(tmp_path):

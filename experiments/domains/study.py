@@ -29,6 +29,7 @@ from hpamdp.analysis.study import (
     mean_interval,
     read_csv,
     spread,
+    with_enough_seeds,
     write_tables,
 )
 from hpamdp.figure_style import LEARNER_COLOURS
@@ -49,7 +50,6 @@ DOMAINS = {
     "sliding": (10_000_000, "score"),
 }
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
-MIN_SEEDS_COMPARED = 3  # least seeds of both learners for a probability of improvement
 MIN_SEEDS_MIDDLE = 5  # least seeds for an interquartile mean beside the mean
 FIRST_STEPS = 700  # start of the curves' axes, before any evaluation
 PLANNERS = ("dlpa", "pets")
@@ -205,9 +205,7 @@ def best_table(results: Rows, published: Rows) -> str:
             continue
         best, *others = sorted(values, key=lambda low: -float(np.mean(values[low])))
         second = f"{others[0]} ({len(values[others[0]])})" if others else ""
-        improvement = ""
-        if others and min(len(values[best]), len(values[others[0]])) >= MIN_SEEDS_COMPARED:
-            improvement = f"{difference(values[best], values[others[0]]).improvement:.2f}"
+        improvement = f"{difference(values[best], values[others[0]]).improvement:.2f}" if others else ""
         low, high = mean_interval(values[best])
         top = best_published(published, name)
         columns = [
@@ -215,7 +213,7 @@ def best_table(results: Rows, published: Rows) -> str:
             best,
             len(values),
             f"{_cell(cells[(best,)])} {'return' if what == 'score' else 'success'}",
-            "" if np.isnan(low) else f"{low:.3f} to {high:.3f}",
+            f"{low:.3f} to {high:.3f}",
             second,
             improvement,
             _not_clearly_lower(values, best, others),
@@ -227,12 +225,8 @@ def best_table(results: Rows, published: Rows) -> str:
 
 
 def _not_clearly_lower(values: dict[str, list[float]], best: str, others: Sequence[str]) -> str:
-    """Return the learners whose difference to the best one has an interval with 0, and those with a single seed."""
-    found = {low: difference(values[best], values[low]) for low in others}
-    ties = [low for low, each in found.items() if not np.isnan(each.low) and not each.is_clear]
-    # The difference to a single seed has no interval. Only seeds within the range of the best learner's are named.
-    single = [low for low in others if len(values[low]) == 1 and values[low][0] >= min(values[best])]
-    return "; ".join([*([", ".join(ties)] if ties else []), *([f"one seed: {', '.join(single)}"] if single else [])])
+    """Return the learners whose difference to the best one has an interval with 0."""
+    return ", ".join(low for low in others if not difference(values[best], values[low]).is_clear)
 
 
 def cost_table(results: Rows) -> str:
@@ -315,7 +309,8 @@ def main(folders: Sequence[str]) -> None:
         tables = {"results": results, "curves": curves}
         stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in tables}
         write_tables(HERE, {name: merged(stored[name], rows) for name, rows in tables.items()})
-    results, curves = (scored_once(read_csv(HERE / f"{name}.csv")) for name in ("results", "curves"))
+    stored = (scored_once(read_csv(HERE / f"{name}.csv")) for name in ("results", "curves"))
+    results, curves = (with_enough_seeds(rows, "domain", "learner", "frames") for rows in stored)
     published = read_csv(HERE / "published.csv")
     references = read_csv(HERE / "references.csv")
     draw(curves, published, HERE / "curves.png")

@@ -17,7 +17,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.analysis.study import Rows, Run, curve, difference, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    curve,
+    difference,
+    finished,
+    groups,
+    read_csv,
+    spread,
+    with_enough_seeds,
+    write_tables,
+)
 from hpamdp.env.boatdock.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 
 HERE = Path(__file__).resolve().parent
@@ -200,9 +211,11 @@ def main(folders: Sequence[str]) -> None:
     if folders:
         results, curves, choices = gather(finished(folders))
         write_tables(HERE, {"results": results, "curves": curves, "choices": choices})
-    results = read_csv(HERE / "results.csv")
-    curves = of_the_map(read_csv(HERE / "curves.csv"))
-    choices = of_the_map(read_csv(HERE / "choices.csv"))
+    stored = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves", "choices"))
+    results, curves, choices = (
+        with_enough_seeds(rows, "low", "total", "uniform_option_steps", "high") for rows in stored
+    )
+    curves, choices = of_the_map(curves), of_the_map(choices)
     print(table(results))
     draw_map(of_the_map(results), HERE / "map.png")
     draw_curves(curves, "regret", "regret of the greedy choice", HERE / "regret.png")

@@ -27,6 +27,7 @@ from hpamdp.analysis.study import (
     groups,
     read_csv,
     spread,
+    with_enough_seeds,
     write_tables,
 )
 from hpamdp.env.boatdock.reference import HUMAN
@@ -178,8 +179,8 @@ def main(folders: Sequence[str]) -> None:
     if folders:
         results, curves = gather(finished(folders))
         write_tables(HERE, {"results": results, "curves": curves})
-    results = read_csv(HERE / "results.csv")
-    curves = read_csv(HERE / "curves.csv")
+    stored = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))
+    results, curves = (with_enough_seeds(rows, "low", "problem", "reward") for rows in stored)
     draw(curves, results, "shaped", "frames", HERE / "curves.png")
     draw(curves, results, "sparse", "frames", HERE / "curves_sparse.png")
     draw(curves, results, "shaped", "wall_s", HERE / "curves_seconds.png")

@@ -22,6 +22,7 @@ from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_
 Rows = list[dict[str, Any]]
 
 MIN_SEEDS = 10  # smallest number of seeds for an interquartile mean and a bootstrap interval
+FEWEST_SEEDS = 3  # seeds that a cell needs for a place in a table
 _MOST_FOLDERS = 100_000  # a link may lead to the whole disk
 
 
@@ -130,6 +131,12 @@ def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
     for row in rows:
         found[tuple(row[name] for name in names)].append(row)
     return dict(found)
+
+
+def with_enough_seeds(rows: Rows, *names: str) -> Rows:
+    """Return the rows of the cells, told apart by these columns, that have at least `FEWEST_SEEDS` seeds."""
+    cells = groups(rows, *names).values()
+    return [row for cell in cells if len({row["seed"] for row in cell}) >= FEWEST_SEEDS for row in cell]
 
 
 def first_at(rows: Rows, column: str, level: float) -> dict[str, Any] | None:
