@@ -226,6 +226,8 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         if self.rules.observation == "scaled" and self.rules.sensor_noise == 0.0:
             names += ["goal_x", "goal_y"]
         tables = self._directions()
+        if len(tables) == 1:
+            names.append("controller")  # always the same one
         vectors, origins = self._vectors()
         is_known = all(len(table) == 1 for table in tables)
         return PlaneGeometry(
