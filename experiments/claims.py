@@ -618,7 +618,8 @@ def domain_runs() -> tuple[dict[tuple[str, str], Rows], dict[tuple[str, str], li
     The curves have an entry for each length of the runs. Domains without published scores have no best one.
     """
     module = study("domains")
-    stored, evaluations = (module.scored_once(rows(f"domains/{name}.csv")) for name in ("results", "curves"))
+    planned = module.planned_seeds()
+    stored, evaluations = (module.scored_once(rows(f"domains/{name}.csv"), planned) for name in ("results", "curves"))
     results = groups(module.at_published_steps(stored), "domain", "learner")
     curves: dict[tuple[str, str], list[Rows]] = {}
     for (domain, learner, _), runs in groups(evaluations, "domain", "learner", "frames").items():

@@ -264,15 +264,16 @@ def test_domains_scores_each_learner_by_its_longest_runs_within_the_published_st
     assert domains.at_published_steps([*allowed, run(1000, 0), run(2_000_000, 0)]) == allowed
 
 
-def test_domains_scores_seeds_that_ran_once_and_marks_earlier_ones():
+def test_domains_scores_seeds_that_ran_once_when_all_have_run_and_marks_earlier_ones():
     domains = study("domains")
 
     def run(learner, seed, success):
         return {"domain": "goal", "learner": learner, "frames": 1000, "seed": seed, "success": success}
 
-    results = domains.scored_once(
-        [run("pdqn", 0, 0.9), run("pdqn", 100, 0.6), run("pdqn", 101, 0.8), run("hyar", 3, 0.7)]
-    )
+    stored = [run("pdqn", 0, 0.9), run("pdqn", 100, 0.6), run("pdqn", 101, 0.8), run("hyar", 3, 0.7)]
+    unfinished = {("goal", "pdqn"): {100, 101, 102}}
+    assert [row["seed"] for row in domains.scored_once(stored, unfinished)] == [0, 3]
+    results = domains.scored_once(stored, {("goal", "pdqn"): {100, 101}})
     assert [row["seed"] for row in results] == [100, 101, 3]
     table = domains.table(results, [], [])
     assert "| 0.700 ± 0.141 (2) |" in table

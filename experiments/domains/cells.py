@@ -6,7 +6,8 @@ python experiments/domains/cells.py --processes 2        trains two at a time, e
 python experiments/domains/cells.py --minutes 60         begins no run after an hour
 python experiments/domains/cells.py --list               says what is left
 
-A run goes to `multirun/domains/DOMAIN/LEARNER/SEED`, and an interrupted one continues. `study.py` gathers them.
+A run goes to `multirun/domains/DOMAIN/LEARNER/SEED`, and an interrupted one continues. `study.py` gathers them. Runs
+that it has stored in results.csv are not made again.
 """
 
 from __future__ import annotations
@@ -65,6 +66,12 @@ def runs(names: Sequence[str]) -> Iterator[tuple[Path, list[str]]]:
             )
 
 
+def stored_runs() -> set[Path]:
+    """Return the folders of the runs whose scores are in results.csv."""
+    with (HERE / "results.csv").open(newline="") as file:
+        return {RUNS / row["domain"] / row["learner"] / row["seed"] for row in csv.DictReader(file)}
+
+
 def is_finished(folder: Path) -> bool:
     """Return whether a run in this folder has come to its end."""
     return bool((saved_summary(folder) or {}).get("finished"))
@@ -88,7 +95,9 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no run after this time")
     parser.add_argument("--list", action="store_true", help="print the commands of the runs that are left")
     options = parser.parse_args()
-    left = [(folder, arguments) for folder, arguments in runs(options.cells) if not is_finished(folder)]
+    stored = stored_runs()
+    planned = [(folder, arguments) for folder, arguments in runs(options.cells) if folder not in stored]
+    left = [(folder, arguments) for folder, arguments in planned if not is_finished(folder)]
     if options.list:
         for _, arguments in left:
             print(f"python run.py {shlex.join(arguments)}")

@@ -2,14 +2,15 @@
 
 python experiments/domains/study.py FOLDER...    adds the finished runs in these folders to results.csv and curves.csv,
                                                  in the place of earlier ones of the same learner, domain, steps and
-                                                 seed; then draws and tabulates
+                                                 seed; then draws and tabulates. A cell of cells.csv shows the seeds of
+                                                 the protocol once all of them have run.
 python experiments/domains/study.py              draws and tabulates the stored csv files
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -130,11 +131,22 @@ def merged(stored: Rows, new: Rows) -> Rows:
     )
 
 
-def scored_once(results: Rows) -> Rows:
-    """Return each learner's runs with seeds that ran once on each domain, else its earlier runs."""
+def planned_seeds() -> dict[tuple[str, str], set[int]]:
+    """Return the seeds of cells.csv by domain and learner."""
+    planned = {}
+    for cell in read_csv(HERE / "cells.csv"):
+        first, last = map(int, cell["seeds"].split("-"))
+        planned[cell["domain"], cell["learner"]] = set(range(first, last + 1))
+    return planned
+
+
+def scored_once(results: Rows, planned: Mapping[tuple[str, str], Set[int]]) -> Rows:
+    """Return each learner's runs with seeds that ran once, if all that are planned have run, else its earlier runs."""
     chosen: Rows = []
-    for rows in groups(results, "domain", "learner").values():
-        chosen += [row for row in rows if row["seed"] >= FIRST_SEED] or rows
+    for cell, rows in groups(results, "domain", "learner").items():
+        once = [row for row in rows if row["seed"] >= FIRST_SEED]
+        is_complete = planned.get(cell, {FIRST_SEED}) <= {row["seed"] for row in once}
+        chosen += once if is_complete else [row for row in rows if row["seed"] < FIRST_SEED]
     return chosen
 
 
@@ -309,7 +321,8 @@ def main(folders: Sequence[str]) -> None:
         tables = {"results": results, "curves": curves}
         stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in tables}
         write_tables(HERE, {name: merged(stored[name], rows) for name, rows in tables.items()})
-    stored = (scored_once(read_csv(HERE / f"{name}.csv")) for name in ("results", "curves"))
+    planned = planned_seeds()
+    stored = (scored_once(read_csv(HERE / f"{name}.csv"), planned) for name in ("results", "curves"))
     results, curves = (with_enough_seeds(rows, "domain", "learner", "frames") for rows in stored)
     published = read_csv(HERE / "published.csv")
     references = read_csv(HERE / "references.csv")
