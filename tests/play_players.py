@@ -6,7 +6,7 @@ import torch
 
 from hpamdp.env.boatdock import harbour, physics, planner
 from hpamdp.env.boatdock.play import episodes
-from hpamdp.env.boatdock.play.replay import settle
+from hpamdp.env.boatdock.play.replay import HELD, settle
 
 PLAYER = "0123456789abcdef"
 
@@ -21,33 +21,49 @@ def events_of(presses, gap=0.05):
     return events
 
 
-def played(start, goal, controller, events, *, keymap=1, index=0, player=PLAYER, mode="round"):
-    """Return the episode that the page would send; the events must end it."""
-    bare = episodes.Episode.model_construct(start=start, goal=goal, controller=controller, keymap=keymap, presses=[])
-    settled = settle((event["t"], event["type"], event["key"]) for event in events)
-    sailed = episodes.sail([bare], [settled])
-    num, fuel = int(sailed.num_presses), sailed.fuel / physics.TANK
+def sailed(start, goal, directions, events, *, strength=1.0, glide=1.0, shortest=0.0, longest=HELD):
+    """Return what the page says of a trip with any boat; the events must end it."""
+    bare = episodes.Trip.model_construct(start=start, goal=goal, presses=[])
+    settled = settle(((event["t"], event["type"], event["key"]) for event in events), shortest, longest)
+    directions = torch.tensor([directions], dtype=torch.float64)
+    boat = episodes.sail_trips([bare], directions, [settled], strength=strength, glide=glide)
+    num, fuel = int(boat.num_presses), boat.fuel / physics.TANK
+    return {
+        "start": list(start),
+        "goal": list(goal),
+        "events": events,
+        "presses": [
+            {"key": press.key, "start": press.start, "duration": boat.burnt[0, i].item()}
+            for i, press in enumerate(settled[:num])
+        ],
+        "outcome": physics.OUTCOMES[int(boat.outcome)],
+        "fuel": fuel.item(),
+        "score": harbour.score(boat.outcome, fuel).item(),
+        "end": [boat.end_x.item(), boat.end_y.item()],
+    }
+
+
+def recorded(*, index=0, player=PLAYER):
+    """Return what every line of a file has."""
     return {
         "format": 1,
         "software": "0.2.0",
         "consent": True,
         "player": player,
         "index": index,
+        "resolution": 1e-4,
+    }
+
+
+def played(start, goal, controller, events, *, keymap=1, index=0, player=PLAYER, mode="round"):
+    """Return the episode that the page would send; the events must end it."""
+    directions = harbour.DIRECTIONS[2 if controller == "congruent" else keymap - 1]
+    return {
+        **recorded(index=index, player=player),
         "mode": mode,
         "keymap": keymap,
         "controller": controller,
-        "start": list(start),
-        "goal": list(goal),
-        "events": events,
-        "presses": [
-            {"key": press.key, "start": press.start, "duration": sailed.burnt[0, i].item()}
-            for i, press in enumerate(settled[:num])
-        ],
-        "outcome": physics.OUTCOMES[int(sailed.outcome)],
-        "fuel": fuel.item(),
-        "score": harbour.score(sailed.outcome, fuel).item(),
-        "end": [sailed.end_x.item(), sailed.end_y.item()],
-        "resolution": 1e-4,
+        **sailed(start, goal, directions, events),
     }
 
 

@@ -14,6 +14,7 @@ from filelock import FileLock
 from play_players import docked
 
 from hpamdp.env.boatdock.play.boat_page import BoatPage
+from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
 from hpamdp.env.play_page import EpisodeError
 from hpamdp.run import page_server
 from hpamdp.run.page_server import EpisodeFile, PageServer
@@ -82,7 +83,7 @@ def test_the_page_and_its_data_are_served_and_nothing_from_elsewhere_is_allowed(
 
 
 def test_the_page_names_no_other_site():
-    for file in BoatPage.files.values():
+    for file in (BoatPage.files | SessionPage.files).values():
         text = file.read_text()
         assert "https://" not in text and "//cdn" not in text
         assert [line for line in text.splitlines() if "http://" in line and "www.w3.org" not in line] == []

@@ -21,6 +21,8 @@ from play_players import docked
 from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.play.boat_page import BoatPage
+from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
+from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
 from hpamdp.run.page_server import EpisodeFile, PageServer
 from hpamdp.run.play import export
 from hpamdp.run.train import run
@@ -47,8 +49,8 @@ def page_data():
 
 
 @contextmanager
-def serving(path, data):
-    page = BoatPage(seed=0)
+def serving(path, data, page=None):
+    page = BoatPage(seed=0) if page is None else page
     server = PageServer(("127.0.0.1", 0), page, data, EpisodeFile(path, page))
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
     thread.start()
@@ -439,3 +441,58 @@ def test_the_page_of_the_browser_and_python_know_the_same_episode(browser, page_
     assert found["outcome"] == made["outcome"] == "success"
     assert found["fuel"] / physics.TANK == pytest.approx(made["fuel"], abs=1e-12)
     torch.testing.assert_close(torch.tensor([found["x"], found["y"]]), torch.tensor(made["end"]), atol=1e-6, rtol=0.0)
+
+
+@pytest.mark.parametrize("boats", [1, 2])
+def test_a_session_shows_where_its_boats_keys_push_only_when_it_is_over_and_is_stored_then(browser, tmp_path, boats):
+    page = SessionPage(seed=0, options=UnseenBoatsOptions(trips=2, boats=boats, family="strength"))
+    with serving(tmp_path / "played.jsonl", page.data([], has_server=True), page) as address:
+        context = browser.new_context(viewport={"width": 1100, "height": 900})
+        player = Player(context, address, mode="session")
+        player.file = tmp_path / "played.jsonl"
+        shown = lambda: player.page.locator("main svg").count()  # noqa: E731
+        for trip in range(2):
+            assert player.page.inner_text("#status").startswith(f"Session 1, trip {trip + 1} of 2") and shown() == 0
+            if boats == 2:
+                player.page.keyboard.press("fs"[trip])
+            player.until("screen === 'sail'")
+            assert shown() == 0
+            player.hold("j", 0.03)  # lasts 0.15 s all the same
+            player.until("state?.legs.length === 1 && !hpamdpGame.state.isPressed")
+            released = time.time()
+            for turn in range(30):
+                if player.get("screen") == "result":
+                    break
+                released = player.hold(KEYS[turn % 3], 1.4, released + 0.02)
+            player.until("screen === 'result'")
+            if trip == 0:
+                assert shown() == 0 and not player.file.exists()
+                player.page.keyboard.press("Enter")
+        assert shown() == boats and "The session is over" in player.page.inner_text("#result")
+        (session,) = stored(player, 1)
+        assert page.check(session) == session and [trip["boat"] for trip in session["trips"]] == [0, boats - 1]
+        assert all(trip["presses"][0]["duration"] == pytest.approx(0.15) for trip in session["trips"])
+        player.page.keyboard.press("Enter")
+        assert player.page.locator("#end-table tr").count() == 4  # head, two trips, note
+        player.page.click("#go-on")
+        assert player.page.inner_text("#status").startswith("Session 2, trip 1 of 2") and shown() == 0
+        assert player.get("session.boats[0].number") != session["boats"][0]["number"]
+        assert player.errors == []
+        context.close()
+
+
+def test_a_trip_that_is_left_gives_up_its_session(browser, tmp_path):
+    page = SessionPage(seed=0, options=UnseenBoatsOptions(trips=1))
+    with serving(tmp_path / "played.jsonl", page.data([], has_server=True), page) as address:
+        context = browser.new_context()
+        player = Player(context, address, mode="session")
+        player.until("screen === 'sail'")
+        boat = player.get("session.boats[0].number")
+        player.hold("k", 0.2)
+        player.page.click("#finish")
+        assert player.get("screen") == "start" and player.get("results.session.length") == 0
+        player.page.click("[data-mode=session]")
+        assert player.get("session.boats[0].number") != boat
+        assert player.page.inner_text("#status") == "Session 2, trip 1 of 1"
+        assert player.get("stored.length") == 0 and player.errors == []
+        context.close()

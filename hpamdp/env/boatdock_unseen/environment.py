@@ -8,7 +8,7 @@ a session a trial.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -28,6 +28,9 @@ from hpamdp.env.boatdock_unseen.rules import SessionRules, SessionState
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.rng_streams import EVALUATION, TRAINING
+
+if TYPE_CHECKING:
+    from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
 
 SESSION_SCORE, SESSION_SUCCESS = "session_score", "session_success"  # entries of the tensordict
 _FIRST_TRIPS = 2  # whose scores have metrics of their own
@@ -185,6 +188,16 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         from hpamdp.env.boatdock_unseen import film  # only films need it
 
         return film.film(track, fps, size, self.rules, self.options.boats)
+
+    def page(self, seed: int) -> SessionPage:
+        """Return the page on which people sail sessions.
+
+        Raises:
+            ValueError: the settings are not those of the page, which has new boats and no noise.
+        """
+        from hpamdp.env.boatdock_unseen.play.session_page import SessionPage  # only the page needs it
+
+        return SessionPage(seed, self.options)
 
     def known_boats(self, state: SessionState) -> list[fleet.Boats]:
         """Return what the boats of each session do, which no agent is told: the first and, with two, the second."""

@@ -60,7 +60,7 @@ class BoatPage:
     shows_agents = True
 
     def __init__(self, seed: int, rules: Rules | None = None) -> None:
-        other = _other_setting({} if rules is None else rules._asdict(), _OF_PEOPLE)
+        other = other_setting({} if rules is None else rules._asdict(), _OF_PEOPLE)
         if other is not None:
             raise ValueError(f"BoatDockEnv: {other}")
         self.seed = seed
@@ -157,12 +157,12 @@ def _check_agent(agent: Mapping[str, Any]) -> None:
     Raises:
         EpisodeError: a setting differs. The message names it.
     """
-    other = _other_setting(agent["env"], _OF_AGENTS)
+    other = other_setting(agent["env"], _OF_AGENTS)
     if other is not None:
         raise EpisodeError(f"{agent['name']}: was trained with env.{other}")
 
 
-def _other_setting(settings: Mapping[str, Any], of_page: Mapping[str, Any]) -> str | None:
+def other_setting(settings: Mapping[str, Any], of_page: Mapping[str, Any]) -> str | None:
     """Return a text about the first setting that differs from the page's, or None. Missing settings do not differ."""
     for name, value in of_page.items():
         given = settings.get(name, value)

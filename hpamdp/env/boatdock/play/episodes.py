@@ -110,7 +110,7 @@ def check(value: object) -> Episode:
     Raises:
         EpisodeError: the episode is not valid. The message is one line.
     """
-    episode = parse(Episode, value)
+    episode = _parse_episode(value)
     (problem,) = _problems([episode])
     if problem is not None:
         raise EpisodeError(problem)
@@ -196,7 +196,7 @@ def read_with_problems(path: Path) -> tuple[dict[int, Episode], dict[int, str]]:
     problems: dict[int, str] = {}
     for number, line in lines_of(data):
         try:
-            parsed[number] = parse(Episode, read_json(line))
+            parsed[number] = _parse_episode(read_json(line))
         except ValueError as error:
             problems[number] = str(error)
     episodes: dict[int, Episode] = {}
@@ -237,6 +237,12 @@ def parse(form: type[RecordT], value: object) -> RecordT:
         raise EpisodeError(f"{where[:80]}: {wrong['msg']}") from error
     except (ValueError, TypeError) as error:
         raise EpisodeError("episode: is not a JSON object") from error
+
+
+def _parse_episode(value: object) -> Episode:
+    if isinstance(value, dict) and "trips" in value:
+        raise EpisodeError("trips: is a session with unknown boats, but must be an episode with one of people's two")
+    return parse(Episode, value)
 
 
 def _points(points: Sequence[Point]) -> Tensor:

@@ -147,7 +147,7 @@ function playGame(makeTask) {
   function leaveOpen() {
     task.leave();
     choose();
-    $("#result").insertAdjacentHTML("afterbegin", "<p>The last one was open for more than an hour and does not count.</p>");
+    $("#result").insertAdjacentHTML("afterbegin", `<p>The ${task.noun} was open for more than an hour and does not count.</p>`);
   }
 
   function releaseAll(event) {
