@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
+import hpamdp
 from hpamdp import keys
 from hpamdp.env.boatdock import task
 from hpamdp.env.boatdock.environment import BoatDockEnv
@@ -291,6 +292,22 @@ def test_tensors_are_as_the_specs_say_and_gymnasium_accepts_the_ids():
         assert observation in env.observation_space
         observation, _, terminated, _, _ = env.step(env.action_space.sample())
         assert observation in env.observation_space and not terminated
+
+
+@pytest.mark.parametrize("boats", [1, 2])
+def test_in_gymnasium_infos_tell_where_trips_end_and_the_sessions_score(boats):
+    env = hpamdp.make_gymnasium("boatdock_unseen", boats=boats, trips=2)
+    _, info = env.reset(seed=1)
+    assert info["trip_ended"] is False and "score" not in info
+    ended, is_over = 0, False
+    while not is_over:
+        _, _, is_over, _, info = env.step(env.action_space.sample())
+        ended += info["trip_ended"]
+    assert ended == 2 and -1.0 <= info["score"] <= 5.0 and info["success"] in (0.0, 0.5, 1.0)
+    many = hpamdp.make_gymnasium("boatdock_unseen", num_envs=3, boats=boats, trips=2)
+    many.reset(seed=1)
+    infos = many.step(many.action_space.sample())[-1]
+    assert infos["trip_ended"].dtype == bool and infos["trip_ended"].shape == (3,)
 
 
 def test_an_evaluation_repeats_and_a_saved_state_continues_exactly():

@@ -1,9 +1,11 @@
 """Gymnasium environments of any `BatchedEnv`, whose id a problem registers with the path of its class.
 
-Their actions are the field's nested tuples, `(discrete action, (parameters of action 0, ..., of action K-1))`; batched
-spaces are Gymnasium's own: every leaf has a leading `[N]`. Only the parameters of the chosen action count.
+Their actions are the field's nested tuples, `(discrete action, (parameters of action 0, ..., of action K-1))`, with the
+option in front if the agent chooses one; batched spaces are Gymnasium's own: every leaf has a leading `[N]`. Only the
+parameters of the chosen action count.
 
-Infos: `outcome` (name), `steps` (actions so far) and, once the episode is over, `is_success`.
+Infos: `outcome` (name), `steps` (actions so far), in sessions of trips `trip_ended`, and once the episode is over those
+of `BatchedEnv.final_infos`, such as `is_success`.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.env.batched_env import GOING_ON, SUCCESS, BatchedEnv
+from hpamdp.env.batched_env import GOING_ON, BatchedEnv
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium_adapter import (
     After,
@@ -148,8 +150,6 @@ def rows_of(env: BatchedEnv) -> KernelRows | TensorRows:
 class NumpyBatchedEnv(NumpyRows):
     """A `BatchedEnv` with NumPy in and out: one environment (`batch=()`) or many (`batch=(N,)`)."""
 
-    final_infos = ("is_success",)
-
     def __init__(self, env: BatchedEnv, batch: tuple[int, ...]) -> None:
         if not env.components.is_single or any(env.integer_parameters):
             raise ProblemError(f"{env.title}: the Gymnasium form of a BatchedEnv has one component of real parameters")
@@ -164,6 +164,8 @@ class NumpyBatchedEnv(NumpyRows):
             pixels: Any = np.uint8  # the annotation of Box knows float32 alone
             self.observation_space = spaces.Box(0, 255, self._picture, pixels)
         self._outcome_names = np.array(env.outcomes, dtype=object)
+        self.final_infos = tuple(env.final_infos(env.state))
+        self._num_options = len(env.option_names) if env.has_choice else 0
 
     @property
     def state(self) -> Any:
@@ -193,23 +195,31 @@ class NumpyBatchedEnv(NumpyRows):
     def infos(self) -> dict[str, np.ndarray]:
         """Return the infos, `[N]` each."""
         steps, outcome = self.rows.integers[STEPS_ROW], self.rows.integers[OUTCOME_ROW]
-        return {
-            "outcome": self._outcome_names[outcome],
-            "steps": steps.astype(np.int64),
-            "is_success": outcome == SUCCESS,
-        }
+        infos = {"outcome": self._outcome_names[outcome], "steps": steps.astype(np.int64)}
+        if self._env.has_trips:
+            infos[keys.TRIP_ENDED] = to_numpy(self._trip_ended())
+        return infos | {name: to_numpy(value) for name, value in self._env.final_infos(self._env.state).items()}
 
     def info(self) -> dict[str, Any]:
         """Return the infos of the first environment as Python's numbers."""
         steps, outcome, _ = self.rows.integers[STEPS_ROW:, 0].tolist()
         values = {"outcome": self._env.outcomes[outcome], "steps": steps}
-        return values if outcome == GOING_ON else {**values, "is_success": outcome == SUCCESS}
+        if self._env.has_trips:
+            values[keys.TRIP_ENDED] = self._trip_ended()[0].item()
+        if outcome == GOING_ON:
+            return values
+        return values | {name: value[0].item() for name, value in self._env.final_infos(self._env.state).items()}
 
-    def _leaves(self, action: Any) -> tuple[None, np.ndarray, np.ndarray]:
-        """Check an action's structure, types and shapes; return discrete actions and parameters."""
-        if not isinstance(action, (tuple, list)) or len(action) != 2:
-            raise ValueError(f"step: the action must be a tuple (discrete, parameters), but is {describe(action)}")
-        discrete, parameters = action
+    def _trip_ended(self) -> torch.Tensor:
+        """Return whether a trip ended with the last step, bool `[N]`."""
+        return dict(zip(self._env.extra_names, self._env.extras(self._env.state), strict=True))[keys.TRIP_ENDED]
+
+    def _leaves(self, action: Any) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
+        """Check an action's structure, types and shapes; return options, discrete actions and parameters."""
+        names = ("option", "discrete", "parameters") if self._num_options else ("discrete", "parameters")
+        if not isinstance(action, (tuple, list)) or len(action) != len(names):
+            raise ValueError(f"step: the action must be a tuple ({', '.join(names)}), but is {describe(action)}")
+        *options, discrete, parameters = action
         dims = self._env.parameter_dims
         if not isinstance(parameters, (tuple, list)) or len(parameters) != len(dims):
             raise ValueError(f"step: parameters must be a tuple of length {len(dims)}, but is {describe(parameters)}")
@@ -220,7 +230,9 @@ class NumpyBatchedEnv(NumpyRows):
         ]
         joined = np.empty((self._env.num_envs, sum(dims)), np.float32)
         np.concatenate(arrays, axis=-1, out=joined if self._batch else joined[0], casting="same_kind")
-        return None, given.reshape(self._env.num_envs), joined
+        chosen = [as_array("step: option", each, self._batch, is_integer=True).astype(np.int64) for each in options]
+        option = chosen[0].reshape(self._env.num_envs) if chosen else None
+        return option, given.reshape(self._env.num_envs), joined
 
 
 def _load(problem: str) -> type[Any]:
@@ -230,12 +242,13 @@ def _load(problem: str) -> type[Any]:
 
 
 def _action_space(env: PAMDPEnv) -> spaces.Tuple:
-    """Return the space `Tuple(Discrete, Tuple(Box, ...))` of the actions of one environment."""
+    """Return the space of the actions of one environment, `Tuple(Discrete, Tuple(Box, ...))`, behind any options."""
     bounds = env.full_action_spec_unbatched[keys.PARAMETERS].space
     ends = np.cumsum(env.parameter_dims)[:-1]
     lows, highs = (np.split(side.cpu().numpy().reshape(-1), ends) for side in (bounds.low, bounds.high))
     boxes = [spaces.Box(low, high, dtype=np.float32) for low, high in zip(lows, highs, strict=True)]
-    return spaces.Tuple((spaces.Discrete(len(boxes)), spaces.Tuple(boxes)))
+    options = [spaces.Discrete(len(env.option_names))] if env.has_choice else []
+    return spaces.Tuple((*options, spaces.Discrete(len(boxes)), spaces.Tuple(boxes)))
 
 
 def to_numpy(tensor: torch.Tensor) -> np.ndarray:

@@ -315,6 +315,10 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         """Return `success` bool `[M]`."""
         return {"success": last.get(keys.OUTCOME) == SUCCESS}
 
+    def final_infos(self, state: EpisodeState) -> dict[str, Tensor]:
+        """Return what Gymnasium's infos tell of episodes that are over, `[N]` each: whether they succeeded."""
+        return {"is_success": state.outcome == SUCCESS}
+
     def env_state(self) -> dict[str, Tensor]:
         """Return the columns of the state, `[N]` each."""
         return self.state._asdict()

@@ -223,6 +223,11 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         """Return the mean `score` and `success` of the trips of finished (or abandoned) sessions, `[M]`."""
         return {"score": last.get(SESSION_SCORE).squeeze(-1), "success": last.get(SESSION_SUCCESS).squeeze(-1)}
 
+    def final_infos(self, state: SessionState) -> dict[str, Tensor]:
+        """Return `score` and `success`, the share of trips that docked, of sessions `[N]`."""
+        _, score, success = self.extras(state)
+        return {"score": score, "success": success}
+
     def played(self) -> dict[str, Tensor]:
         """Return `trip_score` and `trip_presses` `[N, trips]` of the sessions of an evaluation."""
         return {"trip_score": self._trip_scores.clone(), "trip_presses": self._trip_presses.clone()}

@@ -5,9 +5,9 @@ from __future__ import annotations
 from hpamdp.env.registration import register_batched_env
 
 UNSEEN_BOATS_IDS = {
-    "turned": "hpamdp/UnseenBoats-v0",
-    "any": "hpamdp/UnseenBoatsAny-v0",
-    "strength": "hpamdp/UnseenBoatsStrength-v0",
+    "turned": "hpamdp/BoatDockUnseen-v0",
+    "any": "hpamdp/BoatDockUnseenAny-v0",
+    "strength": "hpamdp/BoatDockUnseenStrength-v0",
 }
 
 
