@@ -164,7 +164,7 @@ class NumpyBatchedEnv(NumpyRows):
             pixels: Any = np.uint8  # the annotation of Box knows float32 alone
             self.observation_space = spaces.Box(0, 255, self._picture, pixels)
         self._outcome_names = np.array(env.outcomes, dtype=object)
-        self.final_infos = tuple(env.final_infos(env.state))
+        self.final_infos = tuple(env.final_infos(self.rows))
         self._num_options = len(env.option_names) if env.has_choice else 0
 
     @property
@@ -197,22 +197,18 @@ class NumpyBatchedEnv(NumpyRows):
         steps, outcome = self.rows.integers[STEPS_ROW], self.rows.integers[OUTCOME_ROW]
         infos = {"outcome": self._outcome_names[outcome], "steps": steps.astype(np.int64)}
         if self._env.has_trips:
-            infos[keys.TRIP_ENDED] = to_numpy(self._trip_ended())
-        return infos | {name: to_numpy(value) for name, value in self._env.final_infos(self._env.state).items()}
+            infos[keys.TRIP_ENDED] = self._env.trip_ends(self.rows)
+        return infos | self._env.final_infos(self.rows)
 
     def info(self) -> dict[str, Any]:
         """Return the infos of the first environment as Python's numbers."""
         steps, outcome, _ = self.rows.integers[STEPS_ROW:, 0].tolist()
         values = {"outcome": self._env.outcomes[outcome], "steps": steps}
         if self._env.has_trips:
-            values[keys.TRIP_ENDED] = self._trip_ended()[0].item()
+            values[keys.TRIP_ENDED] = self._env.trip_ends(self.rows).item(0)
         if outcome == GOING_ON:
             return values
-        return values | {name: value[0].item() for name, value in self._env.final_infos(self._env.state).items()}
-
-    def _trip_ended(self) -> torch.Tensor:
-        """Return whether a trip ended with the last step, bool `[N]`."""
-        return dict(zip(self._env.extra_names, self._env.extras(self._env.state), strict=True))[keys.TRIP_ENDED]
+        return values | {name: value.item(0) for name, value in self._env.final_infos(self.rows).items()}
 
     def _leaves(self, action: Any) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
         """Check an action's structure, types and shapes; return options, discrete actions and parameters."""

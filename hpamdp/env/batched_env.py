@@ -28,6 +28,7 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.kernel_rows import Advance, KernelRows, Results, invalid_choice
+from hpamdp.env.kernels import OUTCOME_ROW
 from hpamdp.env.state_columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.settings import SettingError, Settings
 
@@ -52,6 +53,18 @@ class EpisodeColumns(Columns, Protocol):
     @property
     def episode(self) -> Tensor:
         """Number of the environment's episode."""
+
+
+class StateArrays(Protocol):
+    """The columns of a state as arrays, in their order."""
+
+    @property
+    def floats(self) -> np.ndarray:
+        """The float32 columns, `[F, N]`."""
+
+    @property
+    def integers(self) -> np.ndarray:
+        """The int32 columns, `[I, N]`."""
 
 
 EpisodeState = TypeVar("EpisodeState", bound=EpisodeColumns)
@@ -315,9 +328,13 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         """Return `success` bool `[M]`."""
         return {"success": last.get(keys.OUTCOME) == SUCCESS}
 
-    def final_infos(self, state: EpisodeState) -> dict[str, Tensor]:
+    def trip_ends(self, rows: StateArrays) -> np.ndarray:
+        """Return whether a trip ended with the last step, bool `[N]`, for Gymnasium's infos."""
+        raise NotImplementedError(f"{type(self).__name__} has no trips")
+
+    def final_infos(self, rows: StateArrays) -> dict[str, np.ndarray]:
         """Return what Gymnasium's infos tell of episodes that are over, `[N]` each: whether they succeeded."""
-        return {"is_success": state.outcome == SUCCESS}
+        return {"is_success": rows.integers[OUTCOME_ROW] == SUCCESS}
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the columns of the state, `[N]` each."""

@@ -19,7 +19,7 @@ from torchrl.data import Binary, Bounded, TensorSpec, Unbounded
 from hpamdp import keys
 from hpamdp.env import counter_rng, kernels
 from hpamdp.env.base import Metric
-from hpamdp.env.batched_env import Action, BatchedEnv
+from hpamdp.env.batched_env import Action, BatchedEnv, StateArrays
 from hpamdp.env.boatdock import harbour, task
 from hpamdp.env.boatdock_unseen import fleet, kernel, rules
 from hpamdp.env.boatdock_unseen.fleet import FAMILIES
@@ -223,10 +223,14 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         """Return the mean `score` and `success` of the trips of finished (or abandoned) sessions, `[M]`."""
         return {"score": last.get(SESSION_SCORE).squeeze(-1), "success": last.get(SESSION_SUCCESS).squeeze(-1)}
 
-    def final_infos(self, state: SessionState) -> dict[str, Tensor]:
+    def trip_ends(self, rows: StateArrays) -> np.ndarray:
+        """Return whether a trip ended with the last press, bool `[N]`."""
+        return rows.integers[kernel.TRIP_ENDED] != 0
+
+    def final_infos(self, rows: StateArrays) -> dict[str, np.ndarray]:
         """Return `score` and `success`, the share of trips that docked, of sessions `[N]`."""
-        _, score, success = self.extras(state)
-        return {"score": score, "success": success}
+        trips = np.float32(self.options.trips)
+        return {"score": rows.floats[kernel.TOTAL_SCORE] / trips, "success": rows.integers[kernel.DOCKED] / trips}
 
     def played(self) -> dict[str, Tensor]:
         """Return `trip_score` and `trip_presses` `[N, trips]` of the sessions of an evaluation."""
