@@ -499,6 +499,8 @@ def test_an_agent_remembers_until_its_episode_ends(memory):
         (["low=hppo", "low.memory=lstm"], "low.memory"),
         (["low=hppo", "low.memory=gru", "low.vector_products=true"], "vector_products=true: does not go with memory"),
         (["low=pdqn", "low.memory=stack", "low.augment=true"], "augment=true: does not go with memory=stack"),
+        (["low=pets", "low.memory=gru", "low.augment=true"], "augment=true: does not go with memory=gru"),
+        (["low=pets", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=pets: memory=gru"),
         (["low=pdqn", "low.memory=gru", "low.n_step=2"], "n_step=2: does not go with memory=gru"),
         (["low=pdqn", "low.memory=gru", "low.double_q=true"], "double_q=true: does not go with memory=gru"),
         (["low=hppo", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=hppo: memory=gru"),

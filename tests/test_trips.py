@@ -117,9 +117,8 @@ REPLAY = {
     "hsac": (HSAC, {}),
     "hyar": (HyAR, {}),
     "paddpg": (PADDPG, {}),
-    "pets": (PETS, {"end_values": True}),
-    "dlpa": (DLPA, {"end_values": True}),
 }
+PLANNING = {"pets": PETS, "dlpa": DLPA}
 # Of the four steps of a session: the discount of what follows.
 DISCOUNTS = {"session": [GAMMA, GAMMA, GAMMA, 0.0], "trip": [GAMMA, 0.0, GAMMA, 0.0]}
 every_end = pytest.mark.parametrize("values_end", ["session", "trip"])
@@ -145,12 +144,22 @@ def test_stored_steps_are_followed_by_later_trips_only_if_values_last_a_session(
     learner = cls(specs, gamma=GAMMA, warmup_steps=1000, **settings)
     agent = agent_of([learner], specs, values_end)
     agent.learn(played(env, agent))
+    assert learner.buffer[:]["discount"].tolist() == DISCOUNTS[values_end]
+
+
+@every_end
+@pytest.mark.parametrize("low", PLANNING)
+def test_models_learn_that_plans_end_with_a_trip_whatever_values_look_past(low, values_end):
+    env = Sessions(1)
+    specs = PAMDPSpecs.from_env(env)
+    learner = PLANNING[low](specs, gamma=GAMMA, warmup_steps=1000, end_values=True)
+    agent = agent_of([learner], specs, values_end)
+    agent.learn(played(env, agent))
     rows = learner.buffer[:]
-    assert rows["discount"].tolist() == DISCOUNTS[values_end]
-    if "terminated" in rows.keys():
-        assert rows["terminated"].tolist() == [each == 0.0 for each in DISCOUNTS[values_end]]
-    if "successor" in rows.keys():
-        assert rows["successor"].tolist() == ([1, 2, 3, -1] if values_end == "session" else [1, -1, 3, -1])
+    assert rows["discount"].tolist() == DISCOUNTS["trip"]
+    assert rows["terminated"].tolist() == [False, True, False, True]
+    if low == "dlpa":
+        assert rows["successor"].tolist() == [1, -1, 3, -1]
 
 
 @every_end

@@ -99,6 +99,10 @@ class Stack(nn.Module):
         """Return the features `[N, num_features]` of observations and the states after them."""
         return state
 
+    def state_in(self, features: Tensor) -> Tensor:
+        """Return the states `[N, size]` of which features `[N, num_features]` were made."""
+        return features
+
 
 class GRU(nn.Module):
     """A gated recurrent unit; the features are its state and the observation.
@@ -129,6 +133,10 @@ class GRU(nn.Module):
     def features(self, seen: Tensor, state: Tensor) -> Tensor:
         """Return the features `[N, num_features]` of observations and the states after them."""
         return torch.cat([state, seen], -1)
+
+    def state_in(self, features: Tensor) -> Tensor:
+        """Return the states `[N, size]` of which features `[N, num_features]` were made."""
+        return features[..., : self.size]
 
     def unrolled(self, seen: Tensor, held: Tensor) -> Tensor:
         """Return the states `[N, L, size]` after each of the observations `[N, L, num_inputs]`.

@@ -141,6 +141,15 @@ class Perception(nn.Module):
         """
         return self._after(self.encoded(observation), memory)
 
+    def imagined(self, features: Tensor, observation: Tensor) -> Tensor:
+        """Return the features `[*B, specs.observation_dim]` that follow from others when observations `[*B, *]` come.
+
+        A model predicts these observations, so they have no pictures.
+        """
+        if self.memory is None:
+            return observation
+        return self.memory.features(observation, self._after(observation, self.memory.state_in(features)))
+
     def _after(self, encoded: Tensor, memory: Tensor | None = None) -> Tensor:
         """Return what `after` does, given encoded observations `[*B, *]`."""
         assert self.memory is not None

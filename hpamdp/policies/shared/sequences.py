@@ -101,7 +101,7 @@ def ancestors(newest: Tensor, previous: Tensor, num_stored: int, num_steps: int)
 
 
 def sample_with_past(buffer: ReplayBuffer, num: int, num_steps: int) -> TensorDict:
-    """Return random rows `[num]` of a buffer, each with the rows before it in its history.
+    """Return random rows `[num]` of a buffer, each with the rows before it in its history, see `past_of`.
 
     Each row is drawn with the same probability, and its sequence ends with it. TorchRL's SliceSampler draws histories
     with the same probability instead, so it would learn too seldom from the last step of a long one.
@@ -110,20 +110,31 @@ def sample_with_past(buffer: ReplayBuffer, num: int, num_steps: int) -> TensorDi
         buffer: has the columns `state`, `memory`, `begins`, and `previous` of `HistoryLinks`.
         num: how many rows.
         num_steps: the most rows of a sequence.
+    """
+    stored = buffer[:]
+    place = torch.randint(len(stored), (num,), device=stored["previous"].device)
+    sample: TensorDict = stored[place]
+    return sample.update(past_of(buffer, place, num_steps))
+
+
+def past_of(buffer: ReplayBuffer, place: Tensor, num_steps: int) -> TensorDict:
+    """Return the sequences that end with the rows at places `[N]` of a buffer.
+
+    Args:
+        buffer: as in `sample_with_past`.
+        place: of the last rows of the sequences.
+        num_steps: the most rows of a sequence.
 
     Returns:
-        The rows, also with `past`, the states of the sequence `[num, num_steps, *]`, padded at the end; `num_past`, how
-        many there are; and `first_memory` and `first_begins`, the entries of the sequence's first row.
+        `past`, the states of the sequence `[N, num_steps, *]`, padded at the end; `num_past`, how many there are; and
+        `first_memory` and `first_begins`, the entries of the sequence's first row.
     """
     stored, num_stored = buffer[:], buffer.write_count
-    place = torch.randint(len(stored), (num,), device=stored["previous"].device)
     # The number of the row at a place: the largest one below `num_stored` that the ring buffer keeps there.
     newest = num_stored - 1 - (num_stored - 1 - place) % len(stored)
     places, num_past = ancestors(newest, stored["previous"], num_stored, num_steps)
-    sample: TensorDict = stored[place]
-    for name in ("memory", "begins"):
-        sample.set(f"first_{name}", stored[name][places[:, 0]])
-    return sample.set("past", stored["state"][places]).set("num_past", num_past)
+    first = {f"first_{name}": stored[name][places[:, 0]] for name in ("memory", "begins")}
+    return TensorDict({"past": stored["state"][places], "num_past": num_past, **first}, [len(place)])
 
 
 def states_of_past(sample: TensorDictBase, perception: Perception, burn_in: int) -> Tensor:

@@ -23,7 +23,8 @@ Differs from the source:
   to the drawn elite;
 - elites are weighted relative to the spread of returns, by the standard deviation over the plan's first samples. The
   source's weights depend on the scale of the rewards;
-- with `end_values` a plan also counts the value of its last state (`policies.shared.end_values`).
+- with `end_values` a plan also counts the value of its last state (`policies.shared.end_values`);
+- windows and plans end where a trip ends, because the start of the next trip is random.
 
 TorchRL's SliceSampler (`fragmented`, padded) does not fit: it samples trajectories instead of steps uniformly, and none
 of its windows starts in the last `horizon - 1` steps of a longer trajectory. So the model learns most terminations from
@@ -41,13 +42,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import ActionFeature, option_ends
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
 from hpamdp.policies.low_level.dlpa.planner import Planner, PlannerOptions
 from hpamdp.policies.shared.end_values import EndValues
-from hpamdp.policies.shared.planning_policy import PlanningPolicy
+from hpamdp.policies.shared.planning_policy import PlanningPolicy, plan_ends
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.settings import PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
@@ -111,7 +111,7 @@ class DLPA(ReplayLearner):
     """A PAMDPModel trained on windows from a replay buffer, and a Planner that acts in it.
 
     Windows never leave their trajectory, which is an unbroken sequence of this learner's steps within one environment,
-    episode and option. It may span several batches.
+    episode, trip and option. It may span several batches.
     """
 
     Options = DLPAOptions
@@ -190,11 +190,17 @@ class DLPA(ReplayLearner):
         return super().value(observation) if self.end_values is None else self.end_values.of_own(observation)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return the model's inputs and targets in a batch `[*B, T]`, and those of the values, if they are learned."""
+        """Return the model's inputs and targets in a batch `[*B, T]`, and those of the values, if they are learned.
+
+        A step that ends a trip counts as one that terminates.
+        """
         rows = super().transitions(batch)
+        ends = plan_ends(batch)
         if self.end_values is None:
             rows = rows.select(*_STORED)
-        return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
+        else:
+            rows.set("discount", torch.where(ends, 0.0, rows["discount"]))
+        return rows.set("terminated", ends)
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Add the transitions in `mask` of a batch `[*B, T]`, each with its trajectory and a link to the next step.
@@ -206,7 +212,7 @@ class DLPA(ReplayLearner):
         num_steps = mask.shape[-1]
         rows = self.transitions(batch).reshape(-1, num_steps)
         mask = mask.reshape(-1, num_steps)
-        ends = option_ends(batch).reshape(-1, num_steps)
+        ends = option_ends(batch).reshape(-1, num_steps) | rows["terminated"]
         # A step follows the one before it, which may be the last step of an earlier batch.
         last_place, last_trajectory = self._open_steps(rows["state"][:, 0])
         follows = torch.zeros_like(mask)

@@ -29,12 +29,18 @@ Differs from the sources:
 - members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
 - weight decay falls with the number of stored steps, as the weight of a prior does;
 - each sequence of discrete actions has its own search for parameters (`policies.shared.planning`);
-- with `end_values` a plan also counts the value of its last state (`policies.shared.end_values`).
+- with `end_values` a plan also counts the value of its last state (`policies.shared.end_values`);
+- with `memory` the networks also see what is remembered of the session's earlier observations, for problems in which
+  something hidden stays the same. Imagined steps go into the memory, too. Models that are told a context: Rakelly et
+  al. 2019, *PEARL*, arXiv 1903.08254; Nagabandi et al. 2019, *Learning to Adapt*, arXiv 1803.11347, which adapts the
+  model's weights instead;
+- plans end where a trip ends, because the start of the next trip is random.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -43,18 +49,21 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from hpamdp import keys
 from hpamdp.policies.base import ActionFeature
 from hpamdp.policies.low_level.pets.model import PETSModel
 from hpamdp.policies.low_level.pets.policy import PETSPolicy, PETSPolicyOptions
 from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.memory import ReplayMemoryOptions, Stack
+from hpamdp.policies.shared.networks import polyak_update
+from hpamdp.policies.shared.planning_policy import plan_ends
 from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.sequences import past_of, sample_with_past, states_of_past
 from hpamdp.specs import PAMDPSpecs
 
 _MAX_COPIES = 16  # of a stored step under the problem's symmetries
 
 
-class PETSOptions(PETSPolicyOptions):
+class PETSOptions(PETSPolicyOptions, ReplayMemoryOptions):
     """Settings of `PETS`."""
 
     weight_decay: NonNegativeFloat = 1.0
@@ -96,16 +105,19 @@ class PETS(ReplayLearner):
     ) -> None:
         options = PETSOptions.of(options, settings)
         self.entries = list(range(specs.observation_dim))
-        if options.augment is not False:
+        remembers = options.memory != "none"
+        if options.augment is not False and not remembers:
             self.entries, specs = specs.telling_entries, specs.with_telling_entries()
         super().__init__(specs, device, options)
-        self.model = PETSModel(specs, options)
-        self.end_values = (
-            EndValues(specs.observation_dim, options.outcome_dims, options) if options.end_values else None
-        )
-        self.policy = PETSPolicy(self.model, specs, self.entries, options, self.end_values)
+        self.set_perception(options)
+        features_dim = self.perception.specs.observation_dim
+        known = _without_directions(specs) if remembers else specs
+        self.model = PETSModel(known, options, features_dim - specs.observation_dim)
+        self.end_values = EndValues(features_dim, options.outcome_dims, options) if options.end_values else None
+        self.policy = PETSPolicy(self.model, specs, self.entries, options, self.perception, self.end_values)
         self.to(device)
-        adam = torch.optim.AdamW(self.model.parameters(), lr=options.lr, weight_decay=options.weight_decay, fused=True)
+        learned = [*self.model.parameters(), *self.perception.parameters()]
+        adam = torch.optim.AdamW(learned, lr=options.lr, weight_decay=options.weight_decay, fused=True)
         self.optimizers = {"model": adam}
         if self.end_values is not None:
             self.optimizers["end_values"] = self.end_values.optimizer()
@@ -117,16 +129,21 @@ class PETS(ReplayLearner):
         """
         scalars = self.gradient_step("model", self.loss, sample)
         if self.end_values is not None:
-            rows = self.buffer.sample(sample.numel())
-            state, next_state = rows["state"], rows["next_state"]
+            num = sample.numel()
+            rows = self.buffer.sample(num) if self.links is None else sample_with_past(self.buffer, num, self.num_past)
+            with torch.no_grad():
+                memory = self.memory_of(rows, self.perception)
+                state = self.perception(rows["state"], memory, has_seen=True)
+                next_state = self.perception(rows["next_state"], memory)
             rows.set("next_state", rows["next_observation"])
             scalars |= self.end_values.update(self, rows, state, next_state)
+            polyak_update(self.target_perception, self.perception, self.options.end_value_tau)
         return scalars
 
     def loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the members' losses, and the mean of each part of it."""
         ends = sample["terminated"]
-        transition, outcome = self.model.in_frame(sample["turned"], sample["action"])
+        transition, outcome = self.model.in_frame(sample["turned"], sample["action"], self._context(sample))
         change = sample["change"]
         if self.model.is_probabilistic:
             mean, log_variance = self.model.moments(transition)
@@ -145,14 +162,31 @@ class PETS(ReplayLearner):
         loss = self.options.transition_weight * parts["change"] + parts["termination"] + parts["reward"]
         return loss * self.model.num_members, parts
 
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the values `[N]` of observations `[N, *]`.
+    def _context(self, sample: TensorDictBase) -> Tensor | None:
+        """Return what is remembered of the observations before those of a sample, `[E, B, context_dim]`, if anything.
+
+        A recurrent memory has seen the sample's own observations as well.
+        """
+        if self.links is None:
+            return sample.get("context", None)
+        states = states_of_past(sample.flatten(0, 1), self.perception, self.burn_in)
+        return states.unflatten(0, sample.batch_size)
+
+    def value(
+        self,
+        observation: Tensor,
+        action_mask: Tensor | None = None,
+        *,
+        memory: Tensor | None = None,
+        has_seen: bool = False,
+    ) -> Tensor:
+        """Return the values `[N]` of observations `[N, *]`; see `Learner.value` for the memory.
 
         With `end_values` they are what these have learned, whatever a mask allows; else see `PETSPolicy.value`.
         """
         if self.end_values is None:
-            return self.policy.value(observation, action_mask)
-        return self.end_values.of_own(observation[..., self.entries])
+            return self.policy.value(observation, action_mask, memory=memory, has_seen=has_seen)
+        return self.end_values.of_own(self.target_perception(observation[..., self.entries], memory, has_seen=has_seen))
 
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Yield samples `[num_members, batch_size]` of all stored steps, each with all its mirror images or maps."""
@@ -163,7 +197,11 @@ class PETS(ReplayLearner):
         rows = self.prepared()
         shape = num_batches, options.num_members, options.batch_size
         for places in torch.randint(len(rows), shape, device=rows.device):
-            yield rows[places]
+            sample = rows[places]
+            if self.links is not None:  # there is a row for each stored step, in the same order
+                past = past_of(self.buffer, places.flatten(), self.num_past)
+                sample.update(past.unflatten(0, places.shape))
+            yield sample
 
     def prepared(self) -> TensorDict:
         """Fit the model's scales to all stored steps; return these in the canonical frame, as the model sees them."""
@@ -188,8 +226,13 @@ class PETS(ReplayLearner):
         self.model.fit_scales(turned[0], action, turned[1], reward, terminated)
         mean, scale = self.model.reward_mean, self.model.reward_scale
         which = terminated.long()
+        contexts: dict[str, Tensor] = {}
+        if isinstance(self.perception.memory, Stack):
+            contexts["context"] = self.buffer[:]["memory"][:, : self.model.context_dim]
+            self.model.fit_context_scales(contexts["context"])
         return TensorDict(
             {
+                **contexts,
                 "turned": turned[0],
                 "action": action,
                 "change": self.model.target_change(turned[0], action, turned[1]),
@@ -223,13 +266,25 @@ class PETS(ReplayLearner):
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the model's inputs and targets in a batch `[*B, T]`; a truncated step has not terminated.
 
-        Where values are learned, `next_observation` has all entries of the next state.
+        A step that ends a trip counts as one that terminates. Where values are learned, `next_observation` has all
+        entries of the next state.
         """
         rows = super().transitions(batch)
+        ends = plan_ends(batch)
+        rows.set("discount", torch.where(ends, 0.0, rows["discount"]))
         if self.end_values is None:
             rows = rows.exclude("discount", "action_mask", "next_action_mask")
         else:
             rows.set("next_observation", rows["next_state"])
         for name in ("state", "next_state"):
             rows.set(name, rows[name][..., self.entries])
-        return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
+        return rows.set("terminated", ends)
+
+
+def _without_directions(specs: PAMDPSpecs) -> PAMDPSpecs:
+    """Return the specs without the directions of actions, so that no states are turned.
+
+    With a memory nothing can be turned, because what is remembered would have to turn, too.
+    """
+    geometry = specs.geometry
+    return specs if geometry is None else replace(specs, geometry=replace(geometry, directions=None))

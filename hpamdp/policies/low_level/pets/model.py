@@ -82,7 +82,16 @@ class MemberNet(nn.Module):
 
 
 class PETSModel(nn.Module):
-    """`num_members` models of a step: the change of the state, then its end and its reward."""
+    """`num_members` models of a step: the change of the state, then its end and its reward.
+
+    With a memory, the networks also see a context: what is remembered of the observations before the state. The context
+    is not predicted.
+
+    Args:
+        specs: of the problem.
+        options: the settings.
+        context_dim: entries of the context; 0 without a memory.
+    """
 
     state_mean: Tensor
     state_scale: Tensor
@@ -96,12 +105,15 @@ class PETSModel(nn.Module):
     reward_scale: Tensor
     feature_mean: Tensor
     feature_scale: Tensor
+    context_mean: Tensor
+    context_scale: Tensor
     slot_kind: Tensor
     slot_number: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, options: PETSModelOptions) -> None:
+    def __init__(self, specs: PAMDPSpecs, options: PETSModelOptions, context_dim: int = 0) -> None:
         super().__init__()
         dim = specs.observation_dim
+        self.context_dim = context_dim
         self.num_members = options.num_members
         self.is_probabilistic = options.probabilistic
         self.frame = CanonicalFrame(specs, is_used=options.augment is not False)
@@ -118,10 +130,10 @@ class PETSModel(nn.Module):
         num_vectors = self.frame.num_vectors
         feature_dim = 4 * num_vectors if num_vectors else 2 * dim
         in_dim = dim + action_dim
-        self.transition = MemberNet(
-            options.num_members, in_dim, options.transition_dims, dim * (2 if options.probabilistic else 1)
-        )
-        self.outcome = MemberNet(options.num_members, in_dim + dim + feature_dim, options.outcome_dims, 3)
+        out_dim = dim * (2 if options.probabilistic else 1)
+        self.transition = MemberNet(options.num_members, context_dim + in_dim, options.transition_dims, out_dim)
+        outcome_in_dim = context_dim + in_dim + dim + feature_dim
+        self.outcome = MemberNet(options.num_members, outcome_in_dim, options.outcome_dims, 3)
         # What a context means for a turned state is its direction alone: one model serves all of them.
         is_input = torch.ones(dim, dtype=torch.float32)
         if self.frame.turns and self.frame.geometry is not None:
@@ -138,6 +150,9 @@ class PETSModel(nn.Module):
             "feature_mean": torch.zeros(feature_dim, dtype=torch.float32),
             "feature_scale": torch.ones(feature_dim, dtype=torch.float32),
         }
+        if context_dim > 0:
+            buffers["context_mean"] = torch.zeros(context_dim, dtype=torch.float32)
+            buffers["context_scale"] = torch.ones(context_dim, dtype=torch.float32)
         if self.has_linear_part:
             buffers["linear_weight"] = torch.zeros(in_dim + len(slots) + 1, dim, dtype=torch.float32)
         for name, value in buffers.items():
@@ -150,22 +165,24 @@ class PETSModel(nn.Module):
         """Predict one step with every member, each from states of its own.
 
         Args:
-            state: `[E, B, observation_dim]`.
+            state: `[E, B, context_dim + observation_dim]`, the context first.
             discrete: discrete actions, or with several components numbered choices (`JointChoice`), `[E, B]`.
             own: parameters of the discrete actions, `[E, B, D]` in [-1, 1].
             precision: of the networks.
         """
+        context, state = self.split(state)
         direction = None if self.joint is not None else self.frame.direction(state, discrete)
         turned = state if direction is None else self.frame.turn(state, direction)
         kind = discrete if direction is None else self.frame.kind[discrete]
         x = self._inputs(turned, self.action_inputs(kind, own))
+        seen = self._with_context(context, x)
         if self.is_probabilistic:
-            change = self._sampled(self.transition(x, precision)) @ self._change_map()
+            change = self._sampled(self.transition(seen, precision)) @ self._change_map()
         else:
-            change = self.transition(x, precision, self._change_map())
+            change = self.transition(seen, precision, self._change_map())
         if self.has_linear_part:
             change = change + self._linear_part(x) @ self._change_map()
-        outcome = self._outcome(x, turned, turned + change, precision)
+        outcome = self._outcome(seen, turned, turned + change, precision)
         logit, terminating, continuing = outcome.unbind(-1)
         mean, scale = self.reward_mean, self.reward_scale
         return Prediction(
@@ -174,6 +191,16 @@ class PETSModel(nn.Module):
             terminating * scale[1] + mean[1],
             logit,
         )
+
+    def split(self, state: Tensor) -> tuple[Tensor | None, Tensor]:
+        """Return contexts and observations, of `[*B, context_dim + observation_dim]`; no contexts without a memory."""
+        if self.context_dim == 0:
+            return None, state
+        return state[..., : self.context_dim], state[..., self.context_dim :]
+
+    def _with_context(self, context: Tensor | None, x: Tensor) -> Tensor:
+        """Return what the networks see: a scaled context, and inputs `[*B, in]`."""
+        return x if context is None else joined(_scaled(context, self.context_mean, self.context_scale), x)
 
     def action_inputs(self, kind: Tensor, own: Tensor) -> Tensor:
         """Return what the networks see of actions of a kind `[*B]` with parameters `[*B, D]`.
@@ -189,25 +216,27 @@ class PETSModel(nn.Module):
         value = own[..., self.slot_number] * (kind.unsqueeze(-1) == self.slot_kind)
         return joined(F.one_hot(kind, self.frame.num_kinds).to(own.dtype), value, value.square())
 
-    def in_frame(self, turned: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    def in_frame(self, turned: Tensor, action: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Predict a step in the canonical frame, to learn from it.
 
         Args:
             turned: states `[E, B, observation_dim]`.
             action: of `action_inputs`, `[E, B, *]`.
+            context: `[E, B, context_dim]`; None without a memory.
 
         Returns:
             What the transition networks say, and what the outcome networks say: logit, scaled reward if the step
             terminates, and if it does not. The loss of the latter does not reach the former.
         """
         x = self._inputs(turned, action)
-        transition = self.transition(x)
+        seen = self._with_context(context, x)
+        transition = self.transition(seen)
         scaled = transition.detach()
         if self.is_probabilistic:
             scaled = self._sampled(scaled)
         if self.has_linear_part:
             scaled = scaled + self._linear_part(x)
-        return transition, self._outcome(x, turned, turned + scaled @ self._change_map(), torch.float32)
+        return transition, self._outcome(seen, turned, turned + scaled @ self._change_map(), torch.float32)
 
     def target_change(self, turned: Tensor, action: Tensor, next_turned: Tensor) -> Tensor:
         """Return the scaled change that is left to the transition networks, `[B, observation_dim]`.
@@ -232,10 +261,10 @@ class PETSModel(nn.Module):
     def _inputs(self, turned: Tensor, action: Tensor) -> Tensor:
         return joined(_scaled(turned, self.state_mean, self.state_scale, self.is_input), action)
 
-    def _outcome(self, x: Tensor, turned: Tensor, next_turned: Tensor, precision: torch.dtype) -> Tensor:
+    def _outcome(self, seen: Tensor, turned: Tensor, next_turned: Tensor, precision: torch.dtype) -> Tensor:
         next_x = _scaled(next_turned, self.state_mean, self.state_scale, self.is_changing)
         features = _scaled(self.features(turned, next_turned), self.feature_mean, self.feature_scale)
-        return self.outcome(joined(x, next_x, features), precision)
+        return self.outcome(joined(seen, next_x, features), precision)
 
     def _change_map(self) -> Tensor:
         """Return what makes changes of the state of scaled changes, `[observation_dim, observation_dim]`."""
@@ -297,6 +326,12 @@ class PETSModel(nn.Module):
         features = self.features(turned, next_turned)
         self.feature_mean.copy_(features.mean(0))
         self.feature_scale.copy_(scale_of(features))
+
+    @torch.no_grad()
+    def fit_context_scales(self, context: Tensor) -> None:
+        """Set the scales of contexts, `[B, context_dim]`."""
+        self.context_mean.copy_(context.mean(0))
+        self.context_scale.copy_(scale_of(context))
 
     def _derive(self, change: Tensor) -> None:
         """Find the entries whose scaled changes `[B, observation_dim]` are linear in those of entries before them."""

@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 from pydantic import NonNegativeFloat
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
@@ -16,6 +16,7 @@ from hpamdp.policies.low_level.pets.model import PETSModel, PETSModelOptions
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
 from hpamdp.policies.shared.joint_choice import JointChoice
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.planning import (
     PlannedAction,
     Prediction,
@@ -72,11 +73,14 @@ class PETSPolicy(PlanningPolicy):
         specs: PAMDPSpecs,
         entries: list[int],
         options: PETSPolicyOptions,
+        perception: Perception,
         end_value: EndValues | None,
     ) -> None:
         super().__init__(specs, options.epsilon)
-        self.in_keys = [*self.in_keys, keys.IS_DECISION, MEMBER]
-        self.out_keys = [*self.out_keys, MEMBER]
+        own_keys: list[NestedKey] = [*self.in_keys, keys.IS_DECISION, MEMBER]
+        self.in_keys = own_keys + [key for key in perception.in_keys if key not in own_keys]
+        self.out_keys = [*self.out_keys, MEMBER, *perception.out_keys]
+        self.perception = perception
         self.options = options
         self.entries = entries
         self.model = model
@@ -89,6 +93,7 @@ class PETSPolicy(PlanningPolicy):
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action, the member `[*B]` and the parameters `[*B, num_parameters]`."""
+        self.perception.see(td)
         return super().forward(td.set(MEMBER, self._members(td)))
 
     def _members(self, td: TensorDictBase) -> Tensor:
@@ -106,13 +111,26 @@ class PETSPolicy(PlanningPolicy):
         """Return the first action of each plan, see `PlanningPolicy.first_action`."""
         observation = observation[is_planned]
         member = td.get(MEMBER).flatten()[is_planned] if self._follows_member else None
-        planned = self.plan(observation[:, self.entries], member, self._allowed(observation, mask))
+        memory = None
+        if self.perception.memory_key is not None:
+            memory = td.get(self.perception.memory_key).flatten(0, -2)[is_planned]
+        state = self.perception(observation[:, self.entries], memory, has_seen=True)
+        planned = self.plan(state, member, self._allowed(observation, mask))
         own = planned.own if is_greedy() else with_exploring_noise(planned.own, self.options.parameter_noise)
         return self.joint.choice(planned.discrete), self.joint.spread(planned.discrete, own)
 
     @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+    def value(
+        self,
+        observation: Tensor,
+        action_mask: Tensor | None = None,
+        *,
+        memory: Tensor | None = None,
+        has_seen: bool = False,
+    ) -> Tensor:
         """Return the expected returns `[N]` of the plans from observations `[N, *]`, with what a mask allows.
+
+        `Learner.value` explains `memory` and `has_seen`.
 
         A greedy policy uses the mean of all members, and `caution`. An exploring policy uses a random member for each
         observation (posterior sampling), or else the mean and `optimism`, so that it tries what members disagree on.
@@ -125,17 +143,18 @@ class PETSPolicy(PlanningPolicy):
             return known.expand(num) if is_greedy() else torch.full_like(observation[:, 0], torch.inf)
         member = torch.randint(self.model.num_members, (num,), device=observation.device)
         allowed = self._allowed(observation, action_mask)
-        return self.plan(observation[:, self.entries], member if self._follows_member else None, allowed).value
+        state = self.perception(observation[:, self.entries], memory, has_seen=has_seen)
+        return self.plan(state, member if self._follows_member else None, allowed).value
 
     @property
     def _follows_member(self) -> bool:
         return self.samples_posterior and not is_greedy()
 
     def plan(self, state: Tensor, member: Tensor | None = None, allowed: Tensor | None = None) -> PlannedAction:
-        """Plan from states `[N, observation_dim]`, each with its own member `[N]`. If None, with the mean of all.
+        """Plan from states `[N, F]`, each with its own member `[N]`. If None, with the mean of all.
 
         Args:
-            state: where the plans begin.
+            state: the features of where the plans begin. Without a memory they are the observations.
             member: of each of them.
             allowed: the numbered choices that each step may take, bool `[N, horizon, J]`. If None, all.
         """
@@ -169,7 +188,7 @@ class PETSPolicy(PlanningPolicy):
         return self.joint.allowed(torch.stack([first] + [later] * (self.options.horizon - 1), 1))
 
     def _plan(self, state: Tensor, allowed: Tensor | None, *, is_mean: bool) -> PlannedAction:
-        """Plan from states `[E, N, observation_dim]`: N plans by the mean of all members, or one for each state.
+        """Plan from states `[E, N, F]`: N plans by the mean of all members, or one for each state.
 
         In a plan by the mean, single members choose the sequences that are refined, which takes a fraction of the time.
         `allowed` is bool `[N, horizon, J]`, or `[E, N, horizon, J]`.
@@ -192,9 +211,10 @@ class PETSPolicy(PlanningPolicy):
         return joined_parts if is_mean else PlannedAction(*(each.flatten(0, 1) for each in joined_parts))
 
     def _returns(self, state: Tensor, is_mean: bool) -> Returns:
-        """Return a function from sequences to their predicted returns, from states `[E, N, observation_dim]`.
+        """Return a function from sequences to their predicted returns, from states `[E, N, F]`.
 
-        The returns are one for each member and state, or with `is_mean` those of all members together.
+        The returns are one for each member and state, or with `is_mean` those of all members together. After each
+        imagined step, the memory is that after the predicted observation.
         """
         num_members, num_states = state.shape[:2]
 
@@ -206,15 +226,18 @@ class PETSPolicy(PlanningPolicy):
             num_sequences = steps[-1].discrete.shape[1]
 
             def predictions() -> Iterator[Prediction]:
-                # [E, observation_dim, N, Q_h, S]: see `joined`
+                # [E, F, N, Q_h, S]: see `joined`
                 rows = state.mT[..., None, None].expand(-1, -1, -1, 1, steps[0].own.shape[2])
-                for step in steps:
+                for place, step in enumerate(steps):
                     shape = num_states, *step.own.shape[1:3]
                     rows = _each_repeated(rows, shape[1] // rows.shape[-2]).flatten(2)
                     discrete = for_members(step.discrete).unsqueeze(-1).expand(num_members, *shape).flatten(1)
                     own = for_members(step.own).flatten(1, 3)
                     ahead = self.model(rows.mT, discrete, own, self.precision)
-                    rows = ahead.next_state.mT.unflatten(-1, shape)
+                    next_rows = ahead.next_state
+                    if place < len(steps) - 1 or self.end_value is not None:
+                        next_rows = self.perception.imagined(rows.mT, next_rows)
+                    rows = next_rows.mT.unflatten(-1, shape)
                     parts = (part.unflatten(1, shape) for part in ahead[1:])
                     yield Prediction(rows, *(_each_repeated(part, num_sequences // shape[1]) for part in parts))
 
@@ -228,7 +251,7 @@ class PETSPolicy(PlanningPolicy):
         return returns
 
     def _end_value_of_joined(self, rows: Tensor) -> Tensor:
-        """Return the values `[E, N, Q, S]` of states `[E, observation_dim, N, Q, S]` at the end of a plan."""
+        """Return the values `[E, N, Q, S]` of states `[E, F, N, Q, S]` at the end of a plan."""
         assert self.end_value is not None
         value: Tensor = self.end_value(rows.movedim(1, -1))
         return value

@@ -1,0 +1,120 @@
+"""Learners that plan, with a memory: what their models see of a session, and that plans end with trips."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_memory import Cue
+from toy_trips import Sessions
+
+from hpamdp import keys
+from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.low_level.pets.learner import PETS
+from hpamdp.policies.shared.planning import Prediction
+from hpamdp.specs import PAMDPSpecs
+
+SMALL = dict(
+    horizon=1, num_samples=16, greedy_samples=16, num_iterations=3, num_members=3, transition_dims=[16],
+    outcome_dims=[32, 32], lr=1e-2, weight_decay=0.1, warmup_steps=64, updates_per_step=1.0, epsilon=0.1,
+    planning_precision="float32", stack_steps=2, memory_size=8, sequence_length=2, burn_in=0,
+)  # fmt: skip
+MEMORIES = ["stack", "gru"]
+
+
+def make(env: PAMDPEnv, memory: str, **changes) -> PETS:
+    torch.manual_seed(0)
+    return PETS(PAMDPSpecs.from_env(env), **{**SMALL, "memory": memory, **changes})
+
+
+def played(env: PAMDPEnv, learner: PETS, steps: int) -> TensorDict:
+    with torch.no_grad():
+        return with_decisions(env).rollout(steps, learner.policy, break_when_any_done=False)
+
+
+def learn(learner: PETS, rolled: TensorDict) -> None:
+    learner.learn(rolled, torch.ones(rolled.shape, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(("memory", "low", "high"), [("none", -1.0, 0.25), ("stack", 0.9, 1.0), ("gru", 0.9, 1.0)])
+def test_with_a_memory_plans_use_a_hidden_sign_that_the_step_before_has_revealed(memory, low, high):
+    env = Cue(16, length=2)
+    learner = make(env, memory)
+    for _ in range(10):
+        learn(learner, played(env, learner, 4))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        rolled = played(Cue(200, length=2, seed=5), learner, 2)
+    assert low <= rolled["next", keys.REWARD].sum(1).mean() <= high
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_the_model_learns_from_the_context_in_which_the_policy_acted(memory):
+    env = Sessions(3, trips=2, length=3)
+    learner = make(env, memory, warmup_steps=1000, sequence_length=2, burn_in=4)
+    rolled = played(env, learner, 12)
+    learn(learner, rolled)
+    acted = learner.perception(rolled[keys.OBSERVATION], rolled[learner.memory_key], has_seen=True).flatten(0, 1)
+    expected = learner.model.split(acted)[0]
+    assert expected.reshape(3, 12, -1)[:, 3].abs().sum() > 0.0, "a trip begins with what the trip before has shown"
+    rows = learner.prepared()
+    for sample in learner.sample_batches(3):
+        # The observations of a session differ, so they tell which step a row is.
+        place = (sample["turned"].unsqueeze(-2) == rows["turned"]).all(-1).long().argmax(-1)
+        torch.testing.assert_close(learner._context(sample), expected[place])
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_imagined_steps_go_into_the_memory(memory, monkeypatch):
+    learner = make(Sessions(), memory, horizon=3, stack_steps=3)
+    seen = []
+
+    def predict(features, discrete, own, precision):
+        seen.append(features)
+        nothing = features[..., 0] * 0.0
+        return Prediction(features[..., -3:] + 1.0, nothing, nothing, nothing - 50.0)
+
+    monkeypatch.setattr(learner.model, "forward", predict)
+    state = learner.perception.after(torch.randn(5, 3))
+    observation = torch.randn(5, 3)
+    features = learner.perception(observation, state)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        learner.policy.plan(features)
+    for place in range(3):
+        first = seen[-3 + place].reshape(3, 5, -1, features.shape[-1])[:, :, :1]
+        torch.testing.assert_close(first, features.expand(3, -1, -1).unsqueeze(2), check_stride=False)
+        state = learner.perception.after(observation, state)
+        observation = observation + 1.0
+        features = learner.perception(observation, state)
+
+
+def test_the_end_of_a_trip_ends_plans_but_not_the_memory():
+    env = Sessions(2, trips=2, length=2)
+    learner = make(env, "stack", warmup_steps=1000)
+    rolled = played(env, learner, 4)
+    learn(learner, rolled)
+    assert rolled["next", keys.TERMINATED].squeeze(-1).tolist() == [[False, False, False, True]] * 2
+    stored = learner.buffer[:].reshape(2, 4)
+    assert stored["terminated"].tolist() == [[False, True, False, True]] * 2
+    assert (stored["memory"][:, 2, :3] == rolled[keys.OBSERVATION][:, 1]).all()
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_values_at_the_ends_of_plans_know_what_is_remembered(memory):
+    env = Cue(16, length=2)
+    learner = make(env, memory, end_values=True, end_value_lr=1e-2, end_value_tau=0.2, updates_per_step=0.5)
+    for _ in range(6):
+        learn(learner, played(env, learner, 4))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        observation = torch.tensor([[0.0, 0.5]]).expand(2, -1)
+        held = learner.perception.after(torch.tensor([[1.0, 0.0], [-1.0, 0.0]]))
+        assert (learner.value(observation, memory=held) > 0.5).all(), "after either cue the right action is known"
+
+
+def test_with_a_memory_no_states_are_turned():
+    specs = PAMDPSpecs.from_env(BoatDockEnv(1, controller="congruent"))
+    without, remembering = (PETS(specs, memory=memory) for memory in ("none", "stack"))
+    assert without.model.frame.turns and not remembering.model.frame.turns
+    assert remembering.model.frame.num_vectors > 0 and remembering.symmetry is None
+    with pytest.raises(ValueError, match="augment=true: does not go with memory=stack; use augment=false or"):
+        PETS(specs, memory="stack", augment=True)
