@@ -255,6 +255,18 @@ def test_motor_noise_changes_the_executed_duration():
     assert (duration / 0.5).log().std() == pytest.approx(0.2, abs=0.01)
 
 
+def test_the_ceiling_is_the_best_plans_mean_score_and_two_boats_raise_it():
+    ceilings = []
+    for boats in (1, 2):
+        env = UnseenBoatsEnv(100, boats=boats, trips=3)
+        env.seed_evaluation(0)
+        env.reset()
+        optimum = env.describe()["optimum"]
+        assert optimum.shape == (100, 3) and optimum.min() > 2.0 and optimum.max() < 5.0
+        ceilings.append(optimum.mean().item())
+    assert ceilings[0] == pytest.approx(3.43, abs=0.08) and 0.1 < ceilings[1] - ceilings[0] < 0.25
+
+
 # Forms.
 
 
@@ -336,6 +348,8 @@ def test_an_evaluation_repeats_and_a_saved_state_continues_exactly():
         ({"trips": 25}, "trips"),
         ({"family": "turnt"}, "family"),
         ({"shortest_press": 1.5}, "shortest_press"),
+        ({"shortest_press": 0.95}, "shortest_press=0.95: it leads to 85 px/s, but boats dock at no more than 74"),
+        ({"shortest_press": 0.8, "family": "strength"}, "shortest_press=0.8: it leads to"),
         ({"separation": 120.0}, "separation"),
     ],
 )

@@ -144,9 +144,9 @@ def check_built(config: Config, env: PAMDPEnv) -> None:
             f"{config.env}: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; "
             "use agent.termination=steps agent.option_length=1 to change them"
         )
-    forgetful = compatibility.memory_ends_with_trips(config, facts)
-    if forgetful is not None:
-        warn(forgetful)
+    forgotten = compatibility.forgotten_trips(config, facts)
+    if forgotten is not None:
+        warn(forgotten)
 
 
 def _facts_of_built(env: PAMDPEnv) -> ProblemFacts:

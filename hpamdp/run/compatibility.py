@@ -201,15 +201,19 @@ def sessions_are_played_here(config: Config) -> str | None:
     return None
 
 
-def memory_ends_with_trips(config: Config, problem: ProblemFacts) -> str | None:
-    """Return a warning if a learner's memory begins anew with each trip; None if it does not, or there is none.
+def forgotten_trips(config: Config, problem: ProblemFacts) -> str | None:
+    """Return a warning if the learners of a session remember nothing of earlier trips; None if one does.
 
-    It may be meant so: within a trip the memory is of use. But it does not see what earlier trips have shown.
+    It may be meant so. But then no learner uses on later trips what earlier ones have shown.
     """
-    if not (has_trips(config) and _has_choice(config, problem)) or config.run.agent.sharing == "shared":
+    if not has_trips(config):
         return None
     remembering = [low for low in config.learners if _memory(low) is not None]
-    if not remembering:
+    if not remembering and any(low.settings.get("memory") == "none" for low in config.learners):
+        return (
+            f"low.memory=none: {config.env} has sessions, of which it forgets earlier trips; low.memory=gru keeps them"
+        )
+    if not remembering or not _has_choice(config, problem) or config.run.agent.sharing == "shared":
         return None
     return (
         f"low.memory={_memory(remembering[0])}: with agent.sharing=per_option a memory begins with its option, so it "

@@ -21,7 +21,7 @@ from hpamdp.env import counter_rng, kernels
 from hpamdp.env.base import Metric
 from hpamdp.env.batched_env import Action, BatchedEnv, StateArrays
 from hpamdp.env.boatdock import harbour, task
-from hpamdp.env.boatdock_unseen import fleet, kernel, rules
+from hpamdp.env.boatdock_unseen import fleet, kernel, planner, rules
 from hpamdp.env.boatdock_unseen.fleet import FAMILIES
 from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
 from hpamdp.env.boatdock_unseen.rules import SessionRules, SessionState
@@ -77,6 +77,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         Metric("score_later", "score of the later trips"),
         Metric("success", "trips that dock", "share"),
         Metric("presses", "presses a trip", "count"),
+        Metric("optimality_gap", "gap to the ceiling"),
     )
     curve_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "Score of a trip"),
@@ -227,6 +228,23 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         """Return whether a trip ended with the last press, bool `[N]`."""
         return rows.integers[kernel.TRIP_ENDED] != 0
 
+    def describe(self) -> dict[str, Tensor]:
+        """Return `optimum` `[N, trips]` of the sessions that have just begun: the best score of a plan in each trip.
+
+        It knows the boats, and with two takes the better one.
+        """
+        state, optimum = self.state, []
+        for trip in range(self.options.trips):
+            layout = harbour.sample_layout(self._session_rng(state.episode, trip))
+            fuel = torch.full_like(layout.start_x, task.TANK)
+            shortest = self.options.shortest_press
+            plans = (
+                planner.best_plan(*layout, fuel, *boats, shortest_press=shortest, is_rough=True)
+                for boats in self.known_boats(state)
+            )
+            optimum.append(torch.stack([plan.score for plan in plans]).amax(0))
+        return {"optimum": torch.stack(optimum, -1)}
+
     def final_infos(self, rows: StateArrays) -> dict[str, np.ndarray]:
         """Return `score` and `success`, the share of trips that docked, of sessions `[N]`."""
         trips = np.float32(self.options.trips)
@@ -237,9 +255,12 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         return {"trip_score": self._trip_scores.clone(), "trip_presses": self._trip_presses.clone()}
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return the mean score by number of the trip, and the mean number of presses of a trip."""
+        """Return the mean score by number of the trip, the mean number of presses of a trip, and the best plans' score.
+
+        The `ceiling` is that of plans that know the boats. Nobody reaches it in a first trip.
+        """
         score = played["trip_score"].mean(0)
         means = {f"score_trip_{number}": float(each) for number, each in enumerate(score[:_FIRST_TRIPS], start=1)}
         if len(score) > _FIRST_TRIPS:
             means["score_later"] = float(score[_FIRST_TRIPS:].mean())
-        return means | {"presses": float(played["trip_presses"].mean())}
+        return means | {"presses": float(played["trip_presses"].mean()), "ceiling": float(played["optimum"].mean())}

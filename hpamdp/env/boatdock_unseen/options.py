@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from hpamdp.env.boatdock.task import RewardForm
+from hpamdp.env.boatdock.task import DOCKING_SPEED, RewardForm, speed
 from hpamdp.env.boatdock_unseen.fleet import Family, FleetRules
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.settings import Settings
@@ -67,6 +67,13 @@ class UnseenBoatsOptions(Settings):
             )
         if self.fleet_size is not None and self.fleet_size < self.boats:
             raise ValueError(f"fleet_size={self.fleet_size}: a session has boats={self.boats}, so it needs as many")
+        strongest = 1.0 + (self.spread if self.family == "strength" else 0.0)
+        fastest = strongest * speed(self.shortest_press)
+        if fastest > DOCKING_SPEED:
+            raise ValueError(
+                f"shortest_press={self.shortest_press:g}: it leads to {fastest:.0f} px/s, but boats dock at no more "
+                f"than {DOCKING_SPEED:g} px/s"
+            )
         return self
 
     @property
