@@ -489,7 +489,7 @@ def test_a_memory_that_forgets_earlier_trips_is_told_of_in_one_line(sharing, cap
 
 @pytest.mark.parametrize(("low", "is_told"), [("hppo", True), ("random", False)])
 def test_a_learner_that_could_remember_trips_and_does_not_is_told_of_in_one_line(low, is_told, capsys):
-    hpamdp.train(HiddenOption, low=low, **SMALL)
+    hpamdp.train(HiddenOption, low=low, **QUIET, progress=False)
     warned = [line for line in capsys.readouterr().err.splitlines() if "forgets earlier trips" in line]
     assert len(warned) == is_told and all("low.memory=gru" in line for line in warned)
 
