@@ -34,6 +34,10 @@ AGENTS = {
     "hppo_moving": ["high=none", "low=hppo", "env=moving"],
     "hppo_sliding": ["high=none", "low=hppo", "env=sliding"],
     "hppo_lunar_lander": ["high=none", "low=hppo", "env=lunar_lander", "eval.layouts=200", "seed=101"],
+    "hppo_boatdock_unseen": [
+        *("high=none", "low=hppo", SMALL, "env=boatdock_unseen", "env.frame=first_press"),
+        *("total_frames=6000000", "eval.every=1000000", "seed=911"),
+    ],
     # The options of this agent change inside an episode.
     "meta_critic_hppo_rooms": [
         *("high=meta_critic", "high.hidden_dims=[64,64]", "low=hppo", "env=rooms", "low.gamma=0.97"),
