@@ -1,0 +1,207 @@
+"""Tabulate and draw how agents dock boats that they have never met, by number of the trip, beside people.
+
+python experiments/generalisation/study.py FOLDER...    adds the runs of experiment=generalisation in these folders to
+                                                        results.csv, then draws and tabulates
+python experiments/generalisation/study.py              draws and tabulates the stored csv files
+
+`players.py` and `transfer.py` write the other csv files. people.csv has the recording's mean score by number of the
+episode.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    finished,
+    groups,
+    mean_interval,
+    read_csv,
+    spread,
+    with_enough_seeds,
+    write_tables,
+)
+from hpamdp.env.boatdock.reference import HUMAN
+
+HERE = Path(__file__).resolve().parent
+SETTINGS = (
+    "family",
+    "boats",
+    "frame",
+    "fleet_size",
+    "scored_boats",
+    "values_end",
+    "high",
+    "high_memory",
+    "low",
+    "memory",
+)
+FIRST_LATER, NUM_TRIPS = 3, 8
+PEOPLE_EPISODES = 60
+PLAYERS = {"knows": "best plans, which know the boat", "finds_out": "player who finds out"}
+COLOURS = {"turned": "#0072B2", "strength": "#009E73", "any": "#CC79A7"}
+
+
+def gather(runs: Sequence[Run]) -> Rows:
+    """Return a row for each run: its settings and the mean score of each trip."""
+    rows: Rows = []
+    for run in runs:
+        env, low, high = run.config["env"], run.config["low"], run.config["high"] or {}
+        played = run.played()
+        scores, presses = played["trip_score"].mean(0), played["trip_presses"].mean(0)
+        settings = {
+            "family": env["family"],
+            "boats": env["boats"],
+            "frame": env["frame"],
+            "fleet_size": env["fleet_size"] or "new",
+            "scored_boats": env["scored_boats"],
+            "values_end": run.config["agent"]["values_end"],
+            "high": run.summary["high"],
+            "high_memory": high.get("memory", ""),
+            "low": run.summary["low"],
+            "memory": low.get("memory", ""),
+        }
+        rows.append(
+            settings
+            | {"frames": run.summary["frames"], "seed": run.summary["seed"], "cpu_s": round(run.summary["cpu_s"], 1)}
+            | {"ceiling": round(run.summary["ceiling"], 4), "success": round(run.summary["success"], 4)}
+            | {f"score_{trip}": round(float(score), 4) for trip, score in enumerate(scores, start=1)}
+            | {f"presses_{trip}": round(float(number), 3) for trip, number in enumerate(presses, start=1)}
+        )
+    return rows
+
+
+def merged(stored: Rows, new: Rows) -> Rows:
+    """Return the stored rows with those of repeated runs replaced, in order of the settings."""
+
+    def key(row: dict) -> tuple[str, ...]:
+        return tuple(str(row[name]) for name in (*SETTINGS, "frames", "seed"))
+
+    made_anew = {key(row) for row in new}
+    return sorted([row for row in stored if key(row) not in made_anew] + new, key=key)
+
+
+def later(row: dict) -> float:
+    """Return the mean score of a run's trips from the third on."""
+    return sum(row[f"score_{trip}"] for trip in range(FIRST_LATER, NUM_TRIPS + 1)) / (NUM_TRIPS + 1 - FIRST_LATER)
+
+
+def table(results: Rows) -> str:
+    """Return a line for each cell: the score of the first, the second and the later trips, mean and interval."""
+    lines = [
+        "| family | boats | frame | training boats | scored on | values end | selector | learner, memory | n "
+        "| first trip | second trip | trips 3 to 8 | 95 % | ceiling | presses, first trip | later | CPU |",
+        "|---" * 17 + "|",
+    ]
+    for settings, rows in groups(results, *SETTINGS).items():
+        family, boats, frame, fleet, scored, ends, high, high_memory, low, memory = settings
+        first, second, rest = ([value(row) for row in rows] for value in (_first, _second, later))
+        low_end, high_end = mean_interval(rest)
+        columns = [
+            family,
+            boats,
+            frame.replace("_", " "),
+            fleet,
+            scored,
+            ends,
+            f"{high} {high_memory}".strip(),
+            f"{low}, {memory}",
+            len(rows),
+            spread(first),
+            spread(second),
+            spread(rest),
+            f"{low_end:.3f} to {high_end:.3f}",
+            f"{_mean(rows, 'ceiling'):.3f}",
+            f"{_mean(rows, 'presses_1'):.1f}",
+            f"{sum(_mean(rows, f'presses_{trip}') for trip in range(3, 9)) / 6:.1f}",
+            f"{_mean(rows, 'cpu_s'):.0f} s",
+        ]
+        lines.append(f"| {' | '.join(map(str, columns))} |")
+    return "\n".join(lines)
+
+
+def _first(row: dict) -> float:
+    return row["score_1"]
+
+
+def _second(row: dict) -> float:
+    return row["score_2"]
+
+
+def _mean(rows: Rows, column: str) -> float:
+    return sum(row[column] for row in rows) / len(rows)
+
+
+def players_table(players: Rows) -> str:
+    """Return a line for each family, number of boats and player: the score by number of the trip."""
+    heads = ("family", "boats", "player", *(f"trip {trip}" for trip in range(1, NUM_TRIPS + 1)), "trips 3 to 8")
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for (family, boats, player), rows in groups(players, "family", "boats", "player").items():
+        scores = [row["score"] for row in rows]
+        rest = scores[FIRST_LATER - 1 :]
+        shown = " | ".join(f"{score:.2f}" for score in scores)
+        lines.append(f"| {family} | {boats} | {PLAYERS[player]} | {shown} | {sum(rest) / len(rest):.3f} |")
+    return "\n".join(lines)
+
+
+def transfer_table(rows: Rows) -> str:
+    """Return a line for each learner and controller of the training: the scores with both controllers."""
+    lines = ["| learner | trained with | n | same controller | other controller |", "|---|---|---|---|---|"]
+    for (learner, trained_on), of_both in groups(rows, "learner", "trained_on").items():
+        same = [row["score"] for row in of_both if row["controller"] == trained_on]
+        other = [row["score"] for row in of_both if row["controller"] != trained_on]
+        lines.append(f"| {learner} | {trained_on} | {len(same)} | {spread(same)} | {spread(other)} |")
+    return "\n".join(lines)
+
+
+def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
+    """Draw the score by number of the trip with one boat, and people's over their first episodes beside it."""
+    figure = Figure(figsize=(11.0, 4.2), layout="constrained")
+    sessions, episodes = figure.subplots(1, 2, sharey=True, width_ratios=[3, 2])
+    trips = range(1, NUM_TRIPS + 1)
+    for family, colour in COLOURS.items():
+        rows = [row for row in results if (row["family"], row["boats"], row["frame"]) == (family, 1, "first_press")]
+        for number, row in enumerate(row for row in rows if row["memory"] == "gru" and row["fleet_size"] == "new"):
+            scores = [row[f"score_{trip}"] for trip in trips]
+            sessions.plot(trips, scores, color=colour, linewidth=1.3, label=None if number else f"H-PPO, {family}")
+        for player, line in (("finds_out", "--"), ("knows", ":")):
+            found = [row for row in players if (row["family"], row["boats"], row["player"]) == (family, 1, player)]
+            if found:
+                label = f"{PLAYERS[player]}, {family}"
+                sessions.plot(trips, [row["score"] for row in found], color=colour, linestyle=line, label=label)
+    sessions.set(xlabel="trip with a boat that was never met", ylim=(-0.2, 3.8))
+    sessions.set_ylabel("mean score of a trip")
+    episodes.plot([row["episode"] for row in people], [row["score"] for row in people], ".", color="#D98200")
+    for axes in (sessions, episodes):
+        axes.axhline(HUMAN["chosen"]["score"], color="#8c8c8c", linestyle=":", linewidth=1.0)
+        axes.spines[["top", "right"]].set_visible(False)
+    sessions.annotate(
+        f"people's mean {HUMAN['chosen']['score']:.2f}", (NUM_TRIPS, HUMAN["chosen"]["score"]), ha="right"
+    )
+    episodes.set(xlabel="a person's episode, two boats", xlim=(0, PEOPLE_EPISODES))
+    episodes.set_title("people", loc="left", fontweight="bold", fontsize=10)
+    sessions.set_title("agents", loc="left", fontweight="bold", fontsize=10)
+    sessions.legend(loc="lower right", fontsize=7, frameon=False)
+    figure.savefig(path, dpi=130)
+
+
+def main(folders: Sequence[str]) -> None:
+    """Gather, draw, tabulate."""
+    if folders:
+        stored = read_csv(HERE / "results.csv") if (HERE / "results.csv").exists() else []
+        write_tables(HERE, {"results": merged(stored, gather(finished(folders)))})
+    stored = {name: HERE / f"{name}.csv" for name in ("results", "players", "transfer", "people")}
+    results, players, transfer, people = (read_csv(file) if file.exists() else [] for file in stored.values())
+    results = with_enough_seeds(results, *SETTINGS)
+    draw(results, players, people, HERE / "trips.png")
+    print(table(results), players_table(players), transfer_table(transfer), sep="\n\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
