@@ -99,12 +99,12 @@ class Explorer:
         shape = (num_rows, num_boats)
         self._known = _Known(
             seen=torch.zeros(*shape, NUM_KEYS, dtype=torch.bool),
-            directions=torch.zeros(*shape, NUM_KEYS, 2),
-            strength=torch.ones(shape),
-            glide=torch.ones(shape),
+            directions=torch.zeros(*shape, NUM_KEYS, 2, dtype=torch.float32),
+            strength=torch.ones(shape, dtype=torch.float32),
+            glide=torch.ones(shape, dtype=torch.float32),
             is_measured=torch.full(shape, fleet.family != "strength"),
         )
-        self._trip = torch.zeros(num_rows)
+        self._trip = torch.zeros(num_rows, dtype=torch.float32)
 
     def reset(self, rows: Tensor) -> None:
         """Forget the boats of the sessions `rows`, bool `[N]`, because new sessions begin."""
@@ -258,7 +258,7 @@ class Explorer:
         plan = best_plan(*repeated, *some, shortest_press=self._shortest, is_rough=True)
         planned = plan.durations.view(num_rows, -1).clamp(self._shortest, MAX_DURATION)
         shortest = max(self._shortest, 0.02)
-        grid = torch.logspace(math.log10(shortest), math.log10(_LONGEST_TRIED), _NUM_DURATIONS)
+        grid = torch.logspace(math.log10(shortest), math.log10(_LONGEST_TRIED), _NUM_DURATIONS, dtype=torch.float32)
         grid[0] = self._shortest
         return torch.cat([grid.expand(num_rows, -1), planned], 1)
 
@@ -285,7 +285,9 @@ class Explorer:
         directions = torch.where(known.seen[:, None, :, None], known.directions[:, None], directions)
         factors = []
         for factor in (known.strength, known.glide):
-            sampled = 1.0 + self._fleet.spread * (2.0 * torch.rand(num, generator=self._generator) - 1.0)
+            sampled = 1.0 + self._fleet.spread * (
+                2.0 * torch.rand(num, generator=self._generator, dtype=torch.float32) - 1.0
+            )
             factors.append(torch.where(known.is_measured[:, None], factor[:, None], sampled))
         return Boats(directions, *factors)
 
@@ -295,9 +297,15 @@ class Explorer:
         if self._fleet.family == "any":
             separation = self._fleet.separation
             free = 2.0 * math.pi - NUM_KEYS * separation
-            between = torch.rand(num, NUM_KEYS - 1, generator=self._generator).sort(1).values
-            offsets = torch.cat([torch.zeros(num, 1), between * free + separation * torch.tensor([1.0, 2.0])], 1)
-            order = torch.rand(num, NUM_KEYS, generator=self._generator).argsort(1)
+            between = torch.rand(num, NUM_KEYS - 1, generator=self._generator, dtype=torch.float32).sort(1).values
+            offsets = torch.cat(
+                [
+                    torch.zeros(num, 1, dtype=torch.float32),
+                    between * free + separation * torch.tensor([1.0, 2.0], dtype=torch.float32),
+                ],
+                1,
+            )
+            order = torch.rand(num, NUM_KEYS, generator=self._generator, dtype=torch.float32).argsort(1)
             return turn + offsets.gather(1, order)
         clockwise = 1.0 - 2.0 * (torch.arange(num) % 2)[:, None]
         return turn + clockwise * torch.arange(NUM_KEYS) * (2.0 * math.pi / NUM_KEYS)
