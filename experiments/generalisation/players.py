@@ -1,7 +1,7 @@
 """Score the player that finds out what the keys do, and the best plans of one who knows, by number of the trip.
 
 python experiments/generalisation/players.py    writes players.csv: a row for each family, number of boats, player and
-                                                trip. It takes half an hour.
+                                                trip. It takes ten minutes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hpamdp.env.boatdock_unseen.explorer import Explorer
 from hpamdp.env.boatdock_unseen.fleet import FAMILIES
 
 HERE = Path(__file__).resolve().parent
-SESSIONS = 500
+SESSIONS = 200
 EVALUATION_SEED = 99
 
 

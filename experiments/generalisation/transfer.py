@@ -21,7 +21,7 @@ from hpamdp.analysis.study import Rows, write_tables
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 
 HERE = Path(__file__).resolve().parent
-SEEDS = range(5)
+SEEDS = range(3)
 EPISODES = 1000
 EVALUATION_SEED = 99
 LEARNERS: dict[str, dict[str, Any]] = {
