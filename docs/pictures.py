@@ -13,6 +13,7 @@ from hpamdp.run import watch
 ROOT = Path(__file__).resolve().parent.parent
 PLAYERS = {
     "boatdock": ["agents/linucb_hppo"],
+    "boatdock_unseen": ["agents/hppo_boatdock_unseen", "env.trips=5"],
     "platform": ["agents/hppo_platform"],
     "goal": ["agents/pdqn_goal"],
     "hard_goal": ["agents/pdqn_hard_goal"],
@@ -25,12 +26,17 @@ PLAYERS = {
 }
 
 
+EPISODES = {"boatdock_unseen": "1"}  # a session has several trips; three episodes elsewhere
+
+
 def main(names: list[str]) -> int:
     """Write the GIFs beside the pages."""
     for name in names or PLAYERS:
         who = [str(ROOT / word) if word.startswith("agents/") else word for word in PLAYERS[name]]
         to = ROOT / "docs" / "domains" / f"{name}.gif"
-        watch.main([*who, "--to", str(to), "--episodes", "3", "--size", "240"], argparse.ArgumentParser())
+        watch.main(
+            [*who, "--to", str(to), "--episodes", EPISODES.get(name, "3"), "--size", "240"], argparse.ArgumentParser()
+        )
     return 0
 
 

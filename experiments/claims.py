@@ -786,6 +786,25 @@ def learners_on_domains() -> list[Claim]:
     ]
 
 
+def generalisation() -> list[Claim]:
+    agent = summary("agents/hppo_boatdock_unseen")
+    numbers = dict(
+        millions=agent["frames"] / 1e6,
+        cpu_s=agent["cpu_s"],
+        **{name: agent[name] for name in ("score_trip_1", "score_trip_2", "score_later", "ceiling")},
+    )
+    return [
+        Claim(
+            page("generalisation"),
+            "One run of H-PPO with a GRU ({millions:.0f} million presses, {cpu_s:.0f} s of CPU time, "
+            "[`hppo_boatdock_unseen`](../../agents/README.md)) scored {score_trip_1:.2f} in the first trip with a new turned "
+            "boat, {score_trip_2:.2f} in the second and {score_later:.2f} from the third on. The best plans, which know the "
+            "boat, score {ceiling:.2f} there.",
+            numbers,
+        )
+    ]
+
+
 def agents() -> list[Claim]:
     # The scores that two agents were chosen from. Their runs are no longer in experiments/domains/results.csv.
     goal, hard_goal = (
@@ -1386,6 +1405,7 @@ STUDIES: list[Callable[[], list[Claim]]] = [
         learners_on_domains,
         agents,
         collectors,
+        generalisation,
         hybrid_control,
         lengths,
         offline,
