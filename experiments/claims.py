@@ -798,8 +798,8 @@ def generalisation() -> list[Claim]:
             page("generalisation"),
             "One run of H-PPO with a GRU ({millions:.0f} million presses, {cpu_s:.0f} s of CPU time, "
             "[`hppo_boatdock_unseen`](../../agents/README.md)) scored {score_trip_1:.2f} in the first trip with a new "
-            "turned boat, {score_trip_2:.2f} in the second and {score_later:.2f} from the third on. The best plans, which "
-            "know the boat, score {ceiling:.2f} there.",
+            "turned boat, {score_trip_2:.2f} in the second and {score_later:.2f} from the third on. The best plans, "
+            "which know the boat, score {ceiling:.2f} there.",
             numbers,
         )
     ]
