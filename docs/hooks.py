@@ -48,6 +48,7 @@ FILLED = re.compile(r"^(<!-- (rows of|csv|runs) (.+?) -->\n)(?:[^<\n].*\n)*<!-- 
 TABLE_MARK = re.compile(r"^<!-- /?table.*-->\n", re.MULTILINE)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".csv": "text", ".toml": "toml", ".cff": "yaml"}
 PICTURES = {".png", ".gif", ".svg"}
+FIRST_SEED = 100  # seeds from here on ran once, as in experiments/domains
 FEWEST_SEEDS = 3  # seeds that a setting needs to be shown, as in hpamdp.analysis.study
 # The columns of runs that are shown, and their heads.
 MEASURED = {"frames": "steps", "score": "score", "success": "success", "cpu_s": "CPU, s"}
@@ -447,6 +448,7 @@ def runs_table(words: str) -> str:
     head = [*(MEASURED.get(name, name) for name in setting_columns), "seeds", *(MEASURED[name] for name in measured)]
     table = [head, ["---"] * len(head)]
     for setting, same in settings.items():
+        same = scored_once(same)
         if len({row["seed"] for row in same}) < FEWEST_SEEDS:
             continue
         numbers = [f"{int(value):,}" if value.isdecimal() else cell(value) for value in setting]
@@ -454,6 +456,13 @@ def runs_table(words: str) -> str:
     if len(table) == 2:
         return f"No {FEWEST_SEEDS} seeds of it have been run yet."
     return "\n".join(f"| {' | '.join(row)} |" for row in table)
+
+
+def scored_once(rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    """Return the runs with seeds that ran once, with frozen settings, or the earlier ones while there are more."""
+    once = [row for row in rows if int(row["seed"]) >= FIRST_SEED]
+    earlier = [row for row in rows if int(row["seed"]) < FIRST_SEED]
+    return once if len(once) >= len(earlier) else earlier
 
 
 def mean_of(rows: list[dict[str, str]], name: str) -> str:

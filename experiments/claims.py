@@ -28,7 +28,7 @@ import numpy as np
 from scipy import stats
 from sentences import Claim, compare, uncovered
 
-from hpamdp.analysis.study import Rows, difference, first_at, groups, read_csv, spread
+from hpamdp.analysis.study import Rows, difference, first_at, groups, read_csv, spread, with_enough_seeds
 from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
 from hpamdp.metrics_file import read_rows
 
@@ -633,7 +633,9 @@ def domains() -> list[Claim]:
     best_runs, num_learners, is_above = [], [], []
     for domain, bar in published.items():
         measure = study("domains").DOMAINS[domain][1]
-        of_domain = [runs for (name, _), runs in results.items() if name == domain]
+        of_domain = [
+            runs for (name, _), runs in results.items() if name == domain and with_enough_seeds(runs, "frames")
+        ]
         best_runs.append(max(of_domain, key=lambda runs: mean(runs, measure)))
         num_learners.append(len(of_domain))
         is_above.append(mean(best_runs[-1], measure) > bar)
