@@ -54,6 +54,23 @@ class Contexts:
         return {name: None if entry is None else place.get(entry) for name, entry in entries.items()}
 
 
+@dataclass(frozen=True)
+class RevealedDirections:
+    """Where an observation shows in which direction the last discrete action points.
+
+    The problem does not tell the directions. They stay the same for an episode, and may differ in the next.
+
+    Attributes:
+        last_action: entries of the one-hot last discrete action, all of them zero before the first one.
+        moved: entries x and y of the displacement by the last action, which points where the action does.
+        sums_to_zero: whether the directions of all actions sum to zero, so that all but one of them tell the last one.
+    """
+
+    last_action: tuple[int, ...]
+    moved: tuple[int, int]
+    sums_to_zero: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class PlaneGeometry(Contexts):
     """The vectors of the plane in an observation, and the directions of the discrete actions.
@@ -65,16 +82,19 @@ class PlaneGeometry(Contexts):
         vectors: pairs of entries of the observation, x and y.
         origins: origin of each vector; () if all are zero.
         directions: `[num_contexts, num_discrete, 2]`: unit vectors, zero for an action without a direction; None if no
-            action has one.
+            action has one, or if they are not known.
+        revealed: what shows the directions, if they are not known; None if nothing does.
         kinds: the kind of each discrete action, `num_discrete` numbers from 0 on; () if all kinds differ.
         has_mirror: whether mirroring the plane at an action's direction mirrors the change and keeps the reward.
         redundant: entries of the observation that a model does not need: nothing later depends on them, or other
-            entries hold the same information. Both entries of a vector are redundant, or neither is.
+            entries or the revealed directions hold the same information. Both entries of a vector are redundant, or
+            neither is.
     """
 
     vectors: tuple[tuple[int, int], ...] = ()
     origins: tuple[tuple[float, float], ...] = ()
     directions: Tensor | None = None
+    revealed: RevealedDirections | None = None
     kinds: tuple[int, ...] = ()
     has_mirror: bool = False
     redundant: tuple[int, ...] = ()
@@ -98,12 +118,23 @@ class PlaneGeometry(Contexts):
             self,
             vectors=tuple((place[self.vectors[number][0]], place[self.vectors[number][1]]) for number in kept),
             origins=tuple(self.origins[number] for number in kept) if self.origins else (),
+            revealed=self._revealed_in(place),
             redundant=(),
             **self._entries_in(place),
         )
 
+    def _revealed_in(self, place: Mapping[int, int]) -> RevealedDirections | None:
+        """Return what shows the directions, given the new place of each entry; None if an entry has none."""
+        old = self.revealed
+        if old is None or any(entry not in place for entry in (*old.last_action, *old.moved)):
+            return None
+        moved = place[old.moved[0]], place[old.moved[1]]
+        return replace(old, last_action=tuple(place[entry] for entry in old.last_action), moved=moved)
+
     def fits(self, observation_dim: int, parameter_dims: Sequence[int]) -> str:
         """Return in words what does not fit a problem of this size, empty if all does."""
+        revealed = self.revealed
+        showing = () if revealed is None else (*revealed.last_action, *revealed.moved)
         entries = [entry for pair in self.vectors for entry in pair]
         expected = [self.num_contexts, len(parameter_dims), 2]
         shape = expected if self.directions is None else list(self.directions.shape)
@@ -126,6 +157,15 @@ class PlaneGeometry(Contexts):
                 len(dims_of_kinds) > len(set(self.kinds))
             ),
             f"directions have shape {shape}, but must be {expected}": shape != expected,
+            "directions are both known and revealed, but must be one of them": (
+                revealed is not None and self.directions is not None
+            ),
+            f"revealed by the entries {showing}, but must be different entries of {observation_dim}": (
+                any(not 0 <= entry < observation_dim for entry in showing) or len(set(showing)) < len(showing)
+            ),
+            f"revealed by {len(showing) - 2} entries of the last action, but must be {len(parameter_dims)}": (
+                revealed is not None and len(revealed.last_action) != len(parameter_dims)
+            ),
         }
         return next((text for text, is_wrong in misfits.items() if is_wrong), "")
 

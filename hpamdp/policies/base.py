@@ -474,6 +474,8 @@ class Learner(Level, nn.Module):
             `specs.to_unit`.
         value_setting: setting that must be true for `value` to work. If None, `value` always works.
         memory_key: key of the memory's state in a step, if the policy and `value` have a memory; else None.
+        remembers_directions: whether the learner remembers the directions of actions that a problem reveals, unless it
+            has another memory or `augment=false`.
         exploring_keys: those of the policy's states that only exploration reads. They do not keep it from an export.
         progress: the buffers, by the last part of their names, that count the steps of a run, or follow from such
             counters. They are reset if a new run takes over the learner.
@@ -485,6 +487,7 @@ class Learner(Level, nn.Module):
     takes: ClassVar[frozenset[ActionFeature]] = frozenset()
     value_setting: ClassVar[str | None] = None
     memory_key: str | None = None
+    remembers_directions: ClassVar[bool] = False
     exploring_keys: ClassVar[frozenset[str]] = frozenset()
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
 

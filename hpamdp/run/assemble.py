@@ -144,7 +144,8 @@ def check_built(config: Config, env: PAMDPEnv) -> None:
             f"{config.env}: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; "
             "use agent.termination=steps agent.option_length=1 to change them"
         )
-    forgotten = compatibility.forgotten_trips(config, facts)
+    reveals_directions = env.geometry is not None and env.geometry.revealed is not None
+    forgotten = compatibility.forgotten_trips(config, facts, reveals_directions=reveals_directions)
     if forgotten is not None:
         warn(forgotten)
 

@@ -101,6 +101,12 @@ def _memory(component: Component) -> str | None:
     return str(memory) if memory in ("stack", "gru") else None  # a bandit's memory is another thing
 
 
+def _remembers_directions(low: Component) -> bool:
+    """Return whether a learner remembers revealed directions."""
+    can = getattr(low.cls, "remembers_directions", False)
+    return can and low.settings.get("memory") == "none" and low.settings.get("augment") is not False
+
+
 def has_trips(config: Config) -> bool:
     """Return whether an episode of the problem is a session of several trips."""
     return bool(getattr(config.env.cls, "has_trips", False))
@@ -201,12 +207,18 @@ def sessions_are_played_here(config: Config) -> str | None:
     return None
 
 
-def forgotten_trips(config: Config, problem: ProblemFacts) -> str | None:
+def forgotten_trips(config: Config, problem: ProblemFacts, *, reveals_directions: bool) -> str | None:
     """Return a warning if the learners of a session remember nothing of earlier trips; None if one does.
 
     It may be meant so. But then no learner uses on later trips what earlier ones have shown.
+
+    Args:
+        config: of the run.
+        problem: what the run must know of the problem.
+        reveals_directions: whether the problem reveals where its actions point, which some learners remember by
+            themselves.
     """
-    if not has_trips(config):
+    if not has_trips(config) or (reveals_directions and any(map(_remembers_directions, config.learners))):
         return None
     remembering = [low for low in config.learners if _memory(low) is not None]
     if not remembering and any(low.settings.get("memory") == "none" for low in config.learners):

@@ -28,6 +28,7 @@ from hpamdp.env.boatdock_unseen.rules import SessionRules, SessionState
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.rng_streams import EVALUATION, TRAINING
+from hpamdp.geometry import PlaneGeometry, RevealedDirections
 
 if TYPE_CHECKING:
     from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
@@ -178,6 +179,33 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         fleet_key = torch.full_like(episode, rules.FLEET)
         drawn = (counter_rng.rng_key(self._fleet_seed, TRAINING, each, fleet_key).bits & -2 for each in (number, other))
         return next(drawn), next(drawn)
+
+    @property
+    def geometry(self) -> PlaneGeometry | None:
+        """The places and displacements, and what reveals where the keys push; None with two boats.
+
+        A mirrored boat is as likely as the boat itself, so the mirror holds for all families. Every press begins at
+        rest, so the velocity does not matter. The start affects only the distance.
+        """
+        if self._chooses:
+            return None  # what the last press shows holds for one of the boats
+        names = ["start_x", "start_y", "velocity_x", "velocity_y", "trip", "boat", "last_boat", "last_key_1"]
+        names += ["last_key_2", "last_key_3", "last_duration", "moved_x", "moved_y", "last_score"]
+        if self.rules.sensor_noise == 0.0:
+            names += ["goal_x", "goal_y"]  # the boat's place and the goal's offset tell it
+        entry = {name: number for number, name in enumerate(rules.OBSERVATION_NAMES)}
+        vectors = ("start", "goal", "boat", "to_goal", "velocity", "moved")
+        return PlaneGeometry(
+            vectors=tuple((entry[f"{name}_x"], entry[f"{name}_y"]) for name in vectors),
+            revealed=RevealedDirections(
+                last_action=tuple(entry[f"last_key_{number}"] for number in range(1, task.NUM_KEYS + 1)),
+                moved=(entry["moved_x"], entry["moved_y"]),
+                sums_to_zero=self.options.family != "any",
+            ),
+            kinds=(0,) * task.NUM_KEYS,
+            has_mirror=True,
+            redundant=tuple(entry[name] for name in names),
+        )
 
     @property
     def position(self) -> Tensor:

@@ -25,6 +25,7 @@ class CanonicalFrame(nn.Module):
     Args:
         specs: of the problem.
         is_used: false: turn nothing, whatever the problem declares.
+        is_revealed: whether directions come from a table of `KnownDirections`, and not from the problem.
     """
 
     directions: Tensor
@@ -37,18 +38,20 @@ class CanonicalFrame(nn.Module):
     partner: Tensor
     partner_sign: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, *, is_used: bool = True) -> None:
+    def __init__(self, specs: PAMDPSpecs, *, is_used: bool = True, is_revealed: bool = False) -> None:
         super().__init__()
         geometry = specs.geometry if is_used else None
         self.geometry = geometry
-        self.turns = geometry is not None and geometry.directions is not None
+        self.is_revealed = is_revealed
+        self.turns = geometry is not None and (is_revealed or geometry.directions is not None)
         pairs = geometry.vectors if geometry is not None else ()
         origins = geometry.origins if geometry is not None and geometry.origins else [(0.0, 0.0)] * len(pairs)
         directions = torch.zeros(1, specs.num_discrete, 2, dtype=torch.float32)
         kind = torch.arange(specs.num_discrete)
         if geometry is not None and geometry.directions is not None:
             directions = geometry.directions
-            kind = torch.tensor(geometry.kinds) if geometry.kinds else kind
+        if geometry is not None and self.turns and geometry.kinds:
+            kind = torch.tensor(geometry.kinds)
         nowhere = directions.norm(dim=-1, keepdim=True) < 1e-6
         directions = torch.where(nowhere, torch.tensor([1.0, 0.0], dtype=torch.float32), directions)  # along +x already
         x = torch.tensor([pair[0] for pair in pairs], dtype=torch.long)
@@ -89,6 +92,17 @@ class CanonicalFrame(nn.Module):
         if self.geometry is None or len(self.directions) == 1:
             return self.directions[0].mT.index_select(1, discrete.flatten()).mT.unflatten(0, discrete.shape)
         return self.directions[self.geometry.context(state), discrete]
+
+    def revealed_direction(self, table: Tensor, discrete: Tensor) -> tuple[Tensor, Tensor]:
+        """Return where actions `[*B, N]` point, `[*B, N, 2]`, and how certain that is, `[*B, N, 1]` in [-1, 1].
+
+        Args:
+            table: x, y and certainty of all actions, `[*B, N, 3 num_discrete]`, see `KnownDirections`.
+            discrete: the actions.
+        """
+        place = discrete[..., None, None, :].expand(*discrete.shape[:-1], 3, 1, -1)
+        found = table.mT.unflatten(-2, (3, -1)).gather(-2, place).squeeze(-2).mT
+        return found[..., :2], found[..., 2:]
 
     def turn(self, state: Tensor, direction: Tensor) -> Tensor:
         """Return states `[*B, observation_dim]` with the plane turned until `direction` `[*B, 2]` is +x."""

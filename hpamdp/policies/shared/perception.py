@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.encoders.base import JoinedEncoders
+from hpamdp.policies.shared.known_directions import KnownDirections
 from hpamdp.policies.shared.memory import GRU, MemoryOptions, Stack, StackOptions
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -33,6 +34,8 @@ class Perception(nn.Module):
         specs: of the problem, as the learner sees it.
         options: settings of the memory. If None, there is no memory.
         prefix: of the key of the memory's state in a step.
+        knows_directions: whether it remembers the directions of actions that the problem reveals, for an episode.
+            Another memory must not be set.
 
     Attributes:
         specs: those of the problem, with the features as observation.
@@ -44,9 +47,16 @@ class Perception(nn.Module):
         out_keys: what `see` writes.
     """
 
-    def __init__(self, specs: PAMDPSpecs, options: StackOptions | None = None, prefix: str = "") -> None:
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        options: StackOptions | None = None,
+        prefix: str = "",
+        *,
+        knows_directions: bool = False,
+    ) -> None:
         super().__init__()
-        self.memory: Stack | GRU | None = None
+        self.memory: Stack | GRU | KnownDirections | None = None
         self.memory_key: str | None = None
         self.encoder = JoinedEncoders(specs) if specs.has_pictures else None
         self.specs = specs if self.encoder is None else self.encoder.feature_specs
@@ -65,6 +75,10 @@ class Perception(nn.Module):
                 self.memory = GRU(num, options.memory_size)
             else:
                 self.memory = Stack(num, options.stack_steps)
+        elif knows_directions:
+            self.memory = KnownDirections(specs)
+            self._begins_key = keys.EPISODE_STEPS
+        if self.memory is not None:
             self.memory_key = prefix + self.memory.name
             self.in_keys += [self._begins_key, self.memory_key]
             self.out_keys += [self.memory_key]
@@ -148,6 +162,8 @@ class Perception(nn.Module):
         """
         if self.memory is None:
             return observation
+        if isinstance(self.memory, KnownDirections):
+            return self.memory.imagined(features, observation)
         return self.memory.features(observation, self._after(observation, self.memory.state_in(features)))
 
     def _after(self, encoded: Tensor, memory: Tensor | None = None) -> Tensor:

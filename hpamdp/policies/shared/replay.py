@@ -126,9 +126,9 @@ class ReplayLearner(Learner):
         self.descent = Descent()
         self.links = None
 
-    def set_perception(self, options: ReplayMemoryOptions) -> None:
+    def set_perception(self, options: ReplayMemoryOptions, *, knows_directions: bool = False) -> None:
         """Make the perception and its target copy; call it before the networks, which are built from its specs."""
-        self.perception = Perception(self.specs, options)
+        self.perception = Perception(self.specs, options, knows_directions=knows_directions)
         self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
         self.memory_key = self.perception.memory_key
         if self.perception.is_recurrent:

@@ -15,8 +15,9 @@ Differs from the sources:
   network sees where the step would lead by that prediction, and predicts termination and reward: an end, such as at a
   wall or in a target, depends on where a step leads;
 - if the problem declares its geometry, states are turned until the discrete action points along +x before the networks
-  see them, and the lengths of all vectors are among the inputs. For other declared symmetries, the model also learns
-  from the mapped steps (`augment`);
+  see them, and the lengths of all vectors are among the inputs. If the problem only reveals where its actions point,
+  states are turned by what the episode's steps have shown, and a plan does not count what its own steps would show. For
+  other declared symmetries, the model also learns from the mapped steps (`augment`);
 - if states are not turned, the change is a linear model, fitted by least squares, plus what the networks add to it
   (`linear_part`), because a few hundred steps teach networks alone little of such a problem;
 - if states are not turned, exploring plans maximise the mean of all members' returns plus their standard deviation
@@ -53,6 +54,7 @@ from hpamdp.policies.base import ActionFeature
 from hpamdp.policies.low_level.pets.model import PETSModel
 from hpamdp.policies.low_level.pets.policy import PETSPolicy, PETSPolicyOptions
 from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.known_directions import KnownDirections
 from hpamdp.policies.shared.memory import ReplayMemoryOptions, Stack
 from hpamdp.policies.shared.networks import polyak_update
 from hpamdp.policies.shared.planning_policy import plan_ends
@@ -90,6 +92,7 @@ class PETS(ReplayLearner):
     modes: ClassVar[tuple[str, ...]] = ("train",)
     stores_own_parameters = True
     catches_up = True
+    remembers_directions = True
     export_refusal = "plans at every step"
 
     options: PETSOptions
@@ -106,13 +109,18 @@ class PETS(ReplayLearner):
         options = PETSOptions.of(options, settings)
         self.entries = list(range(specs.observation_dim))
         remembers = options.memory != "none"
-        if options.augment is not False and not remembers:
+        uses_geometry = options.augment is not False and not remembers
+        is_revealed = uses_geometry and specs.geometry is not None and specs.geometry.revealed is not None
+        if uses_geometry and not is_revealed:
             self.entries, specs = specs.telling_entries, specs.with_telling_entries()
         super().__init__(specs, device, options)
-        self.set_perception(options)
+        self.set_perception(options, knows_directions=is_revealed)
         features_dim = self.perception.specs.observation_dim
-        known = _without_directions(specs) if remembers else specs
-        self.model = PETSModel(known, options, features_dim - specs.observation_dim)
+        predicted = specs.with_telling_entries() if is_revealed else specs
+        if remembers:
+            predicted = _without_directions(specs)
+        context_dim = features_dim - predicted.observation_dim
+        self.model = PETSModel(predicted, options, context_dim, is_revealed=is_revealed)
         self.end_values = EndValues(features_dim, options.outcome_dims, options) if options.end_values else None
         self.policy = PETSPolicy(self.model, specs, self.entries, options, self.perception, self.end_values)
         self.to(device)
@@ -211,18 +219,26 @@ class PETS(ReplayLearner):
             stored = self._with_all_maps(stored)
         joint = self.policy.joint
         if joint.components.is_single:
-            direction = frame.direction(stored["state"], stored["discrete"])
-            turned = [frame.turn(stored[name], direction) for name in ("state", "next_state")]
+            states, certainty = [stored["state"], stored["next_state"]], None
+            memory = self.perception.memory
+            if isinstance(memory, KnownDirections):
+                table = memory.table(self.buffer[:]["memory"])
+                direction, certainty = frame.revealed_direction(table, stored["discrete"])
+                states = [memory.telling(state) for state in states]
+            else:
+                direction = frame.direction(stored["state"], stored["discrete"])
+            turned = [frame.turn(state, direction) for state in states]
             kind, own = frame.kind[stored["discrete"]], stored["unit"] * joint.has_slot[stored["discrete"]]
         else:
             turned = [stored["state"], stored["next_state"]]
             kind = joint.number(stored["discrete"])
-            own = joint.own(kind, stored["unit"])
+            own, certainty = joint.own(kind, stored["unit"]), None
         reward, terminated = stored["reward"], stored["terminated"]
         if frame.turns and frame.geometry is not None and frame.geometry.has_mirror:
             turned = [torch.cat([state, frame.mirror(state)]) for state in turned]
             kind, own, reward, terminated = (torch.cat([part, part]) for part in (kind, own, reward, terminated))
-        action = self.model.action_inputs(kind, own)
+            certainty = None if certainty is None else torch.cat([certainty, certainty])
+        action = self.model.action_inputs(kind, own, certainty)
         self.model.fit_scales(turned[0], action, turned[1], reward, terminated)
         mean, scale = self.model.reward_mean, self.model.reward_scale
         which = terminated.long()

@@ -85,12 +85,14 @@ class PETSModel(nn.Module):
     """`num_members` models of a step: the change of the state, then its end and its reward.
 
     With a memory, the networks also see a context: what is remembered of the observations before the state. The context
-    is not predicted.
+    is not predicted. If directions are revealed, the context is their table, of which the networks only see how certain
+    the action's own direction is.
 
     Args:
         specs: of the problem.
         options: the settings.
         context_dim: entries of the context; 0 without a memory.
+        is_revealed: whether the context is a table of `KnownDirections`.
     """
 
     state_mean: Tensor
@@ -110,13 +112,15 @@ class PETSModel(nn.Module):
     slot_kind: Tensor
     slot_number: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, options: PETSModelOptions, context_dim: int = 0) -> None:
+    def __init__(
+        self, specs: PAMDPSpecs, options: PETSModelOptions, context_dim: int = 0, *, is_revealed: bool = False
+    ) -> None:
         super().__init__()
         dim = specs.observation_dim
         self.context_dim = context_dim
         self.num_members = options.num_members
         self.is_probabilistic = options.probabilistic
-        self.frame = CanonicalFrame(specs, is_used=options.augment is not False)
+        self.frame = CanonicalFrame(specs, is_used=options.augment is not False, is_revealed=is_revealed)
         self.has_linear_part = not self.frame.turns if options.linear_part == "auto" else options.linear_part
         self.joint = None if specs.components.is_single else JointChoice(specs)
         kinds = self.frame.kind.tolist()
@@ -126,13 +130,14 @@ class PETSModel(nn.Module):
         self.register_buffer("slot_kind", places[:, 0], persistent=False)
         self.register_buffer("slot_number", places[:, 1], persistent=False)
         self.has_kinds = self.frame.num_kinds > 1
-        action_dim = 2 * len(slots) + (self.frame.num_kinds if self.has_kinds else 0)
+        action_dim = 2 * len(slots) + (self.frame.num_kinds if self.has_kinds else 0) + int(is_revealed)
+        seen_context_dim = 0 if is_revealed else context_dim
         num_vectors = self.frame.num_vectors
         feature_dim = 4 * num_vectors if num_vectors else 2 * dim
         in_dim = dim + action_dim
         out_dim = dim * (2 if options.probabilistic else 1)
-        self.transition = MemberNet(options.num_members, context_dim + in_dim, options.transition_dims, out_dim)
-        outcome_in_dim = context_dim + in_dim + dim + feature_dim
+        self.transition = MemberNet(options.num_members, seen_context_dim + in_dim, options.transition_dims, out_dim)
+        outcome_in_dim = seen_context_dim + in_dim + dim + feature_dim
         self.outcome = MemberNet(options.num_members, outcome_in_dim, options.outcome_dims, 3)
         # What a context means for a turned state is its direction alone: one model serves all of them.
         is_input = torch.ones(dim, dtype=torch.float32)
@@ -150,7 +155,7 @@ class PETSModel(nn.Module):
             "feature_mean": torch.zeros(feature_dim, dtype=torch.float32),
             "feature_scale": torch.ones(feature_dim, dtype=torch.float32),
         }
-        if context_dim > 0:
+        if seen_context_dim > 0:
             buffers["context_mean"] = torch.zeros(context_dim, dtype=torch.float32)
             buffers["context_scale"] = torch.ones(context_dim, dtype=torch.float32)
         if self.has_linear_part:
@@ -171,10 +176,16 @@ class PETSModel(nn.Module):
             precision: of the networks.
         """
         context, state = self.split(state)
-        direction = None if self.joint is not None else self.frame.direction(state, discrete)
+        direction = certainty = None
+        if self.frame.is_revealed:
+            assert context is not None
+            direction, certainty = self.frame.revealed_direction(context, discrete)
+            context = None
+        elif self.joint is None:
+            direction = self.frame.direction(state, discrete)
         turned = state if direction is None else self.frame.turn(state, direction)
         kind = discrete if direction is None else self.frame.kind[discrete]
-        x = self._inputs(turned, self.action_inputs(kind, own))
+        x = self._inputs(turned, self.action_inputs(kind, own, certainty))
         seen = self._with_context(context, x)
         if self.is_probabilistic:
             change = self._sampled(self.transition(seen, precision)) @ self._change_map()
@@ -202,12 +213,15 @@ class PETSModel(nn.Module):
         """Return what the networks see: a scaled context, and inputs `[*B, in]`."""
         return x if context is None else joined(_scaled(context, self.context_mean, self.context_scale), x)
 
-    def action_inputs(self, kind: Tensor, own: Tensor) -> Tensor:
+    def action_inputs(self, kind: Tensor, own: Tensor, certainty: Tensor | None = None) -> Tensor:
         """Return what the networks see of actions of a kind `[*B]` with parameters `[*B, D]`.
 
         That is the kind, and each kind's own parameters and their squares, 0 for the other kinds. With several
-        components, a kind is a numbered choice, of which the networks see what each component chose.
+        components, a kind is a numbered choice, of which the networks see what each component chose. If directions are
+        revealed, the certainty `[*B, 1]` of the action's direction comes first.
         """
+        if certainty is not None:
+            return joined(certainty, self.action_inputs(kind, own))
         if self.joint is not None:
             value = self.joint.spread(kind, own)
             return joined(self.joint.is_chosen[kind].to(own.dtype), value, value.square())

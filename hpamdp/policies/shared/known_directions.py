@@ -1,0 +1,94 @@
+"""A memory of where discrete actions point, for problems that do not tell it but show it.
+
+Nothing is learned here: a single step shows the direction of its action exactly, up to noise.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from hpamdp.policies.shared.canonical_frame import joined
+from hpamdp.specs import PAMDPSpecs
+
+_SHORTEST = 1e-4  # of a displacement that shows a direction, in units of the observation
+_SHORTEST_SUM = 1e-3  # of the known directions, if its opposite is to be the guess
+
+
+class KnownDirections(nn.Module):
+    """Remembers where each of K discrete actions moved when it was last taken in the episode.
+
+    The state `[*B, 2 K]` has x of all actions, then y: unit vectors, or zeros for an action that was not taken yet.
+
+    The features `[*B, 3 K + entries]` begin with a table: x of all directions, y of all directions, and the certainty
+    of all. The direction of an action that was not taken yet is guessed. It is the opposite of the known directions'
+    sum, or +x if nothing is known. The certainty is 1 for a known direction. For a guess it rises from -1 with the
+    share of actions that are known. The entries of the observation that are not redundant follow.
+
+    Args:
+        specs: of the problem, whose geometry says what reveals the directions.
+
+    Attributes:
+        size: entries of the state.
+        num_features: entries of the features.
+        name: key of its state in a tensordict.
+    """
+
+    is_recurrent = False
+    last_action: Tensor
+    moved: Tensor
+    kept: Tensor
+
+    def __init__(self, specs: PAMDPSpecs) -> None:
+        super().__init__()
+        assert specs.geometry is not None and specs.geometry.revealed is not None
+        revealed = specs.geometry.revealed
+        self.num_actions = specs.num_discrete
+        self.sums_to_zero = revealed.sums_to_zero
+        self.size = 2 * self.num_actions
+        self.table_size = 3 * self.num_actions
+        self.num_features = self.table_size + len(specs.telling_entries)
+        self.name = f"directions_{self.size}"
+        entries = {"last_action": revealed.last_action, "moved": revealed.moved, "kept": specs.telling_entries}
+        for name, numbers in entries.items():
+            self.register_buffer(name, torch.tensor(numbers), persistent=False)
+
+    def step(self, seen: Tensor, held: Tensor) -> Tensor:
+        """Return the states `[N, size]` after observations `[N, observation_dim]`, given the states before."""
+        moved = seen[..., self.moved]
+        length = moved.norm(dim=-1, keepdim=True)
+        is_shown = (seen[..., self.last_action] > 0.5) & (length > _SHORTEST)
+        unit = moved / length.clamp(min=_SHORTEST)
+        parts = zip(unit.split(1, -1), held.chunk(2, -1), strict=True)
+        return torch.cat([torch.where(is_shown, new, old) for new, old in parts], -1)
+
+    def features(self, seen: Tensor, state: Tensor) -> Tensor:
+        """Return the features `[*B, num_features]` of observations and the states after them."""
+        return torch.cat([self.table(state), self.telling(seen)], -1)
+
+    def telling(self, seen: Tensor) -> Tensor:
+        """Return observations `[*B, observation_dim]` without their redundant entries."""
+        return seen[..., self.kept]
+
+    def imagined(self, features: Tensor, observation: Tensor) -> Tensor:
+        """Return the features that follow from others if a model predicts `observation`, without redundant entries.
+
+        A plan knows no more than the step that it begins with.
+        """
+        return joined(features[..., : self.table_size], observation)
+
+    def table(self, state: Tensor) -> Tensor:
+        """Return x, y and certainty of all directions, `[*B, 3 K]`."""
+        x, y = state.chunk(2, -1)
+        is_known = (x != 0.0) | (y != 0.0)
+        num_known = is_known.sum(-1, keepdim=True)
+        guess_x, guess_y = -x.sum(-1, keepdim=True), -y.sum(-1, keepdim=True)
+        length = torch.hypot(guess_x, guess_y)
+        is_clear = length > _SHORTEST_SUM
+        guess_x = torch.where(is_clear, guess_x / length, 1.0)
+        guess_y = torch.where(is_clear, guess_y / length, 0.0)
+        is_certain = is_known
+        if self.sums_to_zero:
+            is_certain = is_known | (num_known == self.num_actions - 1)
+        certainty = torch.where(is_certain, 1.0, 2.0 * num_known / self.num_actions - 1.0)
+        return torch.cat([torch.where(is_known, x, guess_x), torch.where(is_known, y, guess_y), certainty], -1)

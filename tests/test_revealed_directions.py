@@ -1,0 +1,235 @@
+"""Directions of actions that a problem reveals but does not tell: they are remembered, and turn a model's states."""
+
+import re
+import signal
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from test_resume import stop_and_resume
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import hpamdp
+from hpamdp import keys
+from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
+from hpamdp.env.boatdock_unseen.rules import OBSERVATION_NAMES
+from hpamdp.env.decisions import with_decisions
+from hpamdp.geometry import PlaneGeometry, RevealedDirections
+from hpamdp.policies.low_level.pets.learner import PETS
+from hpamdp.policies.shared.known_directions import KnownDirections
+from hpamdp.specs import PAMDPSpecs
+
+SMALL = dict(
+    gamma=0.97, num_members=3, updates_per_step=4.0, num_iterations=3, greedy_samples=12, planning_precision="float32"
+)  # fmt: skip
+STATE = "directions_6"
+BOAT = slice(OBSERVATION_NAMES.index("boat_x"), OBSERVATION_NAMES.index("boat_y") + 1)
+
+
+def make(env: UnseenBoatsEnv, **changes) -> PETS:
+    torch.manual_seed(0)
+    return PETS(PAMDPSpecs.from_env(env), **{**SMALL, **changes})
+
+
+def sailed(env: UnseenBoatsEnv, learner: PETS, steps: int) -> tuple[TensorDict, torch.Tensor]:
+    """Return presses of the policy `[N, T]`, and in which directions the keys pushed, `[N, T, 3, 2]`."""
+    tracked = with_decisions(env)
+    td, rows, directions = tracked.reset(), [], []
+    for _ in range(steps):
+        directions.append(env.known_boats(env.state)[0].directions)
+        with torch.no_grad():
+            td, following = tracked.step_and_maybe_reset(learner.policy(td))
+        rows.append(td)
+        td = following
+    return torch.stack(rows, 1), torch.stack(directions, 1)
+
+
+def learn(learner: PETS, rolled: TensorDict) -> None:
+    learner.learn(rolled, torch.ones(rolled.shape, dtype=torch.bool))
+
+
+def turned(vector: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
+    """Return vectors `[*B, 2]` in the frame whose x axis points along `axis` `[2]`."""
+    return torch.stack([vector @ axis, vector[..., 1] * axis[0] - vector[..., 0] * axis[1]], -1)
+
+
+@pytest.mark.parametrize("frame", ["screen", "first_press"])
+@pytest.mark.parametrize("family", ["turned", "any", "strength"])
+def test_pressed_keys_have_their_true_directions_until_the_session_ends(frame, family):
+    env = UnseenBoatsEnv(8, trips=3, frame=frame, family=family, seed=3)
+    rolled, true = sailed(env, make(env, warmup_steps=1000), 40)
+    x, y = rolled[STATE].chunk(2, -1)
+    known = torch.stack([x, y], -1)
+    num_later_trips = 0
+    for row in range(8):
+        pressed: list[int] = []
+        for step in range(40):
+            if rolled[keys.EPISODE_STEPS][row, step] == 0:
+                pressed = []
+            expected = torch.zeros(3, 2)
+            if pressed:
+                expected[pressed] = true[row, step][pressed]
+                if frame == "first_press":
+                    expected = turned(expected, true[row, step, pressed[0]])
+                num_later_trips += int(rolled[keys.OBSERVATION][row, step, OBSERVATION_NAMES.index("trip")] > 0)
+            torch.testing.assert_close(known[row, step], expected, atol=1e-4, rtol=0.0)
+            pressed.append(int(rolled[keys.DISCRETE][row, step]))
+    assert num_later_trips > 50 and rolled["next", keys.DONE].sum() > 8
+
+
+@pytest.mark.parametrize(("family", "certainty_of_last"), [("turned", 1.0), ("any", 1.0 / 3.0)])
+def test_unknown_directions_are_guessed_opposite_to_the_known_ones(family, certainty_of_last):
+    memory = KnownDirections(PAMDPSpecs.from_env(UnseenBoatsEnv(1, family=family)))
+    half, height = 0.5, 0.75**0.5
+    x = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-half, 1.0, 0.0], [0.0, 1.0, -1.0]])
+    y = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [height, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    seen_x, seen_y, certainty = memory.table(torch.cat([x, y], -1)).chunk(3, -1)
+    # Of two opposite directions, the last row, the opposite says nothing: the guess is then +x.
+    expected_x = torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0], [-half, 1.0, -half], [1.0, 1.0, -1.0]])
+    expected_y = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [height, 0.0, -height], [0.0, 0.0, 0.0]])
+    torch.testing.assert_close(seen_x, expected_x)
+    torch.testing.assert_close(seen_y, expected_y)
+    third, last = -1.0 / 3.0, certainty_of_last
+    expected = torch.tensor([[-1.0, -1.0, -1.0], [third, 1.0, third], [1.0, 1.0, last], [last, 1.0, 1.0]])
+    torch.testing.assert_close(certainty, expected)
+
+
+def test_the_model_learns_from_states_in_which_certain_presses_go_along_x():
+    env = UnseenBoatsEnv(16, seed=3)
+    learner = make(env, warmup_steps=1000)
+    learn(learner, sailed(env, learner, 20)[0])
+    rows = learner.prepared()
+    change = (rows["change"] * learner.model.change_scale)[:, :2]  # the boat's place comes first
+    goes_on, is_certain = rows["terminated"] == 0.0, rows["action"][:, 0] == 1.0
+    certain, guessed = change[goes_on & is_certain], change[goes_on & ~is_certain]
+    assert len(certain) > 100 and (certain[:, 0] > 0.0).all()
+    torch.testing.assert_close(certain[:, 1], torch.zeros(len(certain)), atol=1e-5, rtol=0.0)
+    assert len(guessed) > 10 and guessed[:, 1].abs().mean() > 0.05
+
+
+def test_predictions_turn_with_the_state_and_the_revealed_directions():
+    env = UnseenBoatsEnv(16, seed=3)
+    learner = make(env, warmup_steps=64)
+    rolled = sailed(env, learner, 10)[0]
+    learn(learner, rolled)
+    observation, state = rolled[keys.OBSERVATION].flatten(0, 1), rolled[STATE].flatten(0, 1)
+    angle = torch.tensor(1.1)
+    to_turned = torch.tensor([[angle.cos(), angle.sin()], [-angle.sin(), angle.cos()]])
+    other = observation.clone()
+    for pair in env.geometry.vectors:
+        other[:, list(pair)] = observation[:, list(pair)] @ to_turned
+    other_state = (state.unflatten(-1, (2, 3)).mT @ to_turned).mT.flatten(-2)
+    has_known = (state != 0.0).any(-1)  # before, the guess is +x in every frame
+    predicted = []
+    for seen, held in ((observation, state), (other, other_state)):
+        features = learner.perception(seen, held, has_seen=True)[has_known].expand(3, -1, -1)
+        discrete = torch.arange(features.shape[1]).expand(3, -1) % 3
+        predicted.append(learner.model(features, discrete, torch.zeros(*features.shape[:2], 1)))
+    expected = predicted[0].next_state.clone()
+    for pair in ([0, 1], [2, 3]):
+        expected[..., pair] = expected[..., pair] @ to_turned
+    torch.testing.assert_close(predicted[1].next_state, expected, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(predicted[1].logit, predicted[0].logit, atol=1e-3, rtol=1e-3)
+
+
+def test_a_plan_keeps_the_directions_it_began_with():
+    learner = make(UnseenBoatsEnv(1))
+    features = torch.randn(4, learner.perception.specs.observation_dim)
+    following = torch.randn(4, features.shape[-1] - 9)
+    imagined = learner.perception.imagined(features, following)
+    torch.testing.assert_close(imagined, torch.cat([features[:, :9], following], -1), check_stride=False)
+
+
+def test_a_few_hundred_presses_suffice_to_dock_boats_never_met():
+    env = UnseenBoatsEnv(16, seed=3)
+    learner = make(env)
+    tracked = with_decisions(env)
+    following = tracked.reset()
+    for _ in range(6):
+        rows = []
+        for _ in range(4):
+            with torch.no_grad():
+                td, following = tracked.step_and_maybe_reset(learner.policy(following))
+            rows.append(td)
+        learn(learner, torch.stack(rows, 1))
+    scored = UnseenBoatsEnv(32)
+    scored.seed_evaluation(7)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        rolled = sailed(scored, learner, 40)[0]
+    before_end = rolled["next", keys.DONE].squeeze(-1).cumsum(1) - rolled["next", keys.DONE].squeeze(-1).long() == 0
+    trip = rolled[keys.OBSERVATION][..., OBSERVATION_NAMES.index("trip")]
+    ended = rolled["next", keys.TRIP_ENDED].squeeze(-1) & before_end & (trip >= 2 / 8)
+    score = 5.0 * rolled["next", keys.OBSERVATION][..., OBSERVATION_NAMES.index("last_score")][ended]
+    assert len(score) > 100 and score.mean() > 1.0  # random presses score -0.9, and the best plans 3.4
+
+
+def test_other_settings_remember_no_directions():
+    specs = PAMDPSpecs.from_env(UnseenBoatsEnv(1))
+    for settings in ({"augment": False}, {"memory": "stack"}):
+        learner = PETS(specs, **settings)
+        assert not learner.model.frame.turns and STATE not in learner.policy.out_keys
+    assert UnseenBoatsEnv(1, boats=2).geometry is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "misfit"),
+    [
+        ({"directions": torch.zeros(1, 3, 2)}, "directions are both known and revealed"),
+        ({"revealed": RevealedDirections((2, 3), (0, 1))}, "revealed by 2 entries of the last action, but must be 3"),
+        (
+            {"revealed": RevealedDirections((2, 3, 5), (0, 1))},
+            r"revealed by the entries \(2, 3, 5, 0, 1\), but must be",
+        ),
+        (
+            {"revealed": RevealedDirections((2, 3, 4), (0, 2))},
+            r"revealed by the entries \(2, 3, 4, 0, 2\), but must be",
+        ),
+    ],
+)
+def test_entries_that_cannot_reveal_directions_are_told_of(changes, misfit):
+    geometry = PlaneGeometry(vectors=((0, 1),), revealed=RevealedDirections((2, 3, 4), (0, 1)))
+    assert geometry.fits(5, (1, 1, 1)) == ""
+    told = replace(geometry, **changes).fits(5, (1, 1, 1))
+    assert re.match(misfit, told)
+
+
+RUN = ["env=boatdock_unseen", "high=none", "low=pets", "num_envs=8", "steps_per_batch=4", "total_frames=416"]
+RUN += ["eval.layouts=4", "eval.every=192", "log_every=64", "low.updates_per_step=0.5", "low.num_iterations=1"]
+RUN += ["low.num_members=2", "low.greedy_samples=8", "low.num_samples=8", "low.horizon=2"]
+
+
+def test_a_run_that_remembers_directions_resumes_to_the_last_bit(tmp_path, monkeypatch):
+    stop_and_resume(RUN, tmp_path, monkeypatch, signal.SIGINT)
+
+
+QUIET = {
+    "total_frames": 128,
+    "num_envs": 8,
+    "steps_per_batch": 4,
+    "eval.every": 0,
+    "eval.layouts": 2,
+    "progress": False,
+}
+QUICK = {"low.updates_per_step": 0.5, "low.num_iterations": 1, "low.horizon": 1, "low.greedy_samples": 8}
+
+
+@pytest.mark.parametrize("augment", ["auto", False])
+def test_runs_warn_of_forgotten_trips_only_if_no_directions_are_remembered(augment, capsys):
+    more = {**QUIET, **QUICK, "low.augment": augment}
+    hpamdp.train("boatdock_unseen", high="none", low="pets", **more)
+    assert ("forgets earlier trips" in capsys.readouterr().err) == (augment is False)
+
+
+def test_an_agent_remembers_directions_until_its_session_ends():
+    agent = hpamdp.train("boatdock_unseen", high="none", low="pets", **QUIET, **QUICK)
+    observation = torch.zeros(len(OBSERVATION_NAMES))
+    agent.act(observation.numpy())
+    for key, along in ((1, "moved_y"), (3, "moved_x")):
+        shown = observation.clone()
+        shown[[OBSERVATION_NAMES.index(name) for name in (f"last_key_{key}", along)]] = 1.0
+        agent.act(shown.numpy())
+    assert agent._last[STATE][0].tolist() == [0.0, 0.0, 1.0, 1.0, 0.0, 0.0]
+    agent.reset()
+    agent.act(observation.numpy())
+    assert agent._last[STATE][0].tolist() == [0.0] * 6
