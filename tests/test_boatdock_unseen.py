@@ -340,6 +340,26 @@ def test_an_evaluation_repeats_and_a_saved_state_continues_exactly():
 
 
 @pytest.mark.parametrize(
+    ("column", "number", "message"),
+    [
+        ("trip", 4, "a session is in its trip 5, but env.trips=3; set at least 5"),
+        ("trip", -1, "trip has -1 to 0, not 0 to 2"),
+        ("docked", 4, "docked has 0 to 4, not 0 to 3"),
+        ("boat", 1, "boat has 0 to 1, not -1 to 0"),
+        ("last_key", 3, "last_key has -1 to 3, not -1 to 2"),
+    ],
+)
+def test_a_saved_state_of_other_sessions_is_refused_in_one_line(column, number, message):
+    env = UnseenBoatsEnv(4, trips=3)
+    env.reset()
+    state = env.env_state()
+    env.check_env_state(state)
+    state[column][1] = number
+    with pytest.raises(ValueError, match=message):
+        env.check_env_state(state)
+
+
+@pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"scored_boats": "training"}, "scored_boats=training: needs a fleet_size"),

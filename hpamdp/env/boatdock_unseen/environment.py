@@ -28,6 +28,7 @@ from hpamdp.env.boatdock_unseen.rules import SessionRules, SessionState
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.rng_streams import EVALUATION, TRAINING
+from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry, RevealedDirections
 
 if TYPE_CHECKING:
@@ -251,6 +252,21 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return the mean `score` and `success` of the trips of finished (or abandoned) sessions, `[M]`."""
         return {"score": last.get(SESSION_SCORE).squeeze(-1), "success": last.get(SESSION_SUCCESS).squeeze(-1)}
+
+    def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Refuse boats, keys, counters and outcomes that do not exist, and trips past the end of a session.
+
+        Raises:
+            ValueError: a number is invalid, or the state is of longer sessions.
+        """
+        super().check_env_state(columns)
+        trips, boats = self.options.trips, self.options.boats
+        latest = int(columns["trip"].max())
+        if latest >= trips:
+            raise ValueError(f"a session is in its trip {latest + 1}, but env.trips={trips}; set at least {latest + 1}")
+        limits = {"trip": (0, trips), "docked": (0, trips + 1), "presses": (0, task.MAX_PRESSES + 1)}
+        limits |= {"boat": (-1, boats), "last_boat": (-1, boats), "last_key": (-1, task.NUM_KEYS), "trip_ended": (0, 2)}
+        check_range(columns, limits)
 
     def trip_ends(self, rows: StateArrays) -> np.ndarray:
         """Return whether a trip ended with the last press, bool `[N]`."""
