@@ -233,7 +233,7 @@ def test_batches_ahead_are_made_by_the_policy_from_before_the_last_update(tmp_pa
 
 def test_the_state_of_another_number_of_environments_is_refused(workers, tmp_path):
     _, small = make(tmp_path, "num_envs=4")
-    with pytest.raises(ValueError, match=r"of 4 environments, but there are 8"):
+    with pytest.raises(ValueError, match=r"num_envs=8: the state is of 4 environments; leave num_envs out"):
         workers[1].set_state(small.state())
 
 

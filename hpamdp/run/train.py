@@ -415,8 +415,7 @@ class Trainer:
         try:
             collection.set_state(state)
         except (ValueError, RuntimeError, KeyError) as error:
-            where = f"{self._saved.file}, num_envs={self.config.run.num_envs}"
-            raise ConfigError(f"{where}: {first_line(error)}; leave num_envs out when you resume") from error
+            raise ConfigError(f"{self._saved.file}: {first_line(error)}") from error
         assert generators is not None
         checkpoint.set_generators(generators)
 

@@ -37,7 +37,10 @@ def checked_state(saved: Any, parts: AssembledRun) -> CollectionState:
         if env.keeps_episodes:
             sizes = {len(column) if column.ndim else 0 for column in state.env.values()} - {env.num_envs}
             if sizes:
-                raise ValueError(f"the state is of {sizes.pop()} environments, but there are {env.num_envs}")
+                raise ValueError(
+                    f"num_envs={env.num_envs}: the state is of {sizes.pop()} environments; leave num_envs out when you "
+                    "resume"
+                )
         check_columns("env", state.env, own)
         env.check_env_state(state.env)
         if env.keeps_episodes and state.root is None:
