@@ -479,6 +479,12 @@ def test_what_does_not_go_with_trips_is_refused_in_one_line(env, settings, messa
     assert "\n" not in str(error.value)
 
 
+def test_an_evaluation_learns_nothing_and_so_ignores_where_values_end(command):
+    words = ["mode=eval", "checkpoint=hppo_boatdock_unseen", "env=platform"]
+    code, _, err = command(*words)
+    assert code != 0 and "values_end" not in err and "whose sizes env sets" in err
+
+
 @pytest.mark.parametrize("sharing", ["per_option", "shared"])
 def test_a_memory_that_forgets_earlier_trips_is_told_of_in_one_line(sharing, capsys):
     hpamdp.train(HiddenOption, low="hppo", **SMALL, **{"low.memory": "gru", "agent.sharing": sharing})

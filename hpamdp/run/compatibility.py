@@ -183,8 +183,8 @@ def callbacks_have_evaluations(config: Config) -> str | None:
 
 
 def values_end_where_there_are_trips(config: Config) -> str | None:
-    """Refuse `agent.values_end=trip` for episodes without trips."""
-    if config.run.agent.values_end == "session" or has_trips(config):
+    """Refuse `agent.values_end=trip` for episodes without trips; an evaluation, which learns nothing, ignores it."""
+    if config.run.mode == "eval" or config.run.agent.values_end == "session" or has_trips(config):
         return None
     return f"agent.values_end=trip: episodes of {config.env} have no trips; use agent.values_end=session"
 
