@@ -371,6 +371,8 @@ def test_a_saved_state_of_other_sessions_is_refused_in_one_line(column, number, 
         ({"shortest_press": 0.95}, "shortest_press=0.95: it leads to 85 px/s, but boats dock at no more than 74"),
         ({"shortest_press": 0.8, "family": "strength"}, "shortest_press=0.8: it leads to"),
         ({"separation": 120.0}, "separation"),
+        ({"fleet_size": 4, "fleet_seed": -1}, "fleet_seed=-1: must be greater than or equal to 0"),
+        ({"fleet_size": 4, "fleet_seed": 2**32}, "fleet_seed=4294967296: must be less than 4294967296"),
     ],
 )
 def test_impossible_sessions_are_refused_in_one_line(settings, message):

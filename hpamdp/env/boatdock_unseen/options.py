@@ -35,7 +35,7 @@ class UnseenBoatsOptions(Settings):
     """With `family=strength`: speed and glide are up to this share above or below those of people's boats."""
     fleet_size: Annotated[int, Field(ge=1, le=2**24)] | None = None
     """Number of different boats in training. If None, each session draws new ones."""
-    fleet_seed: int = 0
+    fleet_seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """With a `fleet_size`: which boats these are."""
     scored_boats: Literal["new", "training"] = "new"
     """Boats of evaluations: `new` ones, which no training meets, or with a `fleet_size` those of `training`."""
