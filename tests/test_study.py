@@ -341,3 +341,18 @@ def test_a_share_on_crossing_is_of_the_best_return_from_the_same_places(tmp_path
 def test_the_page_of_lengths_has_the_table_of_its_stored_runs(capsys):
     study("lengths").main([])
     assert capsys.readouterr().out in (EXPERIMENTS / "lengths" / "README.md").read_text()
+
+
+def test_a_run_of_another_sharing_replaces_no_stored_run_with_unknown_boats():
+    study_of = study("generalisation")
+    row = dict.fromkeys(study_of.SETTINGS, "") | {"frames": 200, "seed": 1, "sharing": "shared"}
+    other = row | {"sharing": "per_option"}
+    assert len(study_of.merged([row], [other])) == 2 and len(study_of.merged([row], [row])) == 1
+
+
+def test_the_table_of_unknown_boats_has_a_column_for_each_head():
+    study_of = study("generalisation")
+    numbers = {f"{name}_{trip}": 2.0 for name in ("score", "presses") for trip in range(1, 9)}
+    row = dict.fromkeys(study_of.SETTINGS, "x") | {"boats": 2, "sharing": "per_option", "ceiling": 3.0, "cpu_s": 1.0}
+    lines = study_of.table([row | numbers | {"seed": seed} for seed in range(3)]).splitlines()
+    assert len({line.count("|") for line in lines}) == 1 and "x, x, per option" in lines[-1]

@@ -41,6 +41,7 @@ SETTINGS = (
     "high_memory",
     "low",
     "memory",
+    "sharing",
 )
 FIRST_LATER, NUM_TRIPS = 3, 8
 PEOPLE_EPISODES = 60
@@ -66,6 +67,7 @@ def gather(runs: Sequence[Run]) -> Rows:
             "high_memory": high.get("memory", ""),
             "low": run.summary["low"],
             "memory": low.get("memory", ""),
+            "sharing": run.config["agent"]["sharing"],
         }
         rows.append(
             settings
@@ -95,12 +97,12 @@ def later(row: dict) -> float:
 def table(results: Rows) -> str:
     """Return a line for each cell: the score of the first, the second and the later trips, mean and interval."""
     lines = [
-        "| family | boats | frame | training boats | scored on | values end | selector | learner, memory | n "
+        "| family | boats | frame | training boats | scored on | values end | selector | learner, memory, sharing | n "
         "| first trip | second trip | trips 3 to 8 | 95 % | ceiling | presses, first trip | later | CPU |",
         "|---" * 17 + "|",
     ]
     for settings, rows in groups(results, *SETTINGS).items():
-        family, boats, frame, fleet, scored, ends, high, high_memory, low, memory = settings
+        family, boats, frame, fleet, scored, ends, high, high_memory, low, memory, sharing = settings
         first, second, rest = ([value(row) for row in rows] for value in (_first, _second, later))
         low_end, high_end = mean_interval(rest)
         columns = [
@@ -111,7 +113,7 @@ def table(results: Rows) -> str:
             scored,
             ends,
             f"{high} {high_memory}".strip(),
-            f"{low}, {memory}",
+            f"{low}, {memory}" + (f", {sharing.replace('_', ' ')}" if boats > 1 else ""),
             len(rows),
             spread(first),
             spread(second),
