@@ -42,7 +42,7 @@ class UnseenBoatsOptions(Settings):
     shortest_press: Annotated[float, Field(ge=0.0, le=1.0)] = 0.15
     """Seconds of the shortest press; the default is the fifth percentile of people's presses.
 
-    A shorter press could show a direction for nothing.
+    Shorter presses would show where the keys push at almost no cost.
     """
     reward: RewardForm = "paper"
     """`paper`: progress at each press, 5 x the fuel left on success, -1 on failure. `sparse`: only the success term."""
@@ -50,7 +50,8 @@ class UnseenBoatsOptions(Settings):
     """Axes of positions, displacements and velocities that are seen: the screen's, or those of the first press.
 
     With `first_press` the x axis points to where the session's first press moved the boat, as far as it was seen. Until
-    then it points from the start to the goal. So turned sessions look alike, and only the order of the keys is unknown.
+    then it points from the start to the goal. So turned boats look alike, and only the order of the keys is unknown.
+    With two boats this holds for the one that was pressed first.
     """
     motor_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
     """Standard deviation of the log of the executed duration."""
