@@ -179,7 +179,11 @@ def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
                 sessions.plot(trips, [row["score"] for row in found], color=colour, linestyle=line, label=label)
     sessions.set(xlabel="trip with a boat that was never met", ylim=(-0.2, 3.8))
     sessions.set_ylabel("mean score of a trip")
-    episodes.plot([row["episode"] for row in people], [row["score"] for row in people], ".", color="#D98200")
+    scores = [row["score"] for row in people]
+    episodes.plot(range(1, len(scores) + 1), scores, ".", color="#D98200", alpha=0.4, label="mean of 40 people")
+    tens = [sum(scores[first : first + 10]) / 10 for first in range(0, len(scores), 10)]
+    episodes.plot([10 * i + 5.5 for i in range(len(tens))], tens, "s-", color="#D98200", label="over ten episodes")
+    episodes.legend(loc="lower right", fontsize=7, frameon=False)
     for axes in (sessions, episodes):
         axes.axhline(HUMAN["chosen"]["score"], color="#8c8c8c", linestyle=":", linewidth=1.0)
         axes.spines[["top", "right"]].set_visible(False)
