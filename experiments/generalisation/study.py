@@ -46,13 +46,16 @@ SETTINGS = (
 FIRST_LATER, NUM_TRIPS = 3, 8
 PEOPLE_EPISODES = 60
 PLAYERS = {"knows": "best plans, which know the boat", "finds_out": "player who finds out"}
+DRAWN = {"low": "hppo", "memory": "gru", "values_end": "trip"}  # the learner of the figure
 COLOURS = {"turned": "#0072B2", "strength": "#009E73", "any": "#CC79A7"}
 
 
 def gather(runs: Sequence[Run]) -> Rows:
-    """Return a row for each run: its settings and the mean score of each trip."""
+    """Return a row for each run with sessions of `NUM_TRIPS` trips: its settings and the mean score of each trip."""
     rows: Rows = []
     for run in runs:
+        if run.config["env"]["trips"] != NUM_TRIPS:
+            continue
         env, low, high = run.config["env"], run.config["low"], run.config["high"] or {}
         played = run.played()
         scores, presses = played["trip_score"].mean(0), played["trip_presses"].mean(0)
@@ -168,8 +171,9 @@ def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
     sessions, episodes = figure.subplots(1, 2, sharey=True, width_ratios=[3, 2])
     trips = range(1, NUM_TRIPS + 1)
     for family, colour in COLOURS.items():
-        rows = [row for row in results if (row["family"], row["boats"], row["frame"]) == (family, 1, "first_press")]
-        for number, row in enumerate(row for row in rows if row["memory"] == "gru" and row["fleet_size"] == "new"):
+        shown = {"family": family, "boats": 1, "frame": "first_press", "fleet_size": "new", **DRAWN}
+        rows = [row for row in results if all(row[name] == value for name, value in shown.items())]
+        for number, row in enumerate(rows):
             scores = [row[f"score_{trip}"] for trip in trips]
             sessions.plot(trips, scores, color=colour, linewidth=1.3, label=None if number else f"H-PPO, {family}")
         for player, line in (("finds_out", "--"), ("knows", ":")):
