@@ -180,7 +180,7 @@ def test_a_file_of_sessions_takes_each_once_and_no_episodes_of_people_s_two_boat
         (["env.sensor_noise=2"], "env: UnseenBoatsEnv: sensor_noise=2.0, but the page has 0.0"),
         (["env.frame=first_press"], "frame=first_press, but the page has screen"),
         (["env.fleet_size=4", "env.scored_boats=training"], "scored_boats=training, but the page has new"),
-        (["env.shortest_press=1"], "env: shortest_press=1 s leads to"),
+        (["env.shortest_press=1"], "env: shortest_press=1: it leads to"),
         (["--agent", "linucb_hppo"], "--agent linucb_hppo: people play env=boatdock_unseen alone; leave it out"),
         (["--to", "nowhere/a.jsonl", "--agent", "none"], "there is no folder nowhere"),
     ],

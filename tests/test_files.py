@@ -78,9 +78,8 @@ def test_a_sweep_keeps_no_records_behind_a_link(tmp_path):
 
 
 def test_an_exported_page_replaces_links(tmp_path):
-    page = type("Page", (), {"folder": tmp_path / "page", "files": ["index.html"]})
-    page.folder.mkdir()
-    (page.folder / "index.html").write_text("new")
+    (tmp_path / "index.html").write_text("new")
+    page = type("Page", (), {"files": {"index.html": tmp_path / "index.html"}})
     (tmp_path / "export").mkdir()
     for name in ("index.html", play.DATA_NAME):
         (tmp_path / f"own-{name}").write_text("own")

@@ -209,6 +209,7 @@ def main(folders: Sequence[str]) -> None:
     stored = {name: HERE / f"{name}.csv" for name in ("results", "players", "transfer", "people")}
     results, players, transfer, people = (read_csv(file) if file.exists() else [] for file in stored.values())
     results = with_enough_seeds(results, *SETTINGS)
+    transfer = with_enough_seeds(transfer, "learner", "trained_on", "controller")
     draw(results, players, people, HERE / "trips.png")
     print(table(results), players_table(players), transfer_table(transfer), sep="\n\n")
 

@@ -34,7 +34,7 @@ class SessionPage:
         options: settings of the environment.
 
     Raises:
-        ValueError: the settings differ from those of the page, or no boat can dock after the shortest press.
+        ValueError: the settings differ from those of the page.
     """
 
     files: Mapping[str, Path] = {
