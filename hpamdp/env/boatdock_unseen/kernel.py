@@ -83,7 +83,14 @@ _GLIDE, _TANK, _LONGEST = _F(task.GLIDE), _F(task.TANK), _F(task.MAX_DURATION)
 _SUCCESS, _FAILURE = _F(task.SUCCESS_REWARD), _F(task.FAILURE_REWARD)
 _NEAREST = _F(task.DOCK_RADIUS / task.HARBOUR_RADIUS)
 _SHORTEST_AXIS = _F(rules._SHORTEST_AXIS)
-_NUM_SEEN = 8  # positions and displacements that sensors measure
+
+# Places in the observation. It begins as the state does, with the coordinates of start, goal and boat.
+_NUM_COORDINATES = Y + 1
+_TO_GOAL, _VELOCITY, _MOVED = (rules.OBSERVATION_NAMES.index(f"{name}_x") for name in ("to_goal", "velocity", "moved"))
+_FUEL, _DISTANCE, _TRIP, _BOAT, _LAST_KEY, _LAST_DURATION, _LAST_SCORE = (
+    rules.OBSERVATION_NAMES.index(name)
+    for name in ("fuel", "distance", "trip", "boat", "last_key_1", "last_duration", "last_score")
+)
 
 
 @inlined
@@ -238,43 +245,48 @@ def _act(floats: Any, integers: Any, row: Any, option: Any, key: Any, duration: 
 @inlined
 def _observe(floats: Any, integers: Any, row: Any, settings: Any, observation: Any) -> None:
     """Write the observation of a row, as `rules.observe` does for columns."""
-    for place in range(Y + 1):  # start, goal and boat
+    for place in range(_NUM_COORDINATES):
         observation[place] = floats[place, row]
-    observation[19], observation[20] = floats[MOVED_X, row], floats[MOVED_Y, row]
+    observation[_MOVED], observation[_MOVED + 1] = floats[MOVED_X, row], floats[MOVED_Y, row]
     noise, last_key = _F(settings[SENSOR_NOISE]), integers[LAST_KEY, row]
     if noise > ZERO:
         bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
         index = integers[STEPS_ROW, row] * (rules.NUMBERS_PER_PRESS // 2) + rules.SENSOR
-        for number in range(_NUM_SEEN if last_key >= 0 else _NUM_SEEN - 2):
-            place = number if number < 6 else 13 + number
-            observation[place] += noise * normal(bits, step, index + number)
-    for place in range(Y + 1):
+        for number in range(_NUM_COORDINATES):
+            observation[number] += noise * normal(bits, step, index + number)
+        if last_key >= 0:
+            for axis in range(2):
+                observation[_MOVED + axis] += noise * normal(bits, step, index + _NUM_COORDINATES + axis)
+    for place in range(_NUM_COORDINATES):
         observation[place] *= _UNIT
-    observation[19] *= _UNIT
-    observation[20] *= _UNIT
-    observation[10], observation[11] = floats[VELOCITY_X, row] * _SPEED, floats[VELOCITY_Y, row] * _SPEED
+    observation[_MOVED] *= _UNIT
+    observation[_MOVED + 1] *= _UNIT
+    observation[_VELOCITY], observation[_VELOCITY + 1] = (
+        floats[VELOCITY_X, row] * _SPEED,
+        floats[VELOCITY_Y, row] * _SPEED,
+    )
     if settings[HAS_OWN_FRAME] != 0.0:
         axis_x, axis_y = floats[FRAME_X, row], floats[FRAME_Y, row]
         if axis_x == ZERO and axis_y == ZERO:
-            axis_x, axis_y = observation[2] - observation[0], observation[3] - observation[1]
+            axis_x, axis_y = observation[GOAL_X] - observation[START_X], observation[GOAL_Y] - observation[START_Y]
         length = max(math.sqrt(axis_x * axis_x + axis_y * axis_y), _SHORTEST_AXIS)
         cosine, sine = axis_x / length, axis_y / length
-        for place in (0, 2, 4, 10, 19):
+        for place in (START_X, GOAL_X, X, _VELOCITY, _MOVED):
             across, along = observation[place], observation[place + 1]
             observation[place] = across * cosine + along * sine
             observation[place + 1] = along * cosine - across * sine
-    to_goal_x, to_goal_y = observation[2] - observation[4], observation[3] - observation[5]
-    across, along = observation[2] - observation[0], observation[3] - observation[1]
+    to_goal_x, to_goal_y = observation[GOAL_X] - observation[X], observation[GOAL_Y] - observation[Y]
+    across, along = observation[GOAL_X] - observation[START_X], observation[GOAL_Y] - observation[START_Y]
     at_start = max(math.sqrt(across * across + along * along), _NEAREST)
-    observation[6], observation[7] = to_goal_x, to_goal_y
-    observation[8] = floats[FUEL, row] / _TANK
-    observation[9] = math.sqrt(to_goal_x * to_goal_x + to_goal_y * to_goal_y) / at_start
-    observation[12] = _F(integers[TRIP, row]) / _F(settings[TRIPS])
-    observation[13], observation[14] = _F(integers[BOAT, row]), _F(integers[LAST_BOAT, row])
+    observation[_TO_GOAL], observation[_TO_GOAL + 1] = to_goal_x, to_goal_y
+    observation[_FUEL] = floats[FUEL, row] / _TANK
+    observation[_DISTANCE] = math.sqrt(to_goal_x * to_goal_x + to_goal_y * to_goal_y) / at_start
+    observation[_TRIP] = _F(integers[TRIP, row]) / _F(settings[TRIPS])
+    observation[_BOAT], observation[_BOAT + 1] = _F(integers[BOAT, row]), _F(integers[LAST_BOAT, row])
     for key in range(task.NUM_KEYS):
-        observation[15 + key] = ONE if last_key == key else ZERO
-    observation[18] = floats[LAST_DURATION, row] / _LONGEST
-    observation[21] = floats[LAST_SCORE, row] / _SUCCESS
+        observation[_LAST_KEY + key] = ONE if last_key == key else ZERO
+    observation[_LAST_DURATION] = floats[LAST_DURATION, row] / _LONGEST
+    observation[_LAST_SCORE] = floats[LAST_SCORE, row] / _SUCCESS
 
 
 @kernel
