@@ -277,17 +277,10 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
 
         It knows the boats, and with two takes the better one.
         """
-        state, optimum = self.state, []
-        for trip in range(self.options.trips):
-            layout = harbour.sample_layout(self._session_rng(state.episode, trip))
-            fuel = torch.full_like(layout.start_x, task.TANK)
-            shortest = self.options.shortest_press
-            plans = (
-                planner.best_plan(*layout, fuel, *boats, shortest_press=shortest, is_rough=True)
-                for boats in self.known_boats(state)
-            )
-            optimum.append(torch.stack([plan.score for plan in plans]).amax(0))
-        return {"optimum": torch.stack(optimum, -1)}
+        state = self.state
+        boats, shortest = self.known_boats(state), self.options.shortest_press
+        layouts = (harbour.sample_layout(self._session_rng(state.episode, trip)) for trip in range(self.options.trips))
+        return {"optimum": torch.stack([planner.best_scores(layout, boats, shortest) for layout in layouts], -1)}
 
     def final_infos(self, rows: StateArrays) -> dict[str, np.ndarray]:
         """Return `score` and `success`, the share of trips that docked, of sessions `[N]`."""

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor
 
 from hpamdp.env.boatdock import planner
+from hpamdp.env.boatdock.harbour import Layout
 from hpamdp.env.boatdock.planner import MAX_PRESSES, Plan
-from hpamdp.env.boatdock.task import DOCKING_SPEED, GLIDE, speed
+from hpamdp.env.boatdock.task import DOCKING_SPEED, GLIDE, TANK, speed
+from hpamdp.env.boatdock_unseen.fleet import Boats
 
 
 def best_plan(
@@ -66,3 +71,16 @@ def best_plan(
         max_presses=max_presses,
         is_rough=is_rough,
     )
+
+
+def best_scores(layout: Layout, boats: Sequence[Boats], shortest_press: float) -> Tensor:
+    """Return the scores `[N]` of the best plans from the start with a full tank, each with the better one of its boats.
+
+    Args:
+        layout: layouts with fields `[N]`.
+        boats: the boats to choose from, with fields `[N, ...]` each.
+        shortest_press: seconds.
+    """
+    fuel = torch.full_like(layout.start_x, TANK)
+    plans = (best_plan(*layout, fuel, *each, shortest_press=shortest_press, is_rough=True) for each in boats)
+    return torch.stack([plan.score for plan in plans]).amax(0)

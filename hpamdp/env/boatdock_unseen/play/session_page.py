@@ -134,10 +134,6 @@ class SessionPage:
             layout: layouts of the trips, session by session, `[sessions * trips]`.
             numbers: bits of the boats of each session, int32 `[sessions, boats]`.
         """
-        fuel = torch.full_like(layout.start_x, task.TANK)
-        scores = []
-        for bits in numbers.repeat_interleave(self.rules.trips, 0).unbind(-1):
-            boats = fleet.boats(bits, self.options.fleet)
-            plan = planner.best_plan(*layout, fuel, *boats, shortest_press=self.rules.shortest_press, is_rough=True)
-            scores.append(plan.score)
-        return torch.stack(scores).amax(0)
+        of_trips = numbers.repeat_interleave(self.rules.trips, 0)
+        boats = [fleet.boats(bits, self.options.fleet) for bits in of_trips.unbind(-1)]
+        return planner.best_scores(layout, boats, self.rules.shortest_press)
