@@ -1,4 +1,4 @@
-"""Tabulate and draw how agents dock boats that they have never met, by number of the trip, beside people.
+"""Tabulate and draw how agents dock boats that are new to them, by number of the trip, beside people.
 
 python experiments/generalisation/study.py FOLDER...    adds the runs of experiment=generalisation in these folders to
                                                         results.csv, then draws and tabulates
@@ -181,7 +181,7 @@ def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
             if found:
                 label = f"{PLAYERS[player]}, {family}"
                 sessions.plot(trips, [row["score"] for row in found], color=colour, linestyle=line, label=label)
-    sessions.set(xlabel="trip with a boat that was never met", ylim=(-0.2, 3.8))
+    sessions.set(xlabel="trip with a new boat", ylim=(-0.2, 3.8))
     sessions.set_ylabel("mean score of a trip")
     scores = [row["score"] for row in people]
     episodes.plot(range(1, len(scores) + 1), scores, ".", color="#D98200", alpha=0.4, label="mean of 40 people")

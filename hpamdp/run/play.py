@@ -98,7 +98,7 @@ def _page(config: Config, seed: int) -> PlayPage:
 def _agents(
     page: PlayPage, names: Sequence[str] | None, config: Config, settings: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return the named agents in the page's form; those of this package if `names` is None."""
+    """Return the named agents in the page's form; without `names`, those of this package."""
     if page.shows_agents:
         return own_agents(config) if names is None else given_agents(names, config, settings)
     if names is not None and (name := next((each for each in names if each != "none"), None)) is not None:

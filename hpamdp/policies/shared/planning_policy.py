@@ -23,8 +23,7 @@ from hpamdp.specs import PAMDPSpecs
 def plan_ends(batch: TensorDictBase) -> Tensor:
     """Return after which steps of a batch `[*B, T]` no plan goes on, bool `[*B, T]`.
 
-    These are steps that terminate, and those that end a trip: what the next trip begins with is random, so no model can
-    predict it from the step before.
+    A plan stops where an episode terminates or a trip ends. The next trip begins at random, so no model can predict it.
     """
     ends: Tensor = batch["next", keys.TERMINATED] | batch.get(("next", keys.TRIP_ENDED), False)
     return ends.squeeze(-1)
