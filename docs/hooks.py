@@ -10,7 +10,7 @@
   `<!-- rows of experiments/table1/README.md, table 2: hppo -->`: the rows of a study's table by their first cell;
   `<!-- csv experiments/domains/published.csv: domain=platform -->`: the rows of a csv file by a column;
   `<!-- runs experiments/domains/results.csv: learner=pdqn, pdqn_published -->`: a study's runs by a column. Runs that
-  differ only in their seed become one row, mean ± standard deviation.
+  differ only in their seed become one row, mean ± standard deviation. Which runs stand is the rule of the studies.
   `<!-- public names of hpamdp/__init__.pyi -->`: the names with their docstrings.
   `experiments/report.py` also writes the tables of `rows of`, `csv` and `runs` into the pages themselves, up to the
   next `<!-- /table -->`, for readers of a clone. A test compares them with their sources.
@@ -28,7 +28,6 @@ import json
 import logging
 import posixpath
 import re
-import statistics
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -48,8 +47,6 @@ FILLED = re.compile(r"^(<!-- (rows of|csv|runs) (.+?) -->\n)(?:[^<\n].*\n)*<!-- 
 TABLE_MARK = re.compile(r"^<!-- /?table.*-->\n", re.MULTILINE)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".csv": "text", ".toml": "toml", ".cff": "yaml"}
 PICTURES = {".png", ".gif", ".svg"}
-FIRST_SEED = 100  # seeds from here on ran once, as in experiments/domains
-FEWEST_SEEDS = 3  # seeds that a setting needs to be shown, as in hpamdp.analysis.study
 # The columns of runs that are shown, and their heads.
 MEASURED = {"frames": "steps", "score": "score", "success": "success", "cpu_s": "CPU, s"}
 # How a JSON schema's types and bounds are shown.
@@ -426,51 +423,31 @@ def csv_table(words: str) -> str:
 def runs_table(words: str) -> str:
     """Return a table of the runs in a csv file whose column has one of some values, as `PATH: column=value, value`.
 
-    The columns before `seed` tell settings apart; of those after it the table has the means over the seeds.
-    Settings with fewer than `FEWEST_SEEDS` seeds are left out.
+    The columns before `seed` tell settings apart; of those after it the table has the means over the seeds. Runs that
+    do not stand in the tables of studies, and settings with too few seeds, are left out.
     """
+    from hpamdp.analysis.study import FEWEST_SEEDS, groups, spread, standing_rows, with_enough_seeds
+
     path, _, condition = words.partition(": ")
     column, _, values = condition.partition("=")
-    with (ROOT / path).open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        names = list(reader.fieldnames or [])
-        rows = list(reader)
+    rows = standing_rows(ROOT / path)
+    names = list(rows[0]) if rows else []
     if column not in names or "seed" not in names:
         raise SiteError(f"it has no column {column} or no column seed")
     place = names.index("seed")
     measured = [name for name in names[place + 1 :] if name in MEASURED]
     wanted = [value.strip() for value in values.split(",")]
     setting_columns = [name for name in names[:place] if name != column or len(wanted) > 1]
-    settings: dict[tuple[str, ...], list[dict[str, str]]] = {}
-    for row in rows:
-        if row[column] in wanted:
-            settings.setdefault(tuple(row[name] for name in setting_columns), []).append(row)
+    shown = with_enough_seeds([row for row in rows if row[column] in wanted], *setting_columns)
     head = [*(MEASURED.get(name, name) for name in setting_columns), "seeds", *(MEASURED[name] for name in measured)]
     table = [head, ["---"] * len(head)]
-    for setting, same in settings.items():
-        same = scored_once(same)
-        if len({row["seed"] for row in same}) < FEWEST_SEEDS:
-            continue
-        numbers = [f"{int(value):,}" if value.isdecimal() else cell(value) for value in setting]
-        table.append([*numbers, str(len(same)), *(mean_of(same, name) for name in measured)])
+    for setting, same in groups(shown, *setting_columns).items():
+        numbers = [f"{value:,}" if isinstance(value, int) else cell(str(value)) for value in setting]
+        spreads = [spread([row[name] for row in same], 0 if name == "cpu_s" else 3) for name in measured]
+        table.append([*numbers, str(len(same)), *spreads])
     if len(table) == 2:
         return f"No {FEWEST_SEEDS} seeds of it have been run yet."
     return "\n".join(f"| {' | '.join(row)} |" for row in table)
-
-
-def scored_once(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    """Return the runs with seeds that ran once, with frozen settings, or the earlier ones while there are more."""
-    once = [row for row in rows if int(row["seed"]) >= FIRST_SEED]
-    earlier = [row for row in rows if int(row["seed"]) < FIRST_SEED]
-    return once if len(once) >= len(earlier) else earlier
-
-
-def mean_of(rows: list[dict[str, str]], name: str) -> str:
-    """Return mean ± standard deviation of a column, or the one value."""
-    values = [float(row[name]) for row in rows]
-    digits = 0 if name == "cpu_s" else 3
-    spread = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
-    return f"{statistics.fmean(values):.{digits}f}{spread}"
 
 
 DIRECTIVES: dict[str, Callable[[str], str]] = {

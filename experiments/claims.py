@@ -28,7 +28,7 @@ import numpy as np
 from scipy import stats
 from sentences import Claim, compare, uncovered
 
-from hpamdp.analysis.study import Rows, difference, first_at, groups, read_csv, spread, with_enough_seeds
+from hpamdp.analysis.study import Rows, difference, first_at, groups, read_csv, spread, standing_rows, with_enough_seeds
 from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
 from hpamdp.metrics_file import read_rows
 
@@ -617,9 +617,8 @@ def domain_runs() -> tuple[dict[tuple[str, str], Rows], dict[tuple[str, str], li
 
     The curves have an entry for each length of the runs. Domains without published scores have no best one.
     """
-    module = study("domains")
-    planned = module.planned_seeds()
-    stored, evaluations = (module.scored_once(rows(f"domains/{name}.csv"), planned) for name in ("results", "curves"))
+    module, folder = study("domains"), ROOT / "experiments/domains"
+    stored, evaluations = (standing_rows(folder / f"{name}.csv") for name in ("results", "curves"))
     results = groups(module.at_published_steps(stored), "domain", "learner")
     curves: dict[tuple[str, str], list[Rows]] = {}
     for (domain, learner, _), runs in groups(evaluations, "domain", "learner", "frames").items():

@@ -146,11 +146,12 @@ def test_runs_of_a_setting_with_three_seeds_are_one_row_with_their_mean_and_spre
     x = "| x | 2,000 | 3 | 2.000 ± 1.000 | 1.000 ± 0.000 | 40 ± 10 |"
     assert hooks.runs_table("r.csv: domain=a") == f"{head}{x}"
     assert "No 3 seeds" in hooks.runs_table("r.csv: domain=b")
-    fresh = [f"a,x,2000,{seed},5.0,1,40,9" for seed in (100, 101, 102)]
-    (tmp_path / "r.csv").write_text("\n".join([*rows, fresh[0]]) + "\n")
-    assert "2.000 ± 1.000" in hooks.runs_table("r.csv: domain=a")  # while there are fewer fresh ones
+    (tmp_path / "cells.csv").write_text("domain,learner,seeds\na,x,100-103\n")
+    fresh = [f"a,x,2000,{seed},5.0,1,40,9" for seed in range(100, 104)]
+    (tmp_path / "r.csv").write_text("\n".join([*rows, *fresh[:3]]) + "\n")
+    assert "2.000 ± 1.000" in hooks.runs_table("r.csv: domain=a")  # until all that are planned have run
     (tmp_path / "r.csv").write_text("\n".join([*rows, *fresh]) + "\n")
-    assert "| 3 | 5.000 ± 0.000 |" in hooks.runs_table("r.csv: domain=a")
+    assert "| 4 | 5.000 ± 0.000 |" in hooks.runs_table("r.csv: domain=a")
     assert "No 3 seeds" in hooks.runs_table("r.csv: domain=c")
     with pytest.raises(hooks.SiteError, match="no column problem"):
         hooks.runs_table("r.csv: problem=a")

@@ -10,6 +10,7 @@ import pytest
 from scripts import load_script
 
 from hpamdp.analysis.study import (
+    FIRST_PROTOCOL_SEED,
     Run,
     curve,
     difference,
@@ -18,8 +19,10 @@ from hpamdp.analysis.study import (
     interquartile_mean,
     mean_interval,
     middle_half,
+    planned_seeds,
     read_csv,
     spread,
+    standing_rows,
     with_enough_seeds,
     write_tables,
 )
@@ -264,20 +267,43 @@ def test_domains_scores_each_learner_by_its_longest_runs_within_the_published_st
     assert domains.at_published_steps([*allowed, run(1000, 0), run(2_000_000, 0)]) == allowed
 
 
-def test_domains_scores_seeds_that_ran_once_when_all_have_run_and_marks_earlier_ones():
-    domains = study("domains")
+def test_a_cell_stands_with_the_seeds_of_the_protocol_once_all_planned_ones_have_run(tmp_path):
+    domains, csv_file = study("domains"), tmp_path / "results.csv"
+    write_tables(tmp_path, {"results": [_row("pdqn", seed) for seed in (0, 100, 101)] + [_row("hyar", 3)]})
 
-    def run(learner, seed, success):
-        return {"domain": "goal", "learner": learner, "frames": 1000, "seed": seed, "success": success}
+    def standing(**seeds):
+        write_tables(tmp_path, {"cells": [_cell(learner, planned) for learner, planned in seeds.items()]})
+        return standing_rows(csv_file)
 
-    stored = [run("pdqn", 0, 0.9), run("pdqn", 100, 0.6), run("pdqn", 101, 0.8), run("hyar", 3, 0.7)]
-    unfinished = {("goal", "pdqn"): {100, 101, 102}}
-    assert [row["seed"] for row in domains.scored_once(stored, unfinished)] == [0, 3]
-    results = domains.scored_once(stored, {("goal", "pdqn"): {100, 101}})
-    assert [row["seed"] for row in results] == [100, 101, 3]
-    table = domains.table(results, [], [])
+    assert [row["seed"] for row in standing(pdqn="100-102")] == [0, 3], "one planned seed is missing"
+    assert [row["seed"] for row in standing(pdqn="100-101", hyar="100-101")] == [100, 101, 3]
+    assert [row["seed"] for row in standing(hyar="100-101")] == [0, 3], "seeds that nothing plans"
+    table = domains.table(standing(pdqn="100-101"), [], [])
     assert "| 0.700 ± 0.141 (2) |" in table
     assert "| 0.700 (1†) |" in table
+
+
+def _row(learner, seed):
+    success = {100: 0.6, 101: 0.8}.get(seed, 0.7)
+    return {"domain": "goal", "learner": learner, "frames": 1000, "seed": seed, "success": success}
+
+
+def _cell(learner, seeds):
+    return {"domain": "goal", "learner": learner, "seeds": seeds}
+
+
+def test_a_file_of_runs_without_a_plan_beside_it_stands_as_it_is(tmp_path):
+    write_tables(tmp_path, {"results": [_row("pdqn", 0), _row("pdqn", 100)]})
+    assert [row["seed"] for row in standing_rows(tmp_path / "results.csv")] == [0, 100]
+
+
+def test_every_stored_run_of_the_protocol_is_planned():
+    """Tables would leave it out without a word."""
+    planned = planned_seeds(EXPERIMENTS / "domains/cells.csv")
+    stored = [row for row in read_csv(EXPERIMENTS / "domains/results.csv") if row["seed"] >= FIRST_PROTOCOL_SEED]
+    assert stored
+    for row in stored:
+        assert row["seed"] in planned.get((row["domain"], row["learner"]), ()), row
 
 
 def test_domains_says_what_each_learner_was_given_as_its_settings_say():

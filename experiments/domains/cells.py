@@ -13,7 +13,6 @@ that it has stored in results.csv are not made again.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import shlex
 import subprocess
@@ -23,6 +22,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from hpamdp.analysis.study import PLAN_NAME, planned_seeds, read_csv
 from hpamdp.run_files import saved_summary
 
 HERE = Path(__file__).resolve().parent
@@ -36,8 +36,7 @@ def runs(names: Sequence[str]) -> Iterator[tuple[Path, list[str]]]:
     Raises:
         SystemExit: a name is in no row of cells.csv.
     """
-    with (HERE / "cells.csv").open(newline="") as file:
-        cells = list(csv.DictReader(file))
+    cells, planned = read_csv(HERE / PLAN_NAME), planned_seeds(HERE / PLAN_NAME)
     known = {cell["domain"] for cell in cells} | {f"{cell['domain']}/{cell['learner']}" for cell in cells}
     for name in names:
         if name not in known:
@@ -48,8 +47,7 @@ def runs(names: Sequence[str]) -> Iterator[tuple[Path, list[str]]]:
         name = f"{cell['domain']}/{cell['learner']}"
         if names and not {name, cell["domain"]} & {*names}:
             continue
-        first, last = map(int, cell["seeds"].split("-"))
-        for seed in range(first, last + 1):
+        for seed in planned[cell["domain"], cell["learner"]]:
             folder = RUNS / name / str(seed)
             yield (
                 folder,
@@ -68,8 +66,7 @@ def runs(names: Sequence[str]) -> Iterator[tuple[Path, list[str]]]:
 
 def stored_runs() -> set[Path]:
     """Return the folders of the runs whose scores are in results.csv."""
-    with (HERE / "results.csv").open(newline="") as file:
-        return {RUNS / row["domain"] / row["learner"] / row["seed"] for row in csv.DictReader(file)}
+    return {RUNS / row["domain"] / row["learner"] / str(row["seed"]) for row in read_csv(HERE / "results.csv")}
 
 
 def is_finished(folder: Path) -> bool:

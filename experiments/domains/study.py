@@ -10,7 +10,7 @@ python experiments/domains/study.py              draws and tabulates the stored 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter
 
 from hpamdp.analysis.study import (
+    FIRST_PROTOCOL_SEED,
     Rows,
     Run,
     curve,
@@ -30,6 +31,7 @@ from hpamdp.analysis.study import (
     mean_interval,
     read_csv,
     spread,
+    standing_rows,
     with_enough_seeds,
     write_tables,
 )
@@ -56,9 +58,7 @@ FIRST_STEPS = 700  # start of the curves' axes, before any evaluation
 PLANNERS = ("dlpa", "pets")
 AUGMENTED = "_augment"  # follows a learner's name if it learns from steps mapped by the problem's symmetries
 KEY = ("domain", "learner", "frames", "seed")
-# Seeds from here on ran once, with settings that were frozen before. Those of earlier runs informed settings.
-FIRST_SEED = 100
-EARLIER = "†"  # marks the number of earlier seeds
+EARLIER = "†"  # marks the number of seeds before those of the protocol
 
 
 def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
@@ -131,25 +131,6 @@ def merged(stored: Rows, new: Rows) -> Rows:
     )
 
 
-def planned_seeds() -> dict[tuple[str, str], set[int]]:
-    """Return the seeds of cells.csv by domain and learner."""
-    planned = {}
-    for cell in read_csv(HERE / "cells.csv"):
-        first, last = map(int, cell["seeds"].split("-"))
-        planned[cell["domain"], cell["learner"]] = set(range(first, last + 1))
-    return planned
-
-
-def scored_once(results: Rows, planned: Mapping[tuple[str, str], Set[int]]) -> Rows:
-    """Return each learner's runs with seeds that ran once, if all that are planned have run, else its earlier runs."""
-    chosen: Rows = []
-    for cell, rows in groups(results, "domain", "learner").items():
-        once = [row for row in rows if row["seed"] >= FIRST_SEED]
-        is_complete = planned.get(cell, {FIRST_SEED}) <= {row["seed"] for row in once}
-        chosen += once if is_complete else [row for row in rows if row["seed"] < FIRST_SEED]
-    return chosen
-
-
 def at_published_steps(results: Rows) -> Rows:
     """Return each learner's longest runs on each domain that do not exceed the published number of steps."""
     chosen: Rows = []
@@ -197,7 +178,7 @@ def _cell(rows: Rows) -> str:
     if not values:
         return ""
     middle = f", IQM {interquartile_mean(values)[0]:.3f}" if len(values) >= MIN_SEEDS_MIDDLE else ""
-    return f"{spread(values)} ({len(values)}{EARLIER if rows[0]['seed'] < FIRST_SEED else ''}){middle}"
+    return f"{spread(values)} ({len(values)}{EARLIER if rows[0]['seed'] < FIRST_PROTOCOL_SEED else ''}){middle}"
 
 
 def best_table(results: Rows, published: Rows) -> str:
@@ -321,8 +302,7 @@ def main(folders: Sequence[str]) -> None:
         tables = {"results": results, "curves": curves}
         stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in tables}
         write_tables(HERE, {name: merged(stored[name], rows) for name, rows in tables.items()})
-    planned = planned_seeds()
-    stored = (scored_once(read_csv(HERE / f"{name}.csv"), planned) for name in ("results", "curves"))
+    stored = (standing_rows(HERE / f"{name}.csv") for name in ("results", "curves"))
     results, curves = (with_enough_seeds(rows, "domain", "learner", "frames") for rows in stored)
     published = read_csv(HERE / "published.csv")
     references = read_csv(HERE / "references.csv")

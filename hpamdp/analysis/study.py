@@ -23,6 +23,10 @@ Rows = list[dict[str, Any]]
 
 MIN_SEEDS = 10  # smallest number of seeds for an interquartile mean and a bootstrap interval
 FEWEST_SEEDS = 3  # seeds that a cell needs for a place in a table
+# Seeds from here on are those of the protocol: they run once, with settings that were frozen before. Those of earlier
+# runs informed settings.
+FIRST_PROTOCOL_SEED = 100
+PLAN_NAME = "cells.csv"  # beside a file of runs: the seeds that the protocol plans for each domain and learner
 _MOST_FOLDERS = 100_000  # a link may lead to the whole disk
 
 
@@ -131,6 +135,34 @@ def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
     for row in rows:
         found[tuple(row[name] for name in names)].append(row)
     return dict(found)
+
+
+def planned_seeds(path: Path) -> dict[tuple[str, str], range]:
+    """Return the seeds of a plan, whose rows say `100-109`, by domain and learner."""
+    planned = {}
+    for cell in read_csv(path):
+        first, last = map(int, cell["seeds"].split("-"))
+        planned[cell["domain"], cell["learner"]] = range(first, last + 1)
+    return planned
+
+
+def standing_rows(path: Path) -> Rows:
+    """Read the rows of a csv file that stand in tables.
+
+    A plan beside the file, `PLAN_NAME`, names the seeds of the protocol. The rows of a domain and learner are those
+    of the protocol's seeds once all planned ones are in the file, and until then those of the earlier seeds. Without
+    a plan all rows stand.
+    """
+    rows, plan = read_csv(path), path.with_name(PLAN_NAME)
+    if not plan.exists():
+        return rows
+    planned = planned_seeds(plan)
+    standing: Rows = []
+    for cell, of_cell in groups(rows, "domain", "learner").items():
+        ran = {row["seed"] for row in of_cell if row["seed"] >= FIRST_PROTOCOL_SEED}
+        is_complete = cell in planned and ran.issuperset(planned[cell])
+        standing += [row for row in of_cell if (row["seed"] >= FIRST_PROTOCOL_SEED) == is_complete]
+    return standing
 
 
 def with_enough_seeds(rows: Rows, *names: str) -> Rows:
