@@ -14,7 +14,6 @@ in a claim, in `GIVEN` (numbers that are no results of ours) or in `UNSUPPORTED`
 from __future__ import annotations
 
 import functools
-import importlib.util
 import json
 import math
 import re
@@ -24,6 +23,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import modules
 import numpy as np
 from scipy import stats
 from sentences import Claim, compare, uncovered
@@ -116,10 +116,7 @@ def summary(folder: str) -> dict[str, Any]:
 @functools.cache
 def study(name: str) -> ModuleType:
     """Return the module study.py of a study, which knows how to select its rows."""
-    spec = importlib.util.spec_from_file_location(f"study_{name}", ROOT / "experiments" / name / "study.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return modules.load(ROOT / "experiments" / name / "study.py")
 
 
 def page(of_study: str) -> str:

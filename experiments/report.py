@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import base64
 import html
-import importlib.util
 import io
 import mimetypes
 import re
@@ -22,10 +21,10 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from types import ModuleType
 from unittest import mock
 
 import markdown
+import modules
 from matplotlib.figure import Figure
 
 HERE = Path(__file__).resolve().parent
@@ -109,16 +108,8 @@ def page_of(folder: Path, tables: str | None) -> str | None:
 def run(script: Path, figures: Path) -> str:
     """Run `main([])` of a study, return the printed text, and save its figures also as SVG."""
     with redirect_stdout(io.StringIO()) as printed, saved_as_svg_too(figures):
-        _load(script, f"study_{script.parent.name}").main([])
+        modules.load(script).main([])
     return printed.getvalue()
-
-
-def _load(script: Path, name: str) -> ModuleType:
-    """Return a module that lies outside the package."""
-    spec = importlib.util.spec_from_file_location(name, script)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @contextmanager
@@ -198,7 +189,7 @@ def renew_filled(docs: Path) -> list[str]:
     """
     if not (docs / "hooks.py").exists():
         return []
-    hooks = _load(docs / "hooks.py", "site_hooks")
+    hooks = modules.load(docs / "hooks.py")
     failures = []
     for page in sorted(docs.rglob("*.md")):
         text = page.read_text(encoding="utf-8")
@@ -215,7 +206,7 @@ def renew_filled(docs: Path) -> list[str]:
 def differing_sentences(experiments: Path) -> list[str]:
     """Return a line for each number in a page's sentence that differs from the csv files; see claims.py."""
     script = experiments / "claims.py"
-    return _load(script, "claims").differences() if script.exists() else []
+    return modules.load(script).differences() if script.exists() else []
 
 
 def to_html(text: str, folder: Path) -> tuple[str, list[str]]:

@@ -47,7 +47,9 @@ SECOND_TABLE = "| c |\n|---|\n| 3 |"
 
 @pytest.fixture(scope="module")
 def module():
-    return load_script(SCRIPT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(SCRIPT.parent)
+        yield load_script(SCRIPT)
 
 
 @pytest.fixture
@@ -143,7 +145,7 @@ def test_the_exit_code_says_whether_all_studies_worked(module, experiments, monk
     assert capsys.readouterr().err.startswith("sad: FileNotFoundError")
     (experiments / "sad/study.py").write_text(STUDY)
     assert module.main() == 0
-    assert capsys.readouterr().err == "" and "study_fine" not in sys.modules
+    assert capsys.readouterr().err == "" and "fine_study" not in sys.modules
 
 
 def test_tables_of_directives_are_renewed_in_all_pages_and_wrong_ones_are_told(module, tmp_path):
