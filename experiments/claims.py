@@ -30,6 +30,7 @@ from sentences import Claim, compare, uncovered
 
 from hpamdp.analysis.study import Rows, difference, first_at, groups, read_csv, spread, standing_rows, with_enough_seeds
 from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
+from hpamdp.messages import exit_code
 from hpamdp.metrics_file import read_rows
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -1473,4 +1474,4 @@ def main(words: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -27,6 +27,8 @@ import markdown
 import modules
 from matplotlib.figure import Figure
 
+from hpamdp.messages import exit_code
+
 HERE = Path(__file__).resolve().parent
 TABLE = re.compile(
     r"(?P<opening><!-- table(?: (?P<number>\d+) of (?P<study>\w+))? -->\n).*?(?P<closing><!-- /table -->)", re.DOTALL
@@ -247,4 +249,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO, cast
 
@@ -123,6 +123,31 @@ def lost_output() -> OSError | ValueError | None:
     """Return the last error of a write to stdout, if there was one."""
     sys.stdout.flush()
     return getattr(sys.stdout, "error", None)
+
+
+def exit_code(program: Callable[[], int | None]) -> int:
+    """Run a program and return its exit code, or 1 if some of its text could not be written to stdout.
+
+    The program continues without its output. If the disk is full, one line says so. A reader such as `head`, which has
+    seen enough, causes no message.
+
+    Args:
+        program: returns its exit code. None stands for 0.
+    """
+    reopen_standard_streams()
+    with lenient_streams():
+        try:
+            code = program() or 0
+        except SystemExit as stop:
+            if stop.code or lost_output() is None:
+                raise
+            code = 0  # argparse has printed its help
+        error = lost_output()
+        if code or error is None:
+            return code
+        if not isinstance(error, BrokenPipeError):
+            warn(f"stdout: {reason_of(error)}")
+        return 1
 
 
 def say(text: str) -> None:

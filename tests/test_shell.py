@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from hpamdp import cli
 from hpamdp.config.yaml_files import complete_yaml_files
 from hpamdp.files import replacing
-from hpamdp.messages import say
+from hpamdp.messages import exit_code, say
 from hpamdp.run import train
 from hpamdp.search_path import put_working_directory_last
 from hpamdp.shell import for_hydra, path_setting, setting
@@ -352,3 +352,20 @@ def test_the_printed_command_continues_the_run_when_pasted(command, tmp_path, mo
     told = err.partition("continue it with ")[2].partition(", take another")[0]
     code, out, err = command(*shlex.split(told), "total_frames=8", f"hydra.run.dir={for_hydra(folder)}")
     assert code == 0 and "8 frames" in out, err
+
+
+def test_a_script_whose_text_is_lost_says_why_unless_its_reader_has_seen_enough(tmp_path):
+    err = tmp_path / "err.txt"
+    with open("/dev/full", "w") as full:
+        assert forked(_prints, full.fileno(), err) == 1
+    assert err.read_text() == "stdout: No space left on device\n"
+    reader, writer = os.pipe()
+    os.close(reader)
+    assert forked(_prints, writer, err) == 1 and err.read_text() == ""
+    os.close(writer)
+
+
+def _prints(out: int, err: Path) -> None:
+    sys.stdout = open(os.dup(out), "w")  # noqa: SIM115
+    sys.stderr = err.open("w")
+    sys.exit(exit_code(lambda: print("a line")))

@@ -3,10 +3,13 @@
 import json
 import math
 import os
+import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import forked
 from scripts import load_script
 
 from hpamdp.analysis.study import (
@@ -382,3 +385,31 @@ def test_the_table_of_unknown_boats_has_a_column_for_each_head():
     row = dict.fromkeys(study_of.SETTINGS, "x") | {"boats": 2, "sharing": "per_option", "ceiling": 3.0, "cpu_s": 1.0}
     lines = study_of.table([row | numbers | {"seed": seed} for seed in range(3)]).splitlines()
     assert len({line.count("|") for line in lines}) == 1 and "x, x, per option" in lines[-1]
+
+
+def _listed_to(out, err, words):
+    """Print the list of the domains' runs to this stdout, in a process of its own."""
+    os.dup2(err, 2)
+    sys.stdout, sys.stderr = open(out, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+    sys.argv = ["cells.py", *words]
+    runpy.run_path(str(EXPERIMENTS / "domains/cells.py"), run_name="__main__")
+
+
+@pytest.mark.parametrize("words", [["--list"], ["--help"]])
+def test_the_list_of_runs_ends_quietly_when_its_reader_has_seen_enough(tmp_path, words):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with (tmp_path / "err.txt").open("w+") as err:
+        assert forked(_listed_to, writer, err.fileno(), words) == 1
+        err.seek(0)
+        assert err.read() == ""
+    os.close(writer)
+
+
+def test_all_scripts_of_studies_print_to_streams_that_may_close():
+    """Those in `peers` that run other libraries print nothing."""
+    scripts = {script: script.read_text() for script in sorted(EXPERIMENTS.rglob("*.py"))}
+    printing = {script: text for script, text in scripts.items() if "print(" in text and "__main__" in text}
+    assert len(printing) > 30
+    for script, text in printing.items():
+        assert "exit_code(" in text.rpartition('if __name__ == "__main__":')[2], script

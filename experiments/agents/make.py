@@ -13,6 +13,8 @@ from pathlib import Path
 
 import torch
 
+from hpamdp.messages import exit_code
+
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ("policy.pt", "config.yaml", "summary.json")
 # Only training needs the critics, so small ones suffice and make small files.
@@ -94,4 +96,4 @@ def main(words: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -13,6 +13,8 @@ from typing import Any
 
 import yaml
 
+from hpamdp.messages import exit_code
+
 AGENTS = Path(__file__).resolve().parents[2] / "agents"
 # Settings of problems in which agents differ.
 SHOWN_SETTINGS = ("controller", "n")
@@ -54,4 +56,4 @@ def _order(folder: Path) -> tuple[bool, str, int, str]:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from hpamdp.analysis.study import Rows, groups, read_csv, spread, write_tables
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 RUN = HERE.parents[1] / "run.py"
@@ -101,4 +102,4 @@ def main(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from hpamdp.analysis.study import PLAN_NAME, planned_seeds, read_csv
+from hpamdp.messages import exit_code
 from hpamdp.run_files import saved_summary
 
 HERE = Path(__file__).resolve().parent
@@ -114,4 +115,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -26,6 +26,8 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).parent))
 from adapters import Adapter, load
 
+from hpamdp.messages import exit_code
+
 FLOAT64_TOLERANCE = 1e-9
 
 
@@ -167,4 +169,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -36,6 +36,7 @@ from hpamdp.analysis.study import (
     write_tables,
 )
 from hpamdp.figure_style import LEARNER_COLOURS
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 # The domains, with the largest published number of steps and the score: the mean return or the success rate.
@@ -317,4 +318,4 @@ def main(folders: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from hpamdp.analysis.study import Rows, Run, finished, first_at, groups, read_csv, spread, write_tables
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 HUMAN_BLOCKS = HERE.parent / "human" / "blocks.csv"
@@ -204,4 +205,4 @@ def main(folders: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -19,6 +19,7 @@ from hpamdp.analysis.study import Rows, write_tables
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.env.boatdock_unseen.explorer import Explorer
 from hpamdp.env.boatdock_unseen.fleet import FAMILIES
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 SESSIONS = 200
@@ -77,4 +78,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -28,6 +28,7 @@ from hpamdp.analysis.study import (
     write_tables,
 )
 from hpamdp.env.boatdock.reference import HUMAN
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 SETTINGS = (
@@ -215,4 +216,4 @@ def main(folders: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -19,6 +19,7 @@ from typing import Any
 import hpamdp
 from hpamdp.analysis.study import Rows, write_tables
 from hpamdp.env.boatdock.harbour import CONTROLLERS
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 SEEDS = range(3)
@@ -70,4 +71,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -20,6 +20,7 @@ from tqdm import tqdm
 from hpamdp import keys
 from hpamdp.analysis.study import Rows, groups, read_csv, write_tables
 from hpamdp.config.compose import conf_dir, read
+from hpamdp.messages import exit_code
 from hpamdp.run.assemble import acting, assemble, make_env
 
 HERE = Path(__file__).resolve().parent
@@ -152,4 +153,4 @@ def main(arguments: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -30,6 +30,7 @@ from hpamdp.analysis.study import (
     write_tables,
 )
 from hpamdp.env.boatdock.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 # Selectors with context, selectors without context, and references.
@@ -224,4 +225,4 @@ def main(folders: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -24,6 +24,7 @@ from hpamdp.data.human.episodes import score
 from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.reference import OFFSET_EDGES
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 HUMAN, FAINT, INK, CHOICE, PRESSES = "#D98200", "#c9c9c9", "#2b2b2b", "#CC79A7", "#0072B2"
@@ -370,4 +371,4 @@ def main(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -21,6 +21,7 @@ from matplotlib.ticker import EngFormatter
 
 from hpamdp.analysis.study import Rows, Run, curve, difference, finished, groups, read_csv, spread, write_tables
 from hpamdp.figure_style import STYLE
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 PROBLEMS = {"lunar_lander": "Hybrid LunarLander", "gymnasium": "Hybrid-Shoot"}
@@ -161,4 +162,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

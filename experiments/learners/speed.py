@@ -6,6 +6,7 @@ python experiments/learners/speed.py       one thread; prints the table and writ
 from __future__ import annotations
 
 import csv
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -16,6 +17,7 @@ from hydra import compose, initialize_config_dir
 from torchrl.collectors import Collector
 
 from hpamdp.config.compose import conf_dir, read
+from hpamdp.messages import exit_code
 from hpamdp.run.assemble import AssembledRun, assemble
 
 HERE = Path(__file__).resolve().parent
@@ -133,4 +135,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

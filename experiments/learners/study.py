@@ -32,6 +32,7 @@ from hpamdp.analysis.study import (
 )
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.figure_style import LEARNER_COLOURS
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")
@@ -188,4 +189,4 @@ def main(folders: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

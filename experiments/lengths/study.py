@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from hpamdp.analysis.study import Rows, Run, finished, mean_interval, read_csv, spread, write_tables
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent.parent / "examples" / "crossing"))
@@ -106,4 +107,4 @@ def main(folders: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

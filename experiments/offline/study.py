@@ -28,6 +28,7 @@ from hpamdp.analysis.study import (
     write_tables,
 )
 from hpamdp.env.boatdock.reference import HUMAN
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 HUMAN_SCORE = HUMAN["chosen"]["score"]
@@ -171,4 +172,4 @@ def main(folders: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -15,6 +15,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hpamdp.messages import exit_code
+
 FILE = Path(__file__).resolve().parent / "boats.csv"
 FIGURES = (
     "score",
@@ -67,4 +69,4 @@ def main(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -24,6 +24,7 @@ from hpamdp.config.compose import read
 from hpamdp.config.schema import Config
 from hpamdp.env.rooms import rules
 from hpamdp.env.rooms.environment import RoomsEnv
+from hpamdp.messages import exit_code
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run.assemble import AssembledRun, assemble
 from hpamdp.run.train import Trainer
@@ -317,4 +318,4 @@ def main(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -18,6 +18,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from hpamdp.analysis.study import Rows, groups, read_csv, spread, write_tables
 from hpamdp.figure_style import FAINT, INK, LEARNER_COLOURS, STYLE
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 TIMES = (0.1, 0.25, 0.5, 1.0)  # columns of the table, as fractions of the CPU time of training
@@ -143,4 +144,4 @@ def main(arguments: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

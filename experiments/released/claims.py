@@ -5,6 +5,8 @@ Run: python experiments/released/claims.py
 
 from __future__ import annotations
 
+import sys
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -12,6 +14,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.env.boatdock_released import rules as released
 from hpamdp.env.boatdock_released.environment import ReleasedBoatDockEnv
+from hpamdp.messages import exit_code
 
 BOATS = ("congruent", "incongruent")
 LAYOUTS, IDLE = 1_000, 980
@@ -132,7 +135,12 @@ def frozen_layouts() -> None:
         print(f"frozen_layouts={is_frozen}: layouts in 100 episodes of an environment: {len(seen)}")
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Print all claims, each with its numbers."""
     for claim in (frozen_layouts, refuelling, throws, walls, random_presses):
         print(f"# {claim.__name__}")
         claim()
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(main))

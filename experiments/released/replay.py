@@ -21,6 +21,7 @@ from tensordict import TensorDict
 from hpamdp import keys
 from hpamdp.env.boatdock_released.environment import ReleasedBoatDockEnv
 from hpamdp.env.boatdock_released.rules import SUCCESS
+from hpamdp.messages import exit_code
 
 CONTROLLERS = ("incongruent", "congruent")  # as they are numbered in the files
 TOLERANCE = {"float64": 1e-9, "float32": 1e-3}  # relative for numbers beyond 1
@@ -101,4 +102,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

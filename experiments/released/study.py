@@ -18,6 +18,7 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, write_tables
 from hpamdp.figure_style import LEARNER_COLOURS
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")
@@ -118,4 +119,4 @@ def main(folders: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -14,6 +14,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from hpamdp.messages import exit_code
+
 WORDS = [
     "env=gymnasium", "env.entry_point=faulty_environments:Faulty", "env.max_steps=10", "high=none", "low=random",
     "num_envs=2", "steps_per_batch=8", "total_frames=320", "eval.layouts=4", "eval.every=0", "checkpoint_every=32",
@@ -171,4 +173,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parent))
-    main()
+    sys.exit(exit_code(main))

@@ -17,6 +17,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from hostile import data_sets, environments, page_requests, saved_files
 from hostile.case import ACCEPTED, BAD, REFUSED, Case, play
 
+from hpamdp.messages import exit_code
+
 KINDS = ("files", "environments", "data", "requests")
 
 
@@ -60,4 +62,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

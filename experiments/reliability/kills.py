@@ -6,6 +6,7 @@ import argparse
 import csv
 import random
 import shutil
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -13,6 +14,7 @@ from pathlib import Path
 import command_line
 import torch
 
+from hpamdp.messages import exit_code
 from hpamdp.run import checkpoint
 
 COMMON = [
@@ -96,4 +98,4 @@ def kill_and_resume(name: str, folder: Path, whole: Path, moment: float, count: 
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import random
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -12,6 +13,8 @@ from typing import Any
 
 import command_line
 import yaml
+
+from hpamdp.messages import exit_code
 
 CONF = command_line.REPOSITORY / "conf"
 SMALL = ["num_envs=4", "steps_per_batch=2", "total_frames=16", "eval.layouts=4", "eval.every=0"]
@@ -147,4 +150,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

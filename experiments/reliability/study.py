@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hpamdp.analysis.study import read_csv
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 OUTCOMES = ("traceback", "silent", "harm")
@@ -25,4 +26,4 @@ def main(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -23,6 +23,7 @@ from tqdm import tqdm
 from hpamdp.analysis.study import Rows, Run, difference, finished, groups, read_csv, spread, write_tables
 from hpamdp.config.compose import conf_dir
 from hpamdp.env.boatdock.reference import HUMAN
+from hpamdp.messages import exit_code
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_agent, make_env, make_evaluation
 from hpamdp.run.evaluate import Evaluation
@@ -200,4 +201,4 @@ def main(folders: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

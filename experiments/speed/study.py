@@ -26,6 +26,7 @@ from torchrl.collectors import Collector
 
 from hpamdp.analysis.study import Rows, read_csv, write_tables
 from hpamdp.config.compose import conf_dir, read
+from hpamdp.messages import exit_code
 from hpamdp.policies.base import Learner
 from hpamdp.run.assemble import AssembledRun, assemble
 
@@ -177,4 +178,4 @@ def main(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

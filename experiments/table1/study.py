@@ -33,6 +33,7 @@ from hpamdp.analysis.study import (
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised
 from hpamdp.figure_style import LEARNER_COLOURS
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 HUMAN_BLOCKS = HERE.parent / "human" / "blocks.csv"
@@ -394,4 +395,4 @@ def main(folders: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

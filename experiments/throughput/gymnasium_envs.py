@@ -22,6 +22,7 @@ import csv
 import itertools
 import math
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -39,6 +40,7 @@ import hpamdp
 from hpamdp import keys
 from hpamdp.env.decisions import with_decisions
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.messages import exit_code
 
 POOL = 8
 STEPS = 100
@@ -265,4 +267,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

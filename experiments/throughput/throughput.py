@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +37,7 @@ from hpamdp.env.goal.environment import GoalEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.platform.environment import PlatformEnv
+from hpamdp.messages import exit_code
 
 SIZES = (64, 256, 1_024, 16_384, 65_536)
 DOMAIN_SIZES = (1_024, 16_384)
@@ -162,4 +164,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

@@ -21,15 +21,7 @@ from hpamdp.data.human.released_file import FILE_NAME, PATH_VARIABLE, QUIRKS, SH
 from hpamdp.data.human.transitions import transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
-from hpamdp.messages import (
-    lenient_streams,
-    lost_output,
-    one_line,
-    reason_of,
-    reopen_standard_streams,
-    say,
-    warn,
-)
+from hpamdp.messages import exit_code, one_line, say, warn
 
 _USAGE_ERROR = 2
 _INTERRUPTED = 130
@@ -47,20 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: 0 after success, 1 if stdout cannot be written, 2 after an error, 130 after an interrupt. An
         error is printed to stderr in one line.
     """
-    reopen_standard_streams()
-    with lenient_streams():
-        try:
-            code = _main(arguments)
-        except SystemExit as stop:
-            if stop.code or lost_output() is None:
-                raise
-            code = 0  # argparse has printed its help
-        error = lost_output()
-        if code or error is None:
-            return code
-        if not isinstance(error, BrokenPipeError):  # a reader such as `head` has seen enough
-            warn(f"stdout: {reason_of(error)}")
-        return 1
+    return exit_code(lambda: _main(arguments))
 
 
 def _main(arguments: Sequence[str] | None) -> int:
