@@ -36,7 +36,7 @@ from .run.callbacks import Callback as Callback
 from .run.callbacks import OwnMetrics as OwnMetrics
 from .run.callbacks import Patience as Patience
 from .run.callbacks import TimeLimit as TimeLimit
-from .run.train import DivergedError as DivergedError
+from .run.trainer import DivergedError as DivergedError
 from .specs import PAMDPSpecs as PAMDPSpecs
 
 __version__: str

@@ -18,7 +18,7 @@ from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.policies.base import Learner
 from hpamdp.run.assemble import AssembledRun, assemble
-from hpamdp.run.train import Trainer
+from hpamdp.run.trainer import Trainer
 
 QUICK_CRITIC = ["high=meta_critic", "high.warmup_decisions=0", "high.updates_per_decision=0.2", "high.batch_size=16"]
 

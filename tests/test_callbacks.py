@@ -25,7 +25,8 @@ from hpamdp.run.continuation import rest_of
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.players import load_player
 from hpamdp.run.recorder import Recorder
-from hpamdp.run.train import Trainer, begin, run
+from hpamdp.run.train import begin, run
+from hpamdp.run.trainer import Trainer
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=320", "eval.layouts=4", "eval.every=32", "low=random"]
 PLATFORM = [*SMALL[:-1], "env=platform", "high=none", "low=hppo", "low.minibatch_size=8", "low.hidden_dims=[8]"]

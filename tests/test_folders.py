@@ -20,7 +20,8 @@ from hpamdp.run import checkpoint
 from hpamdp.run.folder import locked, moved_aside
 from hpamdp.run.loggers import TensorboardLogger
 from hpamdp.run.recorder import Recorder
-from hpamdp.run.train import Trainer, run
+from hpamdp.run.train import run
+from hpamdp.run.trainer import Trainer
 from hpamdp.run_files import CONFIG_NAME
 
 TINY = ["num_envs=8", "steps_per_batch=4", "total_frames=128", "log_every=32", "eval.layouts=4", "eval.every=0"]

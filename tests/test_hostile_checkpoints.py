@@ -22,7 +22,8 @@ from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.single import SingleCollection
 from hpamdp.run.players import load_player
 from hpamdp.run.tensor_archive import TensorArchive
-from hpamdp.run.train import DivergedError, Trainer, run
+from hpamdp.run.train import run
+from hpamdp.run.trainer import DivergedError, Trainer
 
 TINY = ["num_envs=4", "steps_per_batch=4", "total_frames=192", "eval.layouts=2", "eval.every=0", "log_every=1000"]
 # A learner with waiting rows under a selector with a replay.

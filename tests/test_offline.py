@@ -22,7 +22,8 @@ from hpamdp.policies.low_level.bc import BC
 from hpamdp.policies.low_level.iql import IQL
 from hpamdp.policies.low_level.td3_bc import TD3BC
 from hpamdp.run.assemble import assemble
-from hpamdp.run.train import Trainer, run
+from hpamdp.run.train import run
+from hpamdp.run.trainer import Trainer
 from hpamdp.specs import PAMDPSpecs
 
 ALL = {"complete": False, "successes": False, "best_people": None, "checksum": None}

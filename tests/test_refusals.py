@@ -195,7 +195,7 @@ def test_memory_that_does_not_suffice_during_training_is_told_in_one_line(error,
     def train(self):
         raise error
 
-    monkeypatch.setattr("hpamdp.run.train.Trainer.train", train)
+    monkeypatch.setattr("hpamdp.run.trainer.Trainer.train", train)
     with pytest.raises(
         ConfigError, match=r"^num_envs=4, .*eval\.layouts=4, .*: the run takes more memory than there is"
     ):

@@ -26,7 +26,8 @@ from hpamdp.messages import LenientStream, warn
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.run import checkpoint
 from hpamdp.run.folder import is_about_folder
-from hpamdp.run.train import DIVERGED_NAME, run
+from hpamdp.run.train import run
+from hpamdp.run_files import DIVERGED_NAME
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=512", "eval.layouts=4", "eval.every=0", "high=ucb"]
 PROGRAM = ["run.py", "num_envs=8", "steps_per_batch=4", "eval.layouts=4", "low=random"]

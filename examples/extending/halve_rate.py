@@ -10,7 +10,7 @@ import torch
 from pydantic import PositiveInt
 
 from hpamdp.run.callbacks import Callback
-from hpamdp.run.train import Trainer
+from hpamdp.run.trainer import Trainer
 from hpamdp.settings import Settings
 
 

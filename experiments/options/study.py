@@ -27,7 +27,7 @@ from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.messages import exit_code
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run.assemble import AssembledRun, assemble
-from hpamdp.run.train import Trainer
+from hpamdp.run.trainer import Trainer
 
 HERE = Path(__file__).resolve().parent
 CONF = HERE.parent.parent / "conf"

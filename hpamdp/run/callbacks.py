@@ -21,7 +21,7 @@ from hpamdp.run_files import BEST_NAME
 from hpamdp.settings import SettingError, Settings
 
 if TYPE_CHECKING:
-    from hpamdp.run.train import Trainer
+    from hpamdp.run.trainer import Trainer
 
 SCORE = "eval/score"
 _RAISED_BY = "_raised_by_callback"  # attribute of an error

@@ -1,0 +1,429 @@
+"""The training loop: collect a batch, learn, log, evaluate and save."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDictBase
+from tqdm import tqdm
+
+from hpamdp import keys
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.schema import Config
+from hpamdp.files import replacing
+from hpamdp.messages import LenientStream, first_line, warn
+from hpamdp.policies.base import Learner
+from hpamdp.run import checkpoint
+from hpamdp.run.assemble import AssembledRun
+from hpamdp.run.callbacks import Callback, CallbackError, metrics_of, mistakes_explained, named, states_of
+from hpamdp.run.collection.base import Collection
+from hpamdp.run.folder import mark_unfinished, moved_aside
+from hpamdp.run.recorder import Recorder
+from hpamdp.run.state_checks import check_numbers, example_steps
+from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
+from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME
+
+_UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
+
+
+class DivergedError(Exception):
+    """Raised if a reward, a loss or a weight is not finite."""
+
+
+class Trainer:
+    """The training loop and its progress.
+
+    A frame is the unit of a run's length: a step, a decision with frozen learners, or an update with `mode=offline`.
+
+    Args:
+        config: config of the run.
+        parts: parts of the run.
+        output_dir: folder of the run. If None, the run writes nothing.
+        callbacks: called during training.
+
+    Attributes:
+        frames: frames so far.
+        wall_s, cpu_s: wall time and CPU time of training so far.
+        last_score: score of the last evaluation; None before the first one.
+        stop_reason: why a callback has ended training; empty if none has, or if it gave no reason.
+        resumed_from: folder of the run that is continued, if any.
+        shows_progress: whether a bar on stderr shows the progress.
+    """
+
+    shows_progress = True
+
+    def __init__(
+        self,
+        config: Config,
+        parts: AssembledRun,
+        output_dir: Path | None = None,
+        callbacks: Sequence[Callback] = (),
+    ) -> None:
+        self.config = config
+        self.parts = parts
+        self.output_dir = output_dir
+        self.callbacks = named(callbacks)
+        self._states_of_callbacks = states_of(self.callbacks)
+        self.recorder = Recorder(config, parts, output_dir)
+        self._is_stopped = False
+        self.stop_reason = ""
+        self.resumed_from: Path | None = None
+        self.frames = 0
+        self.wall_s = 0.0
+        self.cpu_s = 0.0
+        self.last_score: float | None = None
+        self._saved: checkpoint.Saved | None = None  # what a resumed run continues from
+        self.unit = " steps"
+        if config.run.mode == "offline":
+            self.unit = " updates"
+        elif config.run.low.freeze:
+            self.unit = " decisions"
+
+    def restore(self, source: Path) -> None:
+        """Load the agent from a checkpoint, and the state of its run if training continues."""
+        is_training = self.config.run.mode != "eval"
+        agent, env = self.parts.agent, self.parts.env
+        steps = example_steps(env, self.parts.policy) if is_training else None
+        saved = checkpoint.load(source, agent, self.parts.device, with_training=is_training, steps=steps)
+        progress = saved.progress
+        self.frames = progress["frames"]
+        self.wall_s = progress["wall_s"]
+        self.cpu_s = progress["cpu_s"]
+        self.last_score = progress["last_score"]
+        if not is_training:
+            saved.set_statistics(env)
+            return
+        self.resumed_from = source.parent
+        self.recorder.resume_from(source.parent, self.frames)
+        try:
+            self.recorder.set_state(saved.states["recorder"])
+            self._restore_callbacks(saved.states.get("callbacks", {}))
+        except ValueError as error:
+            raise ConfigError(f"{source}: does not fit this run ({first_line(error)})") from error
+        self._saved = saved
+
+    def _restore_callbacks(self, states: Mapping[str, Any]) -> None:
+        """Set the saved states of callbacks. A callback without a saved state begins as in a new run.
+
+        Raises:
+            ValueError: a state is of another callback, or holds invalid numbers.
+        """
+        for name, callback in self.callbacks.items():
+            if name in states:
+                check_numbers(name, states[name], self._states_of_callbacks[name])
+                callback.set_state(states[name])
+        dropped = [name for name, state in states.items() if state and name not in self.callbacks]
+        if dropped:
+            warn(f"the checkpoint holds the state of {', '.join(dropped)}, but this run has no such callback")
+
+    def start(self, *, is_own: bool) -> None:
+        """Write the config and start the logger, if the run has a folder.
+
+        These are the first writes, so everything must be checked and built.
+
+        Args:
+            is_own: whether the folder holds the continued run. Otherwise an earlier run there is deleted.
+
+        Raises:
+            ConfigError: the logger refuses its settings; the folder stays as it was.
+        """
+        if self.output_dir is None:
+            return
+        if is_own:
+            self.recorder.start()
+            self._write_config(self.output_dir)
+            mark_unfinished(self.output_dir)
+            return
+        self.output_dir.mkdir(parents=True, exist_ok=True)
+        with moved_aside(self.output_dir):
+            self._write_config(self.output_dir)
+            self.recorder.start()
+
+    def _write_config(self, folder: Path) -> None:
+        with replacing(folder / CONFIG_NAME) as partial:
+            partial.write_text(self.config.to_yaml())
+
+    def stop(self, reason: str = "") -> None:
+        """End training after the current batch. The run counts as finished.
+
+        Args:
+            reason: shown after the closing table.
+        """
+        self._is_stopped = True
+        self.stop_reason = reason
+
+    def finish(self, *, is_finished: bool = True) -> str:
+        """Evaluate the agent, write what the run has found, and return the closing table as text.
+
+        Args:
+            is_finished: whether training reached its end.
+        """
+        return self.recorder.finish(self.frames, self.wall_s, self.cpu_s, is_finished=is_finished)
+
+    def train(self) -> bool:
+        """Train until `num_frames`, `eval.stop_score` or a callback ends it, and save the agent.
+
+        Returns whether a signal stopped it before.
+
+        A signal takes effect between two batches, so that the saved state equals that of an uninterrupted run.
+
+        Raises:
+            DivergedError: a reward, a loss or a weight is not finite. Nothing has been saved since.
+            CallbackError: a callback returned a value that cannot be recorded. The agent has been saved.
+        """
+        with stop_on_signals() as request:
+            collection: Collection = self.config.collector.build(
+                config=self.config, parts=self.parts, frames=self.frames
+            )
+            try:
+                self.continue_run(collection)
+                self._loop(collection, request)
+            except KeyboardInterrupt:  # the second signal, perhaps in the middle of an update
+                self.recorder.forget_evaluation()
+            except CallbackError:
+                self._save_and_close(collection)
+                raise
+            except (DivergedError, ConfigError):
+                collection.close()
+                raise
+            except BaseException:  # such as a dead worker; the agent is saved before the run fails
+                self._save_and_close(collection)
+                raise
+            try:
+                self._call(lambda callback: callback.on_end(self))
+            finally:
+                self._save_and_close(collection)
+            return not self._is_over()
+
+    def _call(self, act: Callable[[Callback], None]) -> None:
+        for name, callback in self.callbacks.items():
+            with mistakes_explained(name):
+                act(callback)
+
+    def _save_and_close(self, collection: Collection) -> None:
+        """Save first, uninterrupted and without any output, then close the collection."""
+        with signals_ignored():
+            try:
+                self.save(collection)
+            finally:
+                collection.close()
+
+    def continue_run(self, collection: Collection) -> None:
+        """Restore the saved state of the collection and the random generators, if there is one."""
+        if self._saved is None:
+            return
+        state, generators = self._saved.states["collection"], self._saved.generators
+        try:
+            collection.set_state(state)
+        except (ValueError, RuntimeError, KeyError) as error:
+            raise ConfigError(f"{self._saved.file}: {first_line(error)}") from error
+        assert generators is not None
+        checkpoint.set_generators(generators)
+
+    def _loop(self, collection: Collection, request: StopRequest) -> None:
+        run = self.config.run
+        wall_before = self.wall_s - time.perf_counter()
+        cpu_before = self.cpu_s - time.process_time()
+        saved_at = time.monotonic()
+
+        def take_time() -> None:
+            self.wall_s = wall_before + time.perf_counter()
+            self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
+
+        bar = tqdm(
+            total=run.num_frames,
+            initial=self.frames,
+            unit=self.unit,
+            unit_scale=True,
+            mininterval=1.0,
+            file=LenientStream(sys.stderr),
+            disable=not self.shows_progress,
+        )
+        for learner in self.parts.agent.learners:
+            assert isinstance(learner, Learner)
+            learner.while_compiling = partial(_said_by, bar, "compiling the updates")
+        with bar:
+            self._call(lambda callback: callback.on_start(self))
+            if self.last_score is None and self.frames == 0:
+                self._evaluate(bar)
+                if self.parts.data is not None:
+                    self.parts.agent.add_demonstrations(self.parts.data.batch, self.parts.data.decisions)
+            while not self._is_over() and request.signal is None:
+                try:
+                    num = self._learn(collection)
+                finally:
+                    _tell_notices(collection, bar)
+                last = self.frames
+                self.frames += num
+                take_time()
+                bar.update(num)
+                self._call(lambda callback: callback.on_batch(self))
+                if self._is_over() or _is_due(last, self.frames, run.eval_every):
+                    self._evaluate(bar)
+                elif _is_due(last, self.frames, run.log_every):
+                    own = metrics_of(self.callbacks, self)
+                    self.recorder.log(self.frames, self.wall_s, is_evaluated=False, own=own)
+                is_time = run.checkpoint_minutes > 0.0 and time.monotonic() - saved_at > 60.0 * run.checkpoint_minutes
+                if not self._is_over() and (is_time or _is_due(last, self.frames, run.checkpoint_every)):
+                    self.save(collection)
+                    saved_at = time.monotonic()
+            take_time()
+
+    def _learn(self, collection: Collection) -> int:
+        """Let the agent learn from a batch of steps or from the data set, and return the number of frames.
+
+        Raises:
+            DivergedError: a reward or a loss is not finite.
+        """
+        if self.config.run.mode == "offline":
+            run = self.config.run
+            to_next_row = [every - self.frames % every for every in (run.eval_every, run.log_every) if every > 0]
+            num = min(_UPDATES_A_TURN, run.num_frames - self.frames, *to_next_row)
+            scalars = self.parts.agent.update(num)
+            check_scalars(scalars)
+            self.recorder.take(None, scalars)
+            return num
+        batch = collection.next()
+        check_rewards(batch)
+        scalars = self.parts.agent.learn(batch)
+        check_scalars(scalars)
+        self.recorder.take(batch, scalars)
+        return batch.numel()
+
+    def _is_over(self) -> bool:
+        stop_score, last_score = self.config.run.eval.stop_score, self.last_score
+        is_reached = stop_score is not None and last_score is not None and last_score >= stop_score
+        return self._is_stopped or is_reached or self.frames >= self.config.run.num_frames
+
+    def _evaluate(self, bar: tqdm) -> None:
+        own = metrics_of(self.callbacks, self)
+        row = self.recorder.log(self.frames, self.wall_s, is_evaluated=True, own=own)
+        success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
+        self.last_score = row["eval/score"]
+        bar.set_postfix_str(f"score {self.last_score:.2f}{success}")
+        self._call(lambda callback: callback.on_evaluation(self, row))
+
+    def save(self, collection: Collection) -> None:
+        """Write the checkpoint and the file with only the networks, if the run has a folder.
+
+        Raises:
+            DivergedError: a weight is not finite, or another number is NaN.
+            CallbackError: a callback has a state that cannot be saved. Everything else is saved.
+        """
+        self.check_weights()
+        if self.output_dir is None:
+            return
+        try:
+            self._states_of_callbacks = states_of(self.callbacks)
+        finally:  # an error in a callback's code costs no training
+            self._write_checkpoint(self.output_dir, collection)
+
+    def check_weights(self) -> None:
+        """Check the numbers of the agent.
+
+        Raises:
+            DivergedError: a weight is not finite, or another number is NaN.
+        """
+        for name, weight in self.parts.agent.named_parameters():
+            if not weight.isfinite().all():
+                raise DivergedError(f"{name} is {'NaN' if weight.isnan().any() else 'inf'}")
+        for name, value in self.parts.agent.state_dict().items():
+            if isinstance(value, torch.Tensor) and value.is_floating_point() and value.isnan().any():
+                raise DivergedError(f"{name} is NaN")
+
+    def _write_checkpoint(self, folder: Path, collection: Collection) -> None:
+        with_replay = self.config.run.checkpoint_replay
+        states = {
+            "collection": collection.state(),
+            "recorder": self.recorder.state(),
+            "callbacks": self._states_of_callbacks,
+        }
+        file = folder / checkpoint.FILE_NAME
+        checkpoint.save(file, self.parts.agent, states, self.progress(), with_replay=with_replay)
+        self.save_policy(folder / POLICY_NAME)
+
+    def save_policy(self, file: Path) -> None:
+        """Write the networks, and the scale of the observations, to a file that `hpamdp.load` reads."""
+        checkpoint.save_policy(file, self.parts.agent, self.parts.env.base_env, self.progress())
+
+    def load_policy(self, file: Path) -> None:
+        """Give the agent the networks, and the environment the scale of the observations, from such a file."""
+        saved = checkpoint.load(file, self.parts.agent, self.parts.device, with_training=False)
+        saved.set_statistics(self.parts.env.base_env)
+        self.recorder.forget_evaluation()
+
+    def keep_for_inspection(self) -> str:
+        """Save the current agent beside the last good checkpoint, and return a message about both files."""
+        if self.output_dir is None:
+            return "the run has no folder, so nothing is kept"
+        file = self.output_dir / DIVERGED_NAME
+        checkpoint.save(file, self.parts.agent, {}, self.progress(), with_replay=False)
+        good = self.output_dir / checkpoint.FILE_NAME
+        kept = f"the last good checkpoint is {good}" if good.is_file() else "there is no checkpoint from before"
+        return f"{kept}; the agent as it is now is in {file}"
+
+    def progress(self) -> dict[str, Any]:
+        """Return what a saved agent tells of its run, as JSON values."""
+        return {
+            "config": self.config.to_dict(),
+            "option_names": list(self.parts.agent.specs.option_names),
+            "config_dirs": list(self.config.config_dirs),
+            "frames": self.frames,
+            "wall_s": self.wall_s,
+            "cpu_s": self.cpu_s,
+            "last_score": self.last_score,
+        }
+
+
+def check_rewards(batch: TensorDictBase) -> None:
+    """Check the rewards of a batch `[*B, T]` and their sums.
+
+    Raises:
+        DivergedError: a reward or a sum is not finite.
+    """
+    for key in (keys.REWARD, keys.EPISODE_RETURN):
+        value = cast(torch.Tensor, batch.get(("next", key)))
+        is_finite = value.isfinite()
+        if not is_finite.all():
+            place = (~is_finite).nonzero()[0]
+            raise DivergedError(f"{key} is {value[tuple(place)].item()} in environment {int(place[0])}")
+
+
+def check_scalars(scalars: Mapping[str, float]) -> None:
+    """Check the values that the agent returned from learning.
+
+    Raises:
+        DivergedError: a value is not finite.
+    """
+    for name, value in scalars.items():
+        if not math.isfinite(value):
+            raise DivergedError(f"{name} is {value}")
+
+
+@contextmanager
+def _said_by(bar: tqdm, text: str) -> Iterator[None]:
+    """Show a text before the bar while the block runs."""
+    bar.set_description_str(text)
+    try:
+        yield
+    finally:
+        bar.set_description_str(None)
+
+
+def _tell_notices(collection: Collection, bar: tqdm) -> None:
+    for notice in collection.notices():
+        bar.clear()
+        warn(notice)
+
+
+def _is_due(before: int, now: int, every: int) -> bool:
+    """Return whether a multiple of `every` was passed; False if `every` is 0."""
+    return every > 0 and now // every > before // every
