@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from hpamdp.env.boatdock_unseen import fleet, rules
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.env.boatdock_unseen.fleet import FleetRules
 from hpamdp.env.boatdock_unseen.registration import UNSEEN_BOATS_IDS
+from hpamdp.run.evaluate import Evaluation
 from hpamdp.settings import SettingError
 
 every_family = pytest.mark.parametrize("family", fleet.FAMILIES)
@@ -379,3 +382,12 @@ def test_impossible_sessions_are_refused_in_one_line(settings, message):
     with pytest.raises(SettingError, match=message) as raised:
         UnseenBoatsEnv(1, **settings)
     assert "\n" not in str(raised.value)
+
+
+def test_scores_say_whether_they_are_of_a_trip_or_of_a_boat():
+    env = UnseenBoatsEnv(2, boats=2, trips=3)
+    trips = {"trip_score": np.ones((2, 3)), "trip_presses": np.ones((2, 3)), "optimum": np.ones((2, 3))}
+    played = {"score": np.ones(2), "option": np.zeros(2, int), "option_scores": np.ones((2, 2)), **trips}
+    means = Evaluation.measure(SimpleNamespace(env=env), played)
+    scores = {name for name in means if name.startswith("score_")}
+    assert scores == {"score_trip_1", "score_trip_2", "score_later", "score_boat_1", "score_boat_2"}

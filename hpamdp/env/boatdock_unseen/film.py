@@ -13,7 +13,6 @@ from hpamdp.env.boatdock import film as boat_film
 from hpamdp.env.boatdock import physics, task
 from hpamdp.env.boatdock.film import Engine
 from hpamdp.env.boatdock_unseen import fleet
-from hpamdp.env.boatdock_unseen.options import BOAT_NAMES
 from hpamdp.env.boatdock_unseen.rules import SessionRules, SessionState
 
 
@@ -50,7 +49,7 @@ def _trip(
     own = fleet.boats(states[0].second_boat if boat == 1 else states[0].first_boat, rules.fleet)
     degrees = torch.rad2deg(torch.atan2(own.directions[0, :, 1], own.directions[0, :, 0])).tolist()
     name = f"trip {int(states[0].trip) + 1} of {rules.trips}"
-    name += f", {BOAT_NAMES[boat]} boat" if num_boats > 1 else ""
+    name += f", boat {boat + 1}" if num_boats > 1 else ""
     shown = task.Rules(boats=task.Boats((name,), (tuple(degrees),)))
     track = [_as_boat(states[0])]
     for after in states[1:]:

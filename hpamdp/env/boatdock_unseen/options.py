@@ -14,7 +14,7 @@ from hpamdp.env.facts import ProblemFacts
 from hpamdp.settings import Settings
 
 MOST_TRIPS = 24
-BOAT_NAMES = ("first", "second")
+BOAT_NAMES = ("boat_1", "boat_2")
 
 
 class UnseenBoatsOptions(Settings):
