@@ -22,6 +22,7 @@ PLAYERS = {
     "moving": ["agents/hppo_moving"],
     "sliding": ["agents/hppo_sliding"],
     "rooms": ["agents/meta_critic_hppo_rooms"],
+    "office": ["env=office", "high=none", "low=planner"],
     "lunar_lander": ["agents/hppo_lunar_lander", "env.render=true"],
 }
 

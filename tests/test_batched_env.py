@@ -23,14 +23,16 @@ from hpamdp.env.batched_env import GOING_ON, BatchedEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
+from hpamdp.env.office.environment import OfficeEnv
 from hpamdp.env.platform import rendering
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.specs import PAMDPSpecs
 
 POINTS = [CatchPointEnv, HardMoveEnv, MovingEnv, SlidingEnv]
-PROBLEMS = [PlatformEnv, *POINTS]
+PROBLEMS = [PlatformEnv, OfficeEnv, *POINTS]
 IDS = {
     "hpamdp/Platform-v0": PlatformEnv,
+    "hpamdp/Office-v0": OfficeEnv,
     "hpamdp/CatchPoint-v0": CatchPointEnv,
     **{f"hpamdp/HardMove{n}-v0": HardMoveEnv for n in (4, 6, 8)},
     "hpamdp/Moving-v0": MovingEnv,
@@ -312,7 +314,9 @@ def test_gymnasiums_checker_finds_nothing(env_id):
     assert [str(w.message) for w in caught if RECOMMENDATION not in str(w.message)] == []
 
 
-@pytest.mark.parametrize("env_id", ["hpamdp/CatchPoint-v0", "hpamdp/Moving-v0", "hpamdp/Platform-v0"])
+@pytest.mark.parametrize(
+    "env_id", ["hpamdp/CatchPoint-v0", "hpamdp/Moving-v0", "hpamdp/Office-v0", "hpamdp/Platform-v0"]
+)
 def test_a_adapter_plays_as_the_environment_does(env_id):
     adapter, env = gymnasium.make(env_id), IDS[env_id](1)
     env.set_seed(4, static_seed=True)
@@ -383,7 +387,8 @@ def test_bad_actions_and_options_of_a_adapter_are_refused_in_one_line():
 
 
 @pytest.mark.parametrize(
-    "env_id", ["hpamdp/Platform-v0", "hpamdp/CatchPoint-v0", "hpamdp/HardMove4-v0", "hpamdp/Sliding-v0"]
+    "env_id",
+    ["hpamdp/Platform-v0", "hpamdp/Office-v0", "hpamdp/CatchPoint-v0", "hpamdp/HardMove4-v0", "hpamdp/Sliding-v0"],
 )
 def test_a_picture_shows_the_progress_of_the_episode(env_id):
     adapter = gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True)

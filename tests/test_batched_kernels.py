@@ -15,6 +15,7 @@ from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
+from hpamdp.env.office.environment import OfficeEnv
 from hpamdp.env.platform.environment import PlatformEnv
 
 GOAL = {
@@ -53,6 +54,15 @@ PROBLEMS = {
     ),
     "moving": (MovingEnv, {"max_steps": st.sampled_from([3, 201])}, 1e-5),
     "sliding": (SlidingEnv, {"max_steps": st.sampled_from([3, 201])}, 1e-4),
+    "office": (
+        OfficeEnv,
+        {
+            "slip": st.sampled_from([0.0, 0.1, 1.0]),
+            "chooses_goal": st.booleans(),
+            "max_steps": st.sampled_from([3, 400]),
+        },
+        1e-5,
+    ),
 }
 
 

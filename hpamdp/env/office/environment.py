@@ -1,0 +1,170 @@
+"""Office as a batched TorchRL environment: fetch coffee and mail, then bring both to a target.
+
+Source: the Office domain of PEARL, AAAI 2026, arXiv:2512.20831; see `hpamdp.env.office.rules`, also for the
+differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from pydantic import PositiveInt
+from torch import Tensor
+from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
+
+from hpamdp import keys
+from hpamdp.env import counter_rng
+from hpamdp.env.batched_env import Action, BatchedEnv
+from hpamdp.env.counter_rng import RngKey
+from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.office import kernel, player, rendering, rules
+from hpamdp.env.office.rules import OfficeState
+from hpamdp.env.state_columns import check_range
+from hpamdp.settings import Fraction, Settings
+
+# Expected return and success of the player that knows the map, with the default settings.
+_PLAYER = {"score": 956.4, "success": 1.0}
+
+
+class OfficeOptions(Settings):
+    """Settings of `OfficeEnv`. The defaults are the source's rules."""
+
+    max_steps: PositiveInt = 400
+    """Steps after which an episode is truncated."""
+    slip: Fraction = 0.1
+    """Probability that a move slips to the other axis."""
+    chooses_goal: bool = False
+    """Whether the agent chooses what it goes for next, as an option: coffee, mail or target. It takes nothing else.
+
+    A goal is open while the agent lacks it; the target is open once it has both. `option_mask` says which ones are.
+    An agent that has reached its goal and still holds the option goes for the first open one.
+    """
+
+
+class OfficeEnv(BatchedEnv[OfficeState]):
+    """Fetch coffee and mail and deliver both in `num_envs` offices at once.
+
+    Action leaves: `("action", "discrete")` int64 `[N]`: 0 up, 1 down, 2 left, 3 right; `("action", "parameters")`
+    float32 `[N, 4]`: the length of each move with its sign, in [-0.05, 0] for up and left, in [0, 0.05] for down and
+    right; with `chooses_goal` also `option` int64 `[N]`: 0 coffee, 1 mail, 2 target. Only the parameter of the chosen
+    action counts; outside its bounds it is clipped, NaN and infinity are refused.
+
+    A move costs 1, and one that is refused, because it would touch a wall, costs 2. Taking coffee or mail costs
+    nothing. The delivery is rewarded with 1000 and terminates the episode.
+
+    Only the slips are random. If `oracle` is true, the environment writes the action of `hpamdp.env.office.player`
+    under `oracle` (`discrete`, `parameters` `[N, 1]`, or `[N, 3]` with an action for each option). For the
+    constructor's other arguments and errors see `BatchedEnv`.
+    """
+
+    Options = OfficeOptions
+    options: OfficeOptions
+    discrete_names = rules.ACTIONS
+    outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
+    observation_names = rules.OBSERVATION_NAMES
+    parameter_dims = (1, 1, 1, 1)
+    parameter_low = rules.PARAMETER_LOW
+    parameter_high = rules.PARAMETER_HIGH
+    row_kernel = staticmethod(kernel.advance)
+    choice_setting: ClassVar[str] = "env.chooses_goal=true"
+    no_choice_setting: ClassVar[str] = "env.chooses_goal=false"
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        options: OfficeOptions | None = None,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+        oracle: bool = False,
+        **settings: Any,
+    ) -> None:
+        self._has_oracle = oracle
+        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
+
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem; options to begin with are the axes."""
+        if options.chooses_goal:
+            return ProblemFacts(title=cls.__name__, option_names=rules.GOALS, has_choice=True, has_oracle=True)
+        axes = {"upright": ["up", "down"], "level": ["left", "right"]}
+        return ProblemFacts(title=cls.__name__, default_options=axes, has_oracle=True)
+
+    def kernel_settings(self) -> Sequence[float]:
+        """Return the probability of a slip."""
+        return [self.options.slip]
+
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[4]` each."""
+        return [-1.0] * len(self.observation_names), [1.0] * len(self.observation_names)
+
+    @property
+    def position(self) -> Tensor:
+        """The agents' positions, `[N, 2]`."""
+        return torch.stack([self.state.x, self.state.y], -1)
+
+    def start(self, episode: Tensor, rng: RngKey) -> OfficeState:
+        """Return the states at the start, with neither coffee nor mail; nothing about them is random."""
+        return rules.start(episode)
+
+    def act(self, state: OfficeState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[OfficeState, Tensor]:
+        """Return the states after one move and the rewards `[N]`."""
+        slips = counter_rng.uniform(rng, state.steps) < self.options.slip
+        return rules.act(state, action.discrete, action.parameters.squeeze(-1), slips, action.option)
+
+    def observe(self, state: OfficeState) -> Tensor:
+        """Return the observations `[N, 4]`."""
+        return rules.observe(state)
+
+    def scripted_action(self, state: OfficeState) -> tuple[Tensor, Tensor]:
+        """Return the move and the length of the player that knows the map, `[N, 1]` each, or `[N, 3]` with options."""
+        return player.plan(state, self.options.slip, chooses_goal=self.options.chooses_goal)
+
+    def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return the figures of the player that knows the map, which are known for the default settings."""
+        is_published = (self.max_steps, self.options.slip) == (400, 0.1)
+        return {"scripted": _PLAYER} if is_published else {}
+
+    def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Refuse counters and outcomes that do not exist, and more than one coffee or mail.
+
+        Raises:
+            ValueError: a number is invalid.
+        """
+        super().check_env_state(columns)
+        check_range(columns, {"coffee": (0, 2), "mail": (0, 2)})
+
+    def _knowledge_specs(self) -> dict[str, TensorSpec]:
+        """Return the specs of the open goals and of the player's actions."""
+        n, device = self.num_envs, self.device
+        specs: dict[str, TensorSpec] = {}
+        num_plans = 1
+        if self.options.chooses_goal:
+            num_plans = len(rules.GOALS)
+            specs[keys.OPTION_MASK] = Binary(num_plans, shape=(n, num_plans), dtype=torch.bool, device=device)
+        if self._has_oracle:
+            specs["oracle"] = Composite(
+                discrete=Categorical(len(rules.ACTIONS), shape=(n, num_plans), device=device),
+                parameters=Unbounded(shape=(n, num_plans), device=device, dtype=torch.float32),
+                shape=(n,),
+            )
+        return specs
+
+    def _knowledge(self) -> dict[str, Any]:
+        knowledge: dict[str, Any] = {}
+        state = self._state
+        if self.options.chooses_goal:
+            knowledge[keys.OPTION_MASK] = rules.open_goals(state)
+        if self._has_oracle:
+            discrete, length = self.scripted_action(state)
+            knowledge["oracle"] = {"discrete": discrete, "parameters": length}
+        return knowledge
+
+    def draw(self, track: Sequence[OfficeState]) -> np.ndarray:
+        """Return a picture of the office and the way so far, uint8 `[480, 480, 3]`."""
+        return rendering.draw(track)
