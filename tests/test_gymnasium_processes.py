@@ -51,6 +51,16 @@ def test_processes_give_the_same_steps_as_one_process(maker, quick_workers):
         other.close()
 
 
+def test_copies_answer_in_their_order_wherever_they_live(quick_workers):
+    one, other = toys(0), toys(2)
+    try:
+        one.reset(), other.reset()
+        seeds = one._copies.call("get_wrapper_attr", "np_random_seed")
+        assert len(set(seeds)) == 3 and other._copies.call("get_wrapper_attr", "np_random_seed") == seeds
+    finally:
+        other.close()
+
+
 @pytest.mark.parametrize("where", ["constructor", "step"])
 def test_a_fault_in_a_worker_is_told_as_in_one_process(where, quick_workers, recwarn):
     if where == "constructor":  # which fails in this process first, where the spaces are read

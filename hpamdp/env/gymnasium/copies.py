@@ -319,6 +319,22 @@ class Copies:
             self._explain("render", error)
         return pictures
 
+    def call(self, method: str, *arguments: Any) -> list[Any]:
+        """Return what a method of the environments themselves, without wrappers, returns for each copy.
+
+        Raises:
+            ProblemError: the method raised it.
+            EnvironmentFaultError: the method raised another error.
+        """
+        values = []
+        try:
+            for row, env in enumerate(self.envs):
+                self._row = row
+                values.append(getattr(env.unwrapped, method)(*arguments))
+        except Exception as error:
+            self._explain(method, error)
+        return values
+
     def _explain(self, method: str, error: Exception) -> NoReturn:
         """Raise the error of a method, and say which copy broke its contract or raised it."""
         if isinstance(error, EnvironmentFaultError | MemoryError):

@@ -106,6 +106,11 @@ class _BlockEnv(gymnasium.Env):
         assert self._copies is not None
         return self._copies.pictures(max(0, num - self._block.first))
 
+    def call(self, method: str, *arguments: Any) -> list[Any]:
+        """Return what a method returns for each of this worker's copies."""
+        assert self._copies is not None
+        return self._copies.call(method, *arguments)
+
     def _results(self) -> tuple[np.ndarray, ...]:
         assert self._copies is not None
         self._table[: self._block.num] = self._copies.table
@@ -191,6 +196,12 @@ class ProcessCopies:
         with self._explained():
             pictures = self._vector.call("pictures", num)
         return [picture for of_worker in pictures for picture in of_worker]
+
+    def call(self, method: str, *arguments: Any) -> list[Any]:
+        """Return what a method of the environments returns for each copy; see `Copies.call`."""
+        with self._explained():
+            values = self._vector.call("call", method, *arguments)
+        return [value for of_worker in values for value in of_worker]
 
     def _keep(self, tables: Sequence[np.ndarray]) -> None:
         owns: tuple[np.ndarray, ...] = (self.table, self.pixels)
