@@ -24,10 +24,15 @@ PLAYERS = {
     "rooms": ["agents/meta_critic_hppo_rooms"],
     "office": ["env=office", "high=none", "low=planner"],
     "lunar_lander": ["agents/hppo_lunar_lander", "env.render=true"],
+    "traffic": [
+        *("env=traffic", "env.render=true", "env.minutes=15", "env.strategies=true"),
+        *("env.grouping={max_pressure:[max_pressure]}", "high=uniform", "low=random"),
+    ],
 }
 
 
-EPISODES = {"boatdock_unseen": "1"}  # a session has several trips; three episodes elsewhere
+# A session has several trips, and traffic's episodes are long; three episodes elsewhere.
+EPISODES = {"boatdock_unseen": "1", "traffic": "1"}
 
 
 def main(names: list[str]) -> int:

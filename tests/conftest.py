@@ -6,9 +6,10 @@ import os
 import random
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,14 @@ def make_config(overrides: Sequence[str]) -> Config:
 def choices(group: str) -> list[str]:
     """Return the names in a group of conf/."""
     return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
+
+
+def buildable(problems: Iterable[str]) -> list:
+    """Return problems as parameters of a test that builds them. Those that need an extra that `dev` lacks may skip."""
+    needed = {"traffic": "libsumo"}
+    missing = {name for name, module in needed.items() if find_spec(module) is None}
+    skip = pytest.mark.skipif(True, reason="needs the extra of its name")
+    return [pytest.param(name, marks=skip if name in missing else ()) for name in problems]
 
 
 # The learners that learn from presses of their own; the others learn from data sets alone.

@@ -17,7 +17,9 @@ LEARNERS = [module for module in FILES if module.startswith(f"{LOW}.")]
 TORCH = ("torch", "torchrl", "tensordict")
 # The rooms that know boats; everything else is generic.
 BOATS = ("hpamdp.env.boatdock", "hpamdp.env.boatdock_released", "hpamdp.env.boatdock_unseen", "hpamdp.data.human")
-BOAT_WORDS = re.compile(r"boat|\bpress|_press|harbou?r|\bdock|_dock|controller|congruent|\bfuel|_fuel", re.IGNORECASE)
+BOAT_WORDS = re.compile(
+    r"boat|(\b|_)press(?!ure)|harbou?r|\bdock|_dock|controller|congruent|\bfuel|_fuel", re.IGNORECASE
+)
 
 
 @cache
@@ -110,7 +112,7 @@ def test_generic_code_has_never_heard_of_a_boat(module):
 def test_the_words_of_boats_are_found():
     for word in ("boats", "num_presses", "Pressing", "docked", "CONTROLLERS", "incongruent", "key_press", "fuel_left"):
         assert BOAT_WORDS.search(f"x = {word}"), word
-    for word in ("compress", "suppress", "expression", "paddock"):
+    for word in ("compress", "suppress", "expression", "max_pressure", "paddock"):
         assert not BOAT_WORDS.search(f"x = {word}"), word
 
 
@@ -119,8 +121,8 @@ def test_environments_and_policies_do_not_know_each_other():
     assert not importers("hpamdp.env", inside="hpamdp.policies")
 
 
-def test_a_problem_knows_no_other_but_the_released_and_unseen_boats_the_boats_and_the_lander_gymnasium():
-    allowed = {"boatdock": {"boatdock_released", "boatdock_unseen"}, "gymnasium": {"lunar_lander"}}
+def test_a_problem_knows_no_other_but_the_other_boats_the_boats_and_the_lander_and_the_traffic_gymnasium():
+    allowed = {"boatdock": {"boatdock_released", "boatdock_unseen"}, "gymnasium": {"lunar_lander", "traffic"}}
     rooms = {module.split(".")[2] for module in FILES if is_in(module, "hpamdp.env") and module.count(".") == 3}
     assert {"boatdock", "boatdock_released", "gymnasium", "platform"} <= rooms
     for room in rooms:

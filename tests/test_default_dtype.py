@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import CONF, OF_EACH_KIND, choices, compose_config, make_config
+from conftest import CONF, OF_EACH_KIND, buildable, choices, compose_config, make_config
 from tensordict import TensorDict
 from test_masks import CASES, make_learner, play_and_learn
 from toy_masks import Forbidden
@@ -78,7 +78,7 @@ def _is_of_module(function: ast.expr) -> bool:
     return isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name)
 
 
-@pytest.mark.parametrize("env", ENVS)
+@pytest.mark.parametrize("env", buildable(ENVS))
 def test_an_environment_is_the_same_with_float64_as_the_default_dtype(env):
     def steps() -> dict[str, Any]:
         torch.manual_seed(0)
