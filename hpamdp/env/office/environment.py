@@ -7,11 +7,11 @@ differences.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import PositiveInt
+from pydantic import Field, PositiveInt
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
 
@@ -36,6 +36,11 @@ class OfficeOptions(Settings):
     """Steps after which an episode is truncated."""
     slip: Fraction = 0.1
     """Probability that a move slips to the other axis."""
+    tiles: Annotated[int, Field(ge=0, le=100)] = 0
+    """Numbers of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
+
+    From them a network tells places apart more easily, as from the one-hot coordinates of Rooms.
+    """
     chooses_goal: bool = False
     """Whether the agent chooses what it goes for next, as an option: coffee, mail or target. It takes nothing else.
 
@@ -64,7 +69,6 @@ class OfficeEnv(BatchedEnv[OfficeState]):
     options: OfficeOptions
     discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
-    observation_names = rules.OBSERVATION_NAMES
     parameter_dims = (1, 1, 1, 1)
     parameter_low = rules.PARAMETER_LOW
     parameter_high = rules.PARAMETER_HIGH
@@ -94,14 +98,19 @@ class OfficeEnv(BatchedEnv[OfficeState]):
         axes = {"upright": ["up", "down"], "level": ["left", "right"]}
         return ProblemFacts(title=cls.__name__, default_options=axes, has_oracle=True)
 
+    def _prepare(self) -> None:
+        tiles = tuple(f"{axis}_{i}" for axis in "xy" for i in range(self.options.tiles))
+        self.observation_names = rules.OBSERVATION_NAMES + tiles
+
     def kernel_settings(self) -> Sequence[float]:
-        """Return the probability of a slip."""
-        return [self.options.slip]
+        """Return the probability of a slip and the number of tiles."""
+        return [self.options.slip, self.options.tiles]
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
-        """The lowest and the highest observation, `[4]` each."""
-        return [-1.0] * len(self.observation_names), [1.0] * len(self.observation_names)
+        """The lowest and the highest observation, `[4 + 2 tiles]` each."""
+        num, tiles = len(rules.OBSERVATION_NAMES), 2 * self.options.tiles
+        return [-1.0] * num + [0.0] * tiles, [1.0] * (num + tiles)
 
     @property
     def position(self) -> Tensor:
@@ -118,8 +127,8 @@ class OfficeEnv(BatchedEnv[OfficeState]):
         return rules.act(state, action.discrete, action.parameters.squeeze(-1), slips, action.option)
 
     def observe(self, state: OfficeState) -> Tensor:
-        """Return the observations `[N, 4]`."""
-        return rules.observe(state)
+        """Return the observations `[N, 4 + 2 tiles]`."""
+        return rules.observe(state, self.options.tiles)
 
     def scripted_action(self, state: OfficeState) -> tuple[Tensor, Tensor]:
         """Return the move and the length of the player that knows the map, `[N, 1]` each, or `[N, 3]` with options."""

@@ -10,10 +10,22 @@ from typing import Any
 import numpy as np
 
 from hpamdp.env import kernels
-from hpamdp.env.kernels import EPISODE_ROW, NUM_OPTIONS, ONE, OUTCOME_ROW, STEPS_ROW, TWO, ZERO, inlined, kernel, part
+from hpamdp.env.kernels import (
+    EPISODE_ROW,
+    HALF,
+    NUM_OPTIONS,
+    ONE,
+    OUTCOME_ROW,
+    STEPS_ROW,
+    TWO,
+    ZERO,
+    inlined,
+    kernel,
+    part,
+)
 from hpamdp.env.office import rules
 
-SLIP = kernels.OWN  # the problem's own setting
+SLIP, TILES = range(kernels.OWN, kernels.OWN + 2)  # the problem's own settings
 
 _X, _Y = range(2)  # the first rows of the floats
 _COFFEE, _MAIL = range(2)  # the first rows of the integers
@@ -79,6 +91,19 @@ def _act(floats: Any, integers: Any, row: Any, action: Any, length: Any, slips: 
     return rules.ON_THE_WAY, _STEP
 
 
+@part
+def _observe(floats: Any, integers: Any, row: Any, tiles: Any, observation: Any) -> None:
+    """Write what is observed of a row: `rules.observe`."""
+    x, y = floats[_X, row], floats[_Y, row]
+    observation[0], observation[1] = TWO * y - ONE, TWO * x - ONE
+    observation[2] = TWO * _F(integers[_COFFEE, row]) - ONE
+    observation[3] = TWO * _F(integers[_MAIL, row]) - ONE
+    for tile in range(tiles):
+        middle = _F(tile) + HALF
+        observation[4 + tile] = max(ONE - abs(x * _F(tiles) - middle), ZERO)
+        observation[4 + tiles + tile] = max(ONE - abs(y * _F(tiles) - middle), ZERO)
+
+
 @kernel
 def advance(
     floats: Any,
@@ -102,7 +127,7 @@ def advance(
     if invalid >= 0:
         return invalid
     slip = _F(settings[SLIP])
-    has_goal = settings[NUM_OPTIONS] > 0
+    has_goal, tiles = settings[NUM_OPTIONS] > 0, int(settings[TILES])
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.ON_THE_WAY
         if mode != kernels.RESTART and mask[row] and not was_over:
@@ -120,9 +145,6 @@ def advance(
                 kernels.new_episode(integers, row, settings)
                 floats[_X, row], floats[_Y, row] = _START_X, _START_Y
                 integers[_COFFEE, row], integers[_MAIL, row] = 0, 0
-            observations[reading, row, 0] = TWO * floats[_Y, row] - ONE
-            observations[reading, row, 1] = TWO * floats[_X, row] - ONE
-            observations[reading, row, 2] = TWO * _F(integers[_COFFEE, row]) - ONE
-            observations[reading, row, 3] = TWO * _F(integers[_MAIL, row]) - ONE
+            _observe(floats, integers, row, tiles, observations[reading, row])
             kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
     return -1

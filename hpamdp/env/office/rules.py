@@ -4,6 +4,7 @@ Source: the Office domain of PEARL, AAAI 2026, arXiv:2512.20831, with the map, c
 
 Differs from the source:
 - Observations are scaled to [-1, 1].
+- With `tiles` the observation also has the position as tiles.
 - With `chooses_goal` the agent chooses as an option what it goes for next, and takes nothing else.
 
 y grows downwards. The length of a move bears its sign: `up` and `left` have lengths in [-0.05, 0], `down` and `right`
@@ -136,7 +137,14 @@ def goal_in_mind(is_open: Tensor, option: Tensor) -> Tensor:
     return torch.where(is_possible, option, is_open.int().argmax(-1))
 
 
-def observe(state: OfficeState) -> Tensor:
-    """Return the observation `[N, 4]` with the entries OBSERVATION_NAMES, scaled to [-1, 1]."""
+def observe(state: OfficeState, tiles: int = 0) -> Tensor:
+    """Return the observation `[N, 4 + 2 tiles]`.
+
+    It has the entries OBSERVATION_NAMES, scaled to [-1, 1], then x and y again as `tiles` numbers in [0, 1] each. A
+    number is 1 in the middle of its tile and falls linearly to 0 in the middle of the next one.
+    """
     flags = (state.coffee.to(state.x.dtype), state.mail.to(state.x.dtype))
-    return 2.0 * torch.stack([state.y, state.x, *flags], -1) - 1.0
+    seen = [2.0 * torch.stack([state.y, state.x, *flags], -1) - 1.0]
+    middle = torch.arange(tiles, dtype=state.x.dtype, device=state.x.device) + 0.5
+    seen += [(1.0 - (at.unsqueeze(-1) * tiles - middle).abs()).clamp(min=0.0) for at in (state.x, state.y)]
+    return torch.cat(seen, -1)
