@@ -88,9 +88,11 @@ class Component:
         """Return whether a saved config needs the user's permission to give a setting this value.
 
         The class lists such settings in `guarded_settings`, as `name`, or as `name=value` if only that value needs
-        permission.
+        permission. An environment's `unguarded_values` need none.
         """
         guarded = getattr(self.cls, "guarded_settings", ())
+        if value in getattr(self.cls, "unguarded_values", {}).get(name, ()):
+            return False
         return name in guarded or f"{name}={value}" in guarded
 
     def build(self, **context: Any) -> Any:

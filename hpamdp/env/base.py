@@ -100,6 +100,8 @@ class PAMDPEnv(EnvBase):
 
     # Settings that can run code, read files or reach servers. A saved config sets them only if the user allows it.
     guarded_settings: ClassVar[tuple[str, ...]] = ()
+    # Values of these settings that need no such permission.
+    unguarded_values: ClassVar[Mapping[str, tuple[object, ...]]] = {}
 
     # Settings that let the agent choose an option, and settings that do not. Errors name them.
     choice_setting: ClassVar[str] = ""
