@@ -36,7 +36,6 @@ from hpamdp.settings import SettingError, Settings
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
-_SECONDS_PER_STEP = 0.25  # in films
 
 
 class EpisodeColumns(Columns, Protocol):
@@ -133,6 +132,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     rows: KernelRows | None = None  # the state that the kernel moves; None if the tensor functions do
     limit_terminates = False  # whether the time limit terminates an episode instead of truncating it
     float_type = torch.float32  # of observations and rewards
+    seconds_per_step: ClassVar[float] = 0.25  # in films
     _has_oracle = False
 
     def __init__(
@@ -295,13 +295,13 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         raise NotImplementedError(f"{type(self).__name__} has no pictures")
 
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
-        """Yield the pictures of `draw`, each for a quarter of a second; none if there are none."""
+        """Yield the pictures of `draw`, each for `seconds_per_step`; none if there are none."""
         if type(self).draw is BatchedEnv.draw:
             return
         states = [type(self._state)(**columns) for columns in track]
         for i in range(1, len(states) + 1):
             picture = np.array(Image.fromarray(self.draw(states[:i])).resize((size, size), Image.Resampling.LANCZOS))
-            yield from itertools.repeat(picture, max(1, round(fps * _SECONDS_PER_STEP)))
+            yield from itertools.repeat(picture, max(1, round(fps * self.seconds_per_step)))
 
     @property
     def has_choice(self) -> bool:
