@@ -21,6 +21,7 @@ PLAYERS = {
     "hard_move": ["agents/hppo_hard_move_4"],
     "moving": ["agents/hppo_moving"],
     "sliding": ["agents/hppo_sliding"],
+    "pinball": ["env=pinball", "env.map=hard", "env.start=anywhere", "high=none", "low=planner"],
     "rooms": ["agents/meta_critic_hppo_rooms"],
     "office": ["env=office", "high=none", "low=planner"],
     "lunar_lander": ["agents/hppo_lunar_lander", "env.render=true"],

@@ -24,12 +24,13 @@ from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.office.environment import OfficeEnv
+from hpamdp.env.pinball.environment import PinballEnv
 from hpamdp.env.platform import rendering
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.specs import PAMDPSpecs
 
 POINTS = [CatchPointEnv, HardMoveEnv, MovingEnv, SlidingEnv]
-PROBLEMS = [PlatformEnv, OfficeEnv, *POINTS]
+PROBLEMS = [PlatformEnv, OfficeEnv, PinballEnv, *POINTS]
 IDS = {
     "hpamdp/Platform-v0": PlatformEnv,
     "hpamdp/Office-v0": OfficeEnv,
@@ -37,6 +38,8 @@ IDS = {
     **{f"hpamdp/HardMove{n}-v0": HardMoveEnv for n in (4, 6, 8)},
     "hpamdp/Moving-v0": MovingEnv,
     "hpamdp/Sliding-v0": SlidingEnv,
+    "hpamdp/PinballSimple-v0": PinballEnv,
+    "hpamdp/PinballHard-v0": PinballEnv,
 }
 # Gymnasium recommends actions scaled to [-1, 1]; the field's own bounds are others.
 RECOMMENDATION = "we recommend using a symmetric and normalized space"
@@ -315,7 +318,8 @@ def test_gymnasiums_checker_finds_nothing(env_id):
 
 
 @pytest.mark.parametrize(
-    "env_id", ["hpamdp/CatchPoint-v0", "hpamdp/Moving-v0", "hpamdp/Office-v0", "hpamdp/Platform-v0"]
+    "env_id",
+    ["hpamdp/CatchPoint-v0", "hpamdp/Moving-v0", "hpamdp/Office-v0", "hpamdp/Platform-v0", "hpamdp/PinballSimple-v0"],
 )
 def test_a_adapter_plays_as_the_environment_does(env_id):
     adapter, env = gymnasium.make(env_id), IDS[env_id](1)
@@ -388,7 +392,14 @@ def test_bad_actions_and_options_of_a_adapter_are_refused_in_one_line():
 
 @pytest.mark.parametrize(
     "env_id",
-    ["hpamdp/Platform-v0", "hpamdp/Office-v0", "hpamdp/CatchPoint-v0", "hpamdp/HardMove4-v0", "hpamdp/Sliding-v0"],
+    [
+        "hpamdp/Platform-v0",
+        "hpamdp/Office-v0",
+        "hpamdp/CatchPoint-v0",
+        "hpamdp/HardMove4-v0",
+        "hpamdp/Sliding-v0",
+        "hpamdp/PinballHard-v0",
+    ],
 )
 def test_a_picture_shows_the_progress_of_the_episode(env_id):
     adapter = gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True)

@@ -16,6 +16,7 @@ from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.office.environment import OfficeEnv
+from hpamdp.env.pinball.environment import PinballEnv
 from hpamdp.env.platform.environment import PlatformEnv
 
 GOAL = {
@@ -51,6 +52,16 @@ PROBLEMS = {
         HardMoveEnv,
         {"n": st.sampled_from([4, 6]), "rounded_directions": st.booleans(), "max_steps": st.sampled_from([3, 30])},
         1e-5,
+    ),
+    # Its random steps seldom meet a wall; tests/test_pinball_rules.py puts balls anywhere.
+    "pinball": (
+        PinballEnv,
+        {
+            "map": st.sampled_from(["simple", "hard"]),
+            "start": st.sampled_from(["map", "anywhere"]),
+            "max_steps": st.sampled_from([3, 600]),
+        },
+        1e-4,
     ),
     "moving": (MovingEnv, {"max_steps": st.sampled_from([3, 201])}, 1e-5),
     "sliding": (SlidingEnv, {"max_steps": st.sampled_from([3, 201])}, 1e-4),

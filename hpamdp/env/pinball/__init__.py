@@ -1,0 +1,1 @@
+"""Pinball: push a ball between walls into a hole."""

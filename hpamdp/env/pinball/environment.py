@@ -1,0 +1,139 @@
+"""Pinball as a batched TorchRL environment: push a ball between walls into a hole.
+
+Source: Konidaris and Barto 2009; see `hpamdp.env.pinball.rules`, also for the differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from pydantic import Field, PositiveInt
+from torch import Tensor
+
+from hpamdp.env.batched_env import Action, BatchedEnv
+from hpamdp.env.counter_rng import RngKey
+from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.pinball import kernel, maps, rendering, rules
+from hpamdp.env.pinball.planner import Planner
+from hpamdp.env.pinball.rules import PinballState
+from hpamdp.settings import SettingError, Settings
+
+_GRID = 100  # places in a row from which a ball may start anywhere
+_SCRIPTED = {"simple": 9_837.0, "hard": 9_404.0}  # returns of the hand-written player from the start of the map
+
+
+class PinballOptions(Settings):
+    """Settings of `PinballEnv`."""
+
+    map: Annotated[str, Field(min_length=1)] = "simple"
+    """A map of the source, `simple` or `hard`, or the path of a JSON file with a map of one's own."""
+    start: Literal["map", "anywhere"] = "map"
+    """Where episodes begin: at the start of the `map`, or `anywhere` between the walls. The ball is at rest."""
+    max_steps: PositiveInt = 600
+    """Steps after which an episode is truncated."""
+    compile_rules: bool = False
+    """Compile the tensor functions instead of using the kernel, for a GPU; the first action takes about a minute."""
+
+
+class PinballEnv(BatchedEnv[PinballState]):
+    """Push a ball into the hole on `num_envs` tables at once.
+
+    Action leaves: `("action", "discrete")` int64 `[N]`: 0 right, 1 up, 2 left, 3 down, 4 none; `("action",
+    "parameters")` float32 `[N, 4]`: the strengths of a push to the right and upwards in [0, 1], to the left and
+    downwards in [-1, 0]. Only the strength of the chosen push counts; outside its bounds it is clipped, NaN and
+    infinity are refused. A push changes the speed once, by a fifth of its strength; the ball keeps rolling.
+
+    A push costs 5 and none costs 1. The step in which the ball reaches the hole has the reward 10,000 instead, and ends
+    the episode.
+
+    Nothing is random, except the start with `start=anywhere`. If `oracle` is true, the environment writes the action of
+    a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`). For the constructor's other arguments and
+    errors see `BatchedEnv`.
+    """
+
+    Options = PinballOptions
+    options: PinballOptions
+    guarded_settings: ClassVar[tuple[str, ...]] = ("map",)
+    unguarded_values: ClassVar[Mapping[str, tuple[object, ...]]] = {"map": maps.OWN_MAPS}
+    discrete_names = rules.ACTIONS
+    outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
+    observation_names = rules.OBSERVATION_NAMES
+    parameter_dims = rules.PARAMETER_DIMS
+    parameter_low = rules.PARAMETER_LOW
+    parameter_high = rules.PARAMETER_HIGH
+    row_kernel = staticmethod(kernel.advance)
+    seconds_per_step: ClassVar[float] = 0.04
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        options: PinballOptions | None = None,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+        oracle: bool = False,
+        **settings: Any,
+    ) -> None:
+        self._has_oracle = oracle
+        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
+
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem; options to begin with are the two axes and none."""
+        groups = {"horizontal": ["right", "left"], "vertical": ["up", "down"], "none": ["none"]}
+        return ProblemFacts(title=cls.__name__, default_options=groups, has_oracle=True)
+
+    def _prepare(self) -> None:
+        try:
+            self.map = maps.read(self.options.map)
+            is_fixed = self.options.start == "map"
+            self._places = np.array([self.map.start], np.float64) if is_fixed else self.map.free_places(_GRID)
+            self._planner = Planner(self.map, self.device) if self._has_oracle else None
+        except maps.MapError as error:
+            raise SettingError(f"map={self.options.map!r}: {error}") from error
+        self._table = rules.make_table(self.map, self._places, self.device)
+
+    def kernel_settings(self) -> Sequence[float]:
+        """Return the map in numbers."""
+        return kernel.settings_of(self.map, self._places)
+
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[4]` each."""
+        return [-1.0] * 4, [1.0] * 4
+
+    @property
+    def position(self) -> Tensor:
+        """The balls' positions, `[N, 2]`."""
+        return torch.stack([self.state.x, self.state.y], -1)
+
+    def start(self, episode: Tensor, rng: RngKey) -> PinballState:
+        """Return states with the balls at rest where episodes begin."""
+        return rules.start(episode, rng, self._table)
+
+    def act(self, state: PinballState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[PinballState, Tensor]:
+        """Return the states after one step and the rewards `[N]`."""
+        return rules.act(state, action.discrete, action.parameters.squeeze(-1), self._table)
+
+    def observe(self, state: PinballState) -> Tensor:
+        """Return the observations `[N, 4]`."""
+        return rules.observe(state)
+
+    def scripted_action(self, state: PinballState) -> tuple[Tensor, Tensor]:
+        """Return the action of the hand-written player and its strength, `[N]` each."""
+        if self._planner is None:
+            self._planner = Planner(self.map, self.device)
+        return self._planner(state)
+
+    def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return the figures of the hand-written player from the start of a map of the source."""
+        is_published = self.options.start == "map" and self.max_steps == 600 and self.options.map in _SCRIPTED
+        return {"scripted": {"score": _SCRIPTED[self.options.map], "success": 1.0}} if is_published else {}
+
+    def draw(self, track: Sequence[PinballState]) -> np.ndarray:
+        """Return a picture of the table and the way of the ball, uint8 `[480, 480, 3]`."""
+        return rendering.draw(track, self.map)

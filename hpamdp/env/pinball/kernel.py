@@ -1,0 +1,189 @@
+"""The rules of Pinball for one row, and the loop over all rows that Numba compiles.
+
+It states what `rules` says of columns, for the CPU alone; a test compares the two. Before a step a row collects the
+edges that its ball can reach in this step. Most balls reach none, and the others a few, so the ticks test only these.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hpamdp.env import kernels
+from hpamdp.env.kernels import ONE, OUTCOME_ROW, TWO, ZERO, kernel, part
+from hpamdp.env.pinball import rules
+from hpamdp.env.pinball.maps import PinballMap
+
+# The problem's own settings: the map. After these numbers follow the polygons, the edges and the places to start.
+BALL, TARGET_X, TARGET_Y, TARGET_RADIUS, NUM_POLYGONS, NUM_EDGES, NUM_PLACES = range(kernels.OWN, kernels.OWN + 7)
+_FIRST = kernels.OWN + 7
+
+_X, _Y, _VX, _VY = range(4)
+# Columns of a polygon: its edges, and the box around it.
+_BEGIN, _END, _MIN_X, _MAX_X, _MIN_Y, _MAX_Y = range(6)
+# Columns of an edge.
+_CORNER_X, _CORNER_Y, _SIDE_X, _SIDE_Y, _SQUARED, _POLYGON = range(6)
+
+_F = np.float32
+_TICKS, _PUSH, _DRAG, _MAX_SPEED = _F(rules.TICKS), _F(rules.PUSH), _F(rules.DRAG), _F(rules.MAX_SPEED)
+_TOUCHING, _LOW, _HIGH = _F(rules.TOUCHING), _F(rules.LOW_PLACE), _F(rules.HIGH_PLACE)
+_MOVES = _F((rules.TICKS + 1.0) / rules.TICKS)  # of a step, with that after a touch in its last tick
+_SLACK = _F(1e-4)  # for rounding
+
+
+def settings_of(found: PinballMap, places: np.ndarray) -> list[float]:
+    """Return a map and the places `[S, 2]` to start as the kernel's own settings."""
+    edges = found.edges()
+    polygons, begin = [], 0
+    for polygon in found.polygons:
+        x, y = zip(*polygon, strict=True)
+        polygons.append([begin, begin + len(polygon), min(x), max(x), min(y), max(y)])
+        begin += len(polygon)
+    columns = [*edges.corner.T, *edges.side.T, (edges.side**2).sum(-1), edges.polygon]
+    return [
+        found.ball,
+        *found.target,
+        len(polygons),
+        begin,
+        len(places),
+        *np.array(polygons, np.float64).ravel().tolist(),
+        *np.stack(columns, -1).ravel().tolist(),
+        *places.ravel().tolist(),
+    ]
+
+
+@part
+def _collect(x: Any, y: Any, reach: Any, polygons: Any, edges: Any, near: Any) -> Any:
+    """Write the numbers of the edges within reach, and return how many there are."""
+    num = 0
+    for each in range(len(polygons)):
+        polygon = polygons[each]
+        is_far = (x + reach < polygon[_MIN_X]) | (x - reach > polygon[_MAX_X])
+        is_far |= (y + reach < polygon[_MIN_Y]) | (y - reach > polygon[_MAX_Y])
+        if is_far:
+            continue
+        for number in range(int(polygon[_BEGIN]), int(polygon[_END])):
+            edge = edges[number]
+            along = (x - edge[_CORNER_X]) * edge[_SIDE_X] + (y - edge[_CORNER_Y]) * edge[_SIDE_Y]
+            along = min(max(along / edge[_SQUARED], ZERO), ONE)
+            to_x, to_y = edge[_CORNER_X] + along * edge[_SIDE_X] - x, edge[_CORNER_Y] + along * edge[_SIDE_Y] - y
+            if to_x * to_x + to_y * to_y <= reach * reach:
+                near[num] = number
+                num += 1
+    return num
+
+
+@part
+def _touch(x: Any, y: Any, vx: Any, vy: Any, ball: Any, edges: Any, near: Any, num: Any) -> Any:
+    """Return how many edges the ball touches, one of them, and whether they are several polygons': `rules._touches`."""
+    count, touched, is_several = 0, 0, False
+    for place in range(num):
+        number = near[place]
+        edge = edges[number]
+        along = (x - edge[_CORNER_X]) * edge[_SIDE_X] + (y - edge[_CORNER_Y]) * edge[_SIDE_Y]
+        along = min(max(along / edge[_SQUARED], ZERO), ONE)
+        to_x, to_y = edge[_CORNER_X] + along * edge[_SIDE_X] - x, edge[_CORNER_Y] + along * edge[_SIDE_Y] - y
+        squared = to_x * to_x + to_y * to_y
+        if squared > ball * ball:
+            continue
+        towards = to_x * vx + to_y * vy
+        if towards >= ZERO or towards * towards <= _TOUCHING * squared * (vx * vx + vy * vy):
+            is_several |= count > 0 and edges[touched, _POLYGON] != edge[_POLYGON]
+            count, touched = count + 1, number
+    return count, touched, is_several
+
+
+@part
+def _roll(floats: Any, row: Any, settings: Any, polygons: Any, edges: Any, near: Any) -> Any:
+    """Roll a row's ball for a step and return its outcome: the loop of `rules.act`."""
+    x, y, vx, vy = floats[_X, row], floats[_Y, row], floats[_VX, row], floats[_VY, row]
+    ball, radius = _F(settings[BALL]), _F(settings[TARGET_RADIUS])
+    target_x, target_y = _F(settings[TARGET_X]), _F(settings[TARGET_Y])
+    travel = _MOVES * ball * _F(np.sqrt(vx * vx + vy * vy)) + _SLACK
+    num = _collect(x, y, ball + travel, polygons, edges, near)
+    outcome = rules.ROLLING
+    for tick in range(rules.TICKS):
+        x, y = x + vx * ball / _TICKS, y + vy * ball / _TICKS
+        count, touched, is_several = _touch(x, y, vx, vy, ball, edges, near, num)
+        if count == 1:
+            edge = edges[touched]
+            double = TWO * (vx * edge[_SIDE_X] + vy * edge[_SIDE_Y]) / edge[_SQUARED]
+            vx, vy = double * edge[_SIDE_X] - vx, double * edge[_SIDE_Y] - vy
+        elif count > 1:
+            vx, vy = -vx, -vy
+        if count > 0 and not is_several and tick == rules.TICKS - 1:
+            x, y = x + vx * ball / _TICKS, y + vy * ball / _TICKS
+        to_x, to_y = x - target_x, y - target_y
+        if to_x * to_x + to_y * to_y < radius * radius:
+            outcome = rules.REACHED
+            break
+    if outcome == rules.ROLLING:
+        vx, vy = _DRAG * vx, _DRAG * vy
+        x = _HIGH if x > ONE else (_LOW if x < ZERO else x)
+        y = _HIGH if y > ONE else (_LOW if y < ZERO else y)
+    floats[_X, row], floats[_Y, row] = x, y
+    floats[_VX, row] = min(max(vx, -_MAX_SPEED), _MAX_SPEED)
+    floats[_VY, row] = min(max(vy, -_MAX_SPEED), _MAX_SPEED)
+    return outcome
+
+
+@part
+def _start(floats: Any, row: Any, places: Any, bits: Any, step: Any) -> None:
+    """Put a ball where an episode begins: `rules.start`."""
+    place = min(int(kernels.uniform(bits, step, 0) * _F(len(places))), len(places) - 1)
+    floats[_X, row], floats[_Y, row] = _F(places[place, 0]), _F(places[place, 1])
+    floats[_VX, row], floats[_VY, row] = ZERO, ZERO
+
+
+@kernel
+def advance(
+    floats: Any,
+    integers: Any,
+    option: Any,
+    discrete: Any,
+    parameters: Any,
+    places: Any,
+    bounds: Any,
+    mask: Any,
+    settings: Any,
+    mode: Any,
+    observations: Any,
+    outcomes: Any,
+    extras: Any,
+    flags: Any,
+    rewards: Any,
+) -> int:
+    """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
+    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
+    end_polygons = _FIRST + 6 * int(settings[NUM_POLYGONS])
+    end_edges = end_polygons + 6 * int(settings[NUM_EDGES])
+    polygons = settings[_FIRST:end_polygons].astype(np.float32).reshape((-1, 6))
+    edges = settings[end_polygons:end_edges].astype(np.float32).reshape((-1, 6))
+    starts = settings[end_edges : end_edges + 2 * int(settings[NUM_PLACES])].reshape((-1, 2))
+    near = np.empty(len(edges), np.int64)
+    for row in range(len(mask)):
+        was_over = integers[OUTCOME_ROW, row] != rules.ROLLING
+        if mode != kernels.RESTART and mask[row] and not was_over:
+            action = discrete[row]
+            push = _PUSH * kernels.parameter(parameters, row, 0, action, places, bounds)
+            if action == rules.RIGHT or action == rules.LEFT:
+                floats[_VX, row] += push
+            elif action != rules.NONE:
+                floats[_VY, row] += push
+            outcome = _roll(floats, row, settings, polygons, edges, near)
+            kernels.end_step(integers, row, outcome, len(rules.OUTCOMES), settings)
+            cost = rules.NONE_COST if action == rules.NONE else rules.PUSH_COST
+            rewards[row] = rules.REWARD if outcome == rules.REACHED else -cost
+        for reading in range(len(observations)):
+            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
+                bits, step = kernels.new_episode(integers, row, settings)
+                _start(floats, row, starts, bits, step)
+            observations[reading, row, 0] = TWO * floats[_X, row] - ONE
+            observations[reading, row, 1] = TWO * floats[_Y, row] - ONE
+            observations[reading, row, 2] = floats[_VX, row] / _MAX_SPEED
+            observations[reading, row, 3] = floats[_VY, row] / _MAX_SPEED
+            kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1

@@ -1,0 +1,200 @@
+"""Balls roll by the published rules: those of recordings, those written down here for one ball, and the kernel's."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from batched_players import random_player
+
+from hpamdp.env.pinball import maps, rules
+from hpamdp.env.pinball.environment import PinballEnv
+from hpamdp.env.pinball.rules import DOWN, LEFT, NONE, REACHED, RIGHT, ROLLING, UP, PinballState
+
+FOLDER = Path(os.environ.get("HPAMDP_TRACES", "nowhere")) / "domains"
+each_map = pytest.mark.parametrize("name", maps.OWN_MAPS)
+
+
+class ScalarTable:
+    """The published rules for one ball, with angles and in double precision."""
+
+    def __init__(self, name: str) -> None:
+        self.map = maps.read(name)
+        self.polygons = [np.array(polygon) for polygon in self.map.polygons]
+
+    def step(self, x: float, y: float, vx: float, vy: float, action: int, strength: float) -> tuple[list[float], bool]:
+        """Return place and velocity after a step, and whether the ball is in the hole."""
+        place, speed = np.array([x, y]), np.array([vx, vy])
+        if action != NONE:
+            speed[action % 2] += strength / 5.0
+        for tick in range(20):
+            place = place + speed * self.map.ball / 20.0
+            touched = [found for found in (self.touched(p, place, speed) for p in self.polygons) if found]
+            if len(touched) == 1 and len(touched[0]) == 1:
+                speed = self.mirrored(speed, touched[0][0])
+            elif touched:
+                speed = -speed
+            if len(touched) == 1 and tick == 19:
+                place = place + speed * self.map.ball / 20.0
+            if math.dist(place, self.map.target[:2]) < self.map.target[2]:
+                return [*place, *speed], True
+        place = [0.95 if each > 1.0 else 0.05 if each < 0.0 else each for each in place]
+        return [*place, *np.clip(0.995 * speed, -2.0, 2.0)], False
+
+    def touched(self, polygon: np.ndarray, place: np.ndarray, speed: np.ndarray) -> list[np.ndarray]:
+        """Return the edges of a polygon that the ball touches, as vectors."""
+        found = []
+        for corner, following in zip(polygon, np.roll(polygon, -1, 0), strict=True):
+            edge = following - corner
+            nearest = corner + edge * min(max((place - corner) @ edge / (edge @ edge), 0.0), 1.0)
+            way = nearest - place
+            angle = abs(math.atan2(*way) - math.atan2(*speed))
+            if math.hypot(*way) <= self.map.ball and min(angle, 2.0 * math.pi - angle) <= math.pi / 1.99:
+                found.append(edge)
+        return found
+
+    def mirrored(self, speed: np.ndarray, edge: np.ndarray) -> np.ndarray:
+        """Return the velocity mirrored at an edge."""
+        angle = 2.0 * math.atan2(edge[1], edge[0]) - math.atan2(speed[1], speed[0])
+        return math.hypot(*speed) * np.array([math.cos(angle), math.sin(angle)])
+
+
+def columns(rows: object, dtype: torch.dtype = torch.float64) -> PinballState:
+    """Return states from rows of place and velocity, `[N, 4]`."""
+    x, y, vx, vy = torch.as_tensor(rows, dtype=dtype).T
+    nothing = torch.zeros(len(x), dtype=torch.int32)
+    return PinballState(x, y, vx, vy, nothing, nothing, nothing)
+
+
+def table_of(name: str) -> rules.Table:
+    found = maps.read(name)
+    return rules.make_table(found, np.array([found.start]), dtype=torch.float64)
+
+
+def random_rows(name: str, num: int, seed: int) -> torch.Tensor:
+    """Return places anywhere between the walls and velocities of all sizes, float64 `[num, 4]`."""
+    generator = torch.Generator().manual_seed(seed)
+    places = torch.from_numpy(maps.read(name).free_places(300))
+    chosen = places[torch.randint(len(places), (num,), generator=generator)]
+    speeds = 4.0 * torch.rand(num, 2, generator=generator, dtype=torch.float64) - 2.0
+    return torch.cat([chosen, speeds * torch.rand(num, 1, generator=generator, dtype=torch.float64)], -1)
+
+
+@each_map
+def test_our_rules_play_as_the_reference_code_step_by_step(name):
+    path = FOLDER / f"pinball_{name}.json"
+    if not path.exists():
+        pytest.skip(f"needs HPAMDP_TRACES with domains/{path.name}")
+    before, discrete, strength, after, reward, is_reached = [], [], [], [], [], []
+    for episode in json.loads(path.read_text())["episodes"]:
+        state = episode["start"]
+        for step in episode["steps"]:
+            before.append(state)
+            for column, value in zip((discrete, strength, after, reward, is_reached), step, strict=True):
+                column.append(value)
+            state = step[2]
+    assert len(before) > 900 and sum(is_reached) == 4
+    table = table_of(name)
+    got, rewards = rules.act(columns(before), torch.tensor(discrete), columns([[s] * 4 for s in strength]).x, table)
+    expected = columns(after)
+    for column, right in zip(got[:4], expected[:4], strict=True):
+        torch.testing.assert_close(column, right, rtol=0.0, atol=1e-12)
+    assert rewards.tolist() == reward
+    assert (got.outcome == REACHED).tolist() == is_reached
+
+
+@each_map
+def test_steps_from_anywhere_follow_the_published_rules(name):
+    rows, generator = random_rows(name, 400, 1), torch.Generator().manual_seed(2)
+    discrete = torch.randint(5, (400,), generator=generator)
+    strength = torch.rand(400, generator=generator, dtype=torch.float64)
+    strength = torch.where(discrete >= LEFT, -strength, strength)
+    got, _ = rules.act(columns(rows), discrete, strength, table_of(name))
+    scalar = ScalarTable(name)
+    played = [scalar.step(*row, a, s) for row, a, s in zip(rows.tolist(), discrete.tolist(), strength, strict=True)]
+    expected = columns([place for place, _ in played])
+    for column, right in zip(got[:4], expected[:4], strict=True):
+        torch.testing.assert_close(column, right, rtol=0.0, atol=1e-9)
+    assert (got.outcome == REACHED).tolist() == [is_reached for _, is_reached in played]
+    bounced = (got.vx - 0.995 * columns(rows).vx).abs() > 0.2 + 1e-9
+    assert bounced.sum() > 20
+
+
+@each_map
+def test_the_kernel_bounces_as_the_rules_from_anywhere_at_any_speed(name):
+    num = 5_000
+    env = PinballEnv(num, map=name)
+    env.reset()
+    env.state = columns(random_rows(name, num, 3), torch.float32)
+    player = random_player(4)
+    num_bounced = num_reached = num_different = 0
+    for _ in range(4):
+        td = player(env)
+        before = env.state
+        moved, reward, _ = env.advance(before, *env.action_leaves(td), before.outcome != ROLLING)
+        got = env.step(td)["next", "reward"].squeeze(-1)
+        assert env.rows is not None
+        pairs = [(got, reward), *zip(env.state, moved, strict=True)]
+        differs = torch.stack([~torch.isclose(one.double(), other.double(), atol=1e-4) for one, other in pairs])
+        num_different += int(differs.any(0).sum())
+        num_bounced += int(((moved.vx - before.vx).abs() > 0.21).sum())
+        num_reached += int(((moved.outcome == REACHED) & (before.outcome == ROLLING)).sum())
+    # Where a threshold is met to within rounding.
+    assert num_different <= 4
+    assert num_bounced > 1000 and num_reached > 20
+
+
+def step(
+    place: tuple[float, ...], action: int, strength: float = 0.0, name: str = "simple"
+) -> tuple[list[float], float]:
+    """Return place and velocity after a step, and its reward."""
+    after, reward = rules.act(
+        columns([place]), torch.tensor([action]), torch.tensor([strength], dtype=torch.float64), table_of(name)
+    )
+    return [float(column) for column in after[:4]], float(reward)
+
+
+@pytest.mark.parametrize(
+    ("action", "strength", "velocity"),
+    [(RIGHT, 1.0, (0.2, 0.0)), (UP, 0.5, (0.0, 0.1)), (LEFT, -1.0, (-0.2, 0.0)), (DOWN, -0.25, (0.0, -0.05))],
+)
+def test_a_push_changes_the_speed_by_a_fifth_of_its_strength_and_costs_5(action, strength, velocity):
+    (x, y, vx, vy), reward = step((0.2, 0.9, 0.0, 0.0), action, strength)
+    assert (vx, vy) == pytest.approx((0.995 * velocity[0], 0.995 * velocity[1]))
+    # A step covers the speed times the radius.
+    assert (x, y) == pytest.approx((0.2 + 0.02 * velocity[0], 0.9 + 0.02 * velocity[1]))
+    assert reward == -5.0
+
+
+def test_a_ball_that_nobody_pushes_slows_down_and_costs_1():
+    (x, y, vx, vy), reward = step((0.2, 0.9, 1.0, 0.0), NONE)
+    assert (x, y, vx, vy) == pytest.approx((0.22, 0.9, 0.995, 0.0)) and reward == -1.0
+
+
+def test_a_wall_mirrors_the_speed_and_a_corner_reverses_it():
+    (_, _, vx, vy), _ = step((0.04, 0.9, -1.0, 0.5), NONE)
+    assert (vx, vy) == pytest.approx((0.995, 0.4975))
+    # Into the corner of two walls.
+    (_, _, vx, vy), _ = step((0.04, 0.96, -1.0, 1.0), NONE)
+    assert (vx, vy) == pytest.approx((0.995, -0.995))
+
+
+def test_a_ball_that_has_left_the_square_is_put_back():
+    (x, y, _, _), _ = step((-0.2, 1.2, 0.0, 0.0), NONE)
+    assert (x, y) == (0.05, 0.95)
+
+
+def test_the_step_that_reaches_the_hole_earns_10000_and_ends_there():
+    (x, y, vx, _), reward = step((0.85, 0.2, 1.0, 0.0), NONE)
+    assert reward == 10_000.0
+    assert 0.86 < x < 0.862 and y == 0.2 and vx == 1.0, "neither the ticks after it nor the drag count"
+
+
+def test_speeds_are_clipped_after_the_step_alone():
+    (x, _, vx, _), _ = step((0.5, 0.95, 1.95, 0.0), RIGHT, 1.0)
+    assert x == pytest.approx(0.5 + 0.02 * 2.15) and vx == 2.0
