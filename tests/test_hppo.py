@@ -170,6 +170,16 @@ def test_advantages_bootstrap_past_truncation_and_stop_at_every_end():
                 torch.testing.assert_close(target[row, t], trace + value[row, t])
 
 
+def test_rewards_are_learned_from_after_scaling():
+    plain, scaled = make(), make(reward_scale=0.01)
+    td = random_rows(plain, 3, 6)
+    large = td.clone()
+    large["next", keys.REWARD] = 100.0 * td["next", keys.REWARD]
+    mask = torch.ones(3, 6, dtype=torch.bool)
+    for one, other in zip(plain.advantages(td, mask), scaled.advantages(large, mask), strict=True):
+        torch.testing.assert_close(one, other)
+
+
 def test_rows_of_other_learners_change_nothing():
     learners = make(minibatch_size=64), make(minibatch_size=64)
     td = random_rows(learners[0], 64, 6)

@@ -85,6 +85,11 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     """Discount of a step."""
     gae_lambda: Fraction = 0.95
     """Lambda of the generalised advantages: 0 bootstraps after one step, 1 at the end of the episode."""
+    reward_scale: PositiveFloat = 1.0
+    """Factor on the rewards that are learned from.
+
+    Actors and critic share `max_grad_norm`. With returns in the thousands, the critic takes nearly all of it.
+    """
     lr: LearningRate = 1e-3
     """Learning rate of actors and critic at the start."""
     lr_final: Fraction = 1e-4
@@ -330,7 +335,12 @@ class HPPO(OnPolicy, Learner):
         ends = after.get(keys.DONE), after.get(keys.TERMINATED)
         with float32_by_default():
             advantage, target = generalized_advantage_estimate(
-                self.options.gamma, self.options.gae_lambda, value, next_value, reward, *ends
+                self.options.gamma,
+                self.options.gae_lambda,
+                value,
+                next_value,
+                self.options.reward_scale * reward,
+                *ends,
             )
         return advantage.squeeze(-1), target.squeeze(-1)
 
