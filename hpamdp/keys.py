@@ -36,6 +36,11 @@ HELD = "held"
 # Written by the agent for its learners if there is `option_ended`: the option that holds in the next state.
 NEXT_OPTION = ("next", "option")
 
+# Written by the policy with exploration=held: whether exploration took the action of this step, and what it holds after
+# the step: for how many more steps, which discrete action, with which parameters in [-1, 1].
+IS_HELD = "is_held"
+HOLD_STEPS, HOLD_DISCRETE, HOLD_UNIT = "hold_steps", "hold_discrete", "hold_unit"
+
 # Written by an environment that knows the best action; read by the `oracle` selector and the `planner` learner.
 ORACLE_OPTION = ("oracle", "option")
 ORACLE_DISCRETE = ("oracle", "discrete")

@@ -8,12 +8,13 @@ from hpamdp.config.stand_ins import quick_imports
 
 # Facts of classes that the rules of `hpamdp.run.compatibility` read.
 FACTS = ("modes", "needs", "is_bandit", "ends_options", "asks_learners", "value_setting", "guarded_settings")
-FACTS += ("needs_evaluations",)
+FACTS += ("needs_evaluations", "changes", "explores_with")
 
 
 def described(cls: type, group: str) -> dict:
     """Return the settings' defaults and the facts of a class as JSON values."""
-    facts = {name: list(value) if isinstance(value := getattr(cls, name, None), tuple) else value for name in FACTS}
+    facts = {name: getattr(cls, name, None) for name in FACTS}
+    facts = {name: sorted(value) if isinstance(value, tuple | frozenset) else value for name, value in facts.items()}
     return {"defaults": defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS.get(group, ()))), "facts": facts}
 
 

@@ -30,6 +30,7 @@ from hpamdp.env.gymnasium_form import VectorScaling
 from hpamdp.files import replacing
 from hpamdp.policies.agent import HierarchicalAgent, OptionRouter, with_option
 from hpamdp.policies.base import Learner, Level, Selector
+from hpamdp.policies.exploration.base import Exploration
 from hpamdp.specs import PAMDPSpecs
 
 # An ONNX graph has each name once, so the option that comes in is not called as the one that goes out.
@@ -227,6 +228,7 @@ def _check_levels(agent: HierarchicalAgent) -> None:
             f"export: {_names(agent)} cannot be exported: the problem has {what}, which files cannot read"
         )
     exploring = {key for level in _levels(agent) if isinstance(level, Learner) for key in level.exploring_keys}
+    exploring |= {key for each in agent.explorations if isinstance(each, Exploration) for key in each.exploring_keys}
     remembered = [key for key in agent.router.state_keys if key not in exploring]
     if remembered:
         raise ConfigError(f"export: {_names(agent)} cannot be exported: it remembers {remembered}")

@@ -26,6 +26,7 @@ SUPPLIED_ARGUMENTS: dict[str, tuple[str, ...]] = {
     "high": ("specs", "device"),
     "low": ("specs", "device"),
     "encoder": ("entry",),
+    "exploration": ("learner", "device"),
     "data": ("env",),
     "logger": ("output_dir", "config", "earlier"),
     "collector": ("config", "parts", "frames"),
@@ -47,12 +48,13 @@ _BASE_CLASSES = {
     "high": "hpamdp.policies.base.Selector",
     "low": "hpamdp.policies.base.Learner",
     "encoder": "hpamdp.policies.encoders.base.Encoder",
+    "exploration": "hpamdp.policies.exploration.base.Exploration",
     "data": "hpamdp.data.demonstrations.Demonstrations",
     "logger": "hpamdp.run.loggers.Logger",
     "collector": "hpamdp.run.collection.base.Collection",
     CALLBACK: "hpamdp.run.callbacks.Callback",
 }
-_CAN_BE_NONE = ("high", "data")
+_CAN_BE_NONE = ("high", "exploration", "data")
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, protected_namespaces=())
 
 
@@ -63,7 +65,7 @@ class Component:
     Attributes:
         group: the group, such as `low`.
         name: name of the yaml file, such as `hyar`.
-        cls: the class; None for `high=none` and `data=none`.
+        cls: the class; None for `high=none`, `exploration=none` and `data=none`.
         settings: checked values by name.
         objects: further arguments of the constructor, from Python code. No file holds them.
     """

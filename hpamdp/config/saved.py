@@ -19,7 +19,7 @@ _CHOICES = "choices"
 # Values of the run that earlier versions did not save, with the defaults of the time.
 _BEFORE = {"film": True, "callbacks": [], "save_best": False, "compile_updates": False, "update_precision": "float32"}
 # Groups that earlier versions did not have, with the choice that does what they did.
-_GROUPS_BEFORE = {"encoder": "auto"}
+_GROUPS_BEFORE = {"encoder": "auto", "exploration": "none"}
 _RUN_GROUPS: dict[str, type[Settings]] = {"agent": AgentConfig, "env": EnvConfig}
 
 

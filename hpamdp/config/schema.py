@@ -203,6 +203,7 @@ class Config:
     high: Component
     low: Component
     encoder: Component
+    exploration: Component
     data: Component
     logger: Component
     collector: Component

@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType
 from hpamdp import keys
 from hpamdp.acting import acting, is_greedy
 from hpamdp.policies.base import Learner, Level, Selector, finished_decisions
+from hpamdp.policies.exploration.base import Exploration
 from hpamdp.policies.masks import allowed_or_first
 from hpamdp.policies.option_lengths import OptionLengths, PairSelector
 from hpamdp.specs import PAMDPSpecs
@@ -54,20 +55,30 @@ class OptionRouter(TensorDictModuleBase):
         learners: one for each option, or a single one.
         specs: of the problem as the environment states it.
         is_shared: whether the single learner observes the option.
+        explorations: what stands beside each learner; empty for nothing.
 
     Attributes:
         state_keys: the keys of the policies' state.
     """
 
-    def __init__(self, learners: Sequence[Learner], specs: PAMDPSpecs, is_shared: bool) -> None:
+    def __init__(
+        self,
+        learners: Sequence[Learner],
+        specs: PAMDPSpecs,
+        is_shared: bool,
+        explorations: Sequence[Exploration] = (),
+    ) -> None:
         super().__init__()
-        self.policies = nn.ModuleList(learner.policy for learner in learners)
+        policies = [learner.policy for learner in learners]
+        if explorations:
+            policies = [each.acting_policy(learner) for each, learner in zip(explorations, learners, strict=True)]
+        self.policies = nn.ModuleList(policies)
         self.specs = specs
         self.is_shared = is_shared
         # Learners of several classes may write keys of their own.
-        self._own_out_keys = [list(learner.policy.out_keys) for learner in learners]
+        self._own_out_keys = [list(policy.out_keys) for policy in policies]
         self.out_keys = list(dict.fromkeys(key for own_keys in self._own_out_keys for key in own_keys))
-        in_keys = {key for learner in learners for key in learner.policy.in_keys}
+        in_keys = {key for policy in policies for key in policy.in_keys}
         self.state_keys = [key for key in self.out_keys if key in in_keys]
         given = {
             keys.ACTION_MASK: specs.has_action_mask,
@@ -364,6 +375,7 @@ class HierarchicalAgent(nn.Module):
         option_lengths: the lengths that the selector chooses from together with an option, in steps. The selector's
             `specs` then list the pairs as options (`PAMDPSpecs.with_option_lengths`). If empty, it chooses options
             alone.
+        explorations: what stands beside each learner; empty for nothing.
 
     Attributes:
         policy: writes `option`, if there is a selector, and the action leaves.
@@ -380,7 +392,7 @@ class HierarchicalAgent(nn.Module):
     frames: Tensor
     values_end_with_trips: bool = False
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  (the parts of an agent, and what the run says of them)
         self,
         selector: Selector | None,
         learners: Sequence[Learner],
@@ -390,17 +402,20 @@ class HierarchicalAgent(nn.Module):
         uniform_option_steps: int = 0,
         selector_ends_options: bool = False,
         option_lengths: Sequence[int] = (),
+        *,
+        explorations: Sequence[Exploration] = (),
     ) -> None:
         super().__init__()
         self.selector = selector
         self.learners = nn.ModuleList(learners)
+        self.explorations = nn.ModuleList(explorations)
         self.specs = specs
         self.is_shared = is_shared
         self.is_frozen = is_frozen
         self.uniform_option_steps = uniform_option_steps
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self._set_is_uniform()
-        self.router = OptionRouter(learners, specs, is_shared)
+        self.router = OptionRouter(learners, specs, is_shared, explorations)
         self.option_lengths = tuple(option_lengths)
         self.pairs = OptionLengths(option_lengths) if option_lengths and selector is not None else None
         num_choices = specs.num_options * max(1, len(self.option_lengths))
@@ -456,10 +471,28 @@ class HierarchicalAgent(nn.Module):
             scalars.update({f"high/{name}": value for name, value in learned.items()})
         if self.is_frozen:
             return scalars
+        if len(self.explorations):
+            batch, explored = self._explored(batch)
+            scalars.update(explored)
         for prefix, learner, rows, mask in self._batches_of_learners(batch):
             learned = learner.learn(rows, mask)
             scalars.update({f"{prefix}/{name}": value for name, value in learned.items()})
         return scalars
+
+    def _explored(self, batch: TensorDictBase) -> tuple[TensorDictBase, dict[str, float]]:
+        """Let the explorations learn from a batch; return it with their bonuses in its rewards, and scalars to log."""
+        scalars: dict[str, float] = {}
+        bonuses = []
+        of_learners = self._batches_of_learners(batch)
+        for exploration, (prefix, _, rows, mask) in zip(self.explorations, of_learners, strict=True):
+            assert isinstance(exploration, Exploration)
+            bonus, explored = exploration.learn(rows, mask)
+            bonuses += [] if bonus is None else [bonus]
+            scalars.update({f"{prefix}/{name}": value for name, value in explored.items()})
+        if bonuses:
+            reward = batch.get(("next", keys.REWARD)) + torch.stack(bonuses).sum(0)
+            batch = batch.copy().set(("next", keys.REWARD), reward)
+        return batch, scalars
 
     def add_demonstrations(self, batch: TensorDictBase, decisions: TensorDictBase | None = None) -> None:
         """Let the selector learn from a data set `[*B, T]`, if it can, and the learners keep their own transitions.
@@ -496,7 +529,11 @@ class HierarchicalAgent(nn.Module):
         levels: dict[str, Level] = {f"learner{i}": each for i, each in enumerate(self._learners())}
         if self.selector is not None:
             levels["selector"] = self.selector
-        return {f"{level}_{name}": part for level, module in levels.items() for name, part in module.stateful().items()}
+        owners: dict[str, Level | Exploration] = dict(levels)
+        for i, exploration in enumerate(self.explorations):
+            assert isinstance(exploration, Exploration)
+            owners[f"exploration{i}"] = exploration
+        return {f"{owner}_{name}": part for owner, module in owners.items() for name, part in module.stateful().items()}
 
     @torch.no_grad()
     def replay_rows(self, name: str, steps: TensorDictBase) -> TensorDictBase | None:

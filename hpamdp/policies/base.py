@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from enum import Enum
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -26,6 +27,20 @@ class ActionFeature(Enum):
     COMPONENTS = "an action of several components"
     PAIR_MASK = "a pair_mask, which forbids pairs of discrete actions"
     PARAMETER_BOUNDS = "bounds of the parameters that depend on the state"
+
+
+@dataclass(frozen=True)
+class Bonus:
+    """The reward of an exploration for states that are new; see `Learner.novelty_by`.
+
+    Attributes:
+        weight: reward of a bonus of 1.
+        of: maps observations `[*B, observation_dim]` to their bonuses `[*B]`, at least 0. If None, the learner measures
+            by the disagreement of its own ensemble.
+    """
+
+    weight: float
+    of: Callable[[Tensor], Tensor] | None
 
 
 def have_stepped(parts: Mapping[str, Any]) -> bool:
@@ -477,6 +492,17 @@ class Learner(Level, nn.Module):
         remembers_directions: whether the learner remembers the directions of actions that a problem reveals, unless it
             has another memory or `augment=false`.
         exploring_keys: those of the policy's states that only exploration reads. They do not keep it from an export.
+        explores_with: what an exploration beside the learner may change (`Exploration.changes`). With `actions`, the
+            learner may be `is_overruled`; with `rewards`, it may have a `bonus`. Other explorations are refused.
+        novelty_by: where a bonus for new states counts. `reward`: the agent adds it to the rewards of the batch.
+            `sample`: the learner adds it to the rewards that it samples. `plan`: the learner adds it to the rewards of
+            the states in its exploring plans.
+        knows_disagreement: whether the learner has an ensemble that predicts states, whose disagreement can be the
+            bonus of plans.
+        is_overruled: whether an exploration sometimes takes another action than the policy's. Then `is_held` marks the
+            steps in the batch, bool `[*B, T]`, and what the policy writes beside the action is not of that action. An
+            exploration sets it.
+        bonus: the reward for new states; None if there is none.
         progress: the buffers, by the last part of their names, that count the steps of a run, or follow from such
             counters. They are reset if a new run takes over the learner.
         next_options: which options follow one that ended, and their values. The agent sets it.
@@ -489,7 +515,12 @@ class Learner(Level, nn.Module):
     memory_key: str | None = None
     remembers_directions: ClassVar[bool] = False
     exploring_keys: ClassVar[frozenset[str]] = frozenset()
+    explores_with: ClassVar[frozenset[str]] = frozenset()
+    novelty_by: ClassVar[Literal["reward", "sample", "plan"]] = "reward"
+    knows_disagreement: ClassVar[bool] = False
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
+    is_overruled: bool = False
+    bonus: Bonus | None = None
 
     policy: TensorDictModuleBase
     next_options: NextOptions
@@ -539,6 +570,14 @@ class Learner(Level, nn.Module):
         While exploring, `high=value` chooses the options of such learners first, so that all of them get data.
         """
         return False
+
+    def take_bonus(self, bonus: Bonus) -> None:
+        """Learn with a reward for new states from now on; an exploration calls it. Override it if plans need it.
+
+        Raises:
+            SettingError: the learner cannot use this one.
+        """
+        self.bonus = bonus
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Learn from a collected batch `[*B, T]` and return scalars to log, averaged over the updates made.

@@ -199,6 +199,11 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         learner_specs = [specs.of_option(i) for i in range(specs.num_options)] or [specs]
     chosen = zip(learners_of(config, specs), learner_specs, strict=True)
     learners = [low.build(specs=each, device=device) for low, each in chosen]
+    explorations = (
+        []
+        if config.exploration.cls is None
+        else [config.exploration.build(learner=learner, device=device) for learner in learners]
+    )
     agent = HierarchicalAgent(
         selector,
         learners,
@@ -208,6 +213,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         uniform_option_steps=config.run.agent.uniform_option_steps,
         selector_ends_options=config.run.agent.termination == "learned" and selector is not None,
         option_lengths=lengths,
+        explorations=explorations,
     )
     agent.values_end_with_trips = config.run.agent.values_end == "trip"
     return agent.to(device)

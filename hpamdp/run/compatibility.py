@@ -233,6 +233,33 @@ def forgotten_trips(config: Config, problem: ProblemFacts, *, reveals_directions
     )
 
 
+# Rules about exploration beside the learners.
+
+
+def explorations_have_steps(config: Config) -> str | None:
+    """Refuse exploration in a run whose learners take no steps of their own to learn from."""
+    exploration, run = config.exploration, config.run
+    if exploration.cls is None or run.mode == "eval":
+        return None
+    if run.mode == "offline":
+        return f"{exploration}: mode=offline takes no steps; use exploration=none"
+    if run.low.freeze:
+        return f"{exploration}: low.freeze=true keeps the learners as they are, and greedy; use exploration=none"
+    return None
+
+
+def learners_take_the_exploration(config: Config) -> str | None:
+    """Require learners that can learn from other actions than their own, or with a bonus for new states."""
+    exploration = config.exploration
+    if exploration.cls is None:
+        return None
+    changes = getattr(exploration.cls, "changes", "")
+    for low in config.learners:
+        if changes not in getattr(low.cls, "explores_with", ()):
+            return f"{exploration}: changes {changes}, which {low} does not take; use exploration=none or another low"
+    return None
+
+
 # Rules about the data that the agent learns from.
 
 
@@ -551,6 +578,8 @@ RULES: tuple[Rule, ...] = (
     values_end_where_there_are_trips,
     session_rewards_need_trips,
     sessions_are_played_here,
+    explorations_have_steps,
+    learners_take_the_exploration,
     offline_runs_have_data,
     levels_support_the_mode,
     n_step_fits_a_batch,

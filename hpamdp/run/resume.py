@@ -25,7 +25,7 @@ from hpamdp.run.assemble import choose_selector, make_env
 from hpamdp.shell import setting
 
 # Parts of the config that define the agent.
-_AGENT = ("high", "low", "encoder", "agent", "experiment", "search", RECIPE)
+_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment", "search", RECIPE)
 # Settings that a run does not take over from the saved run.
 _BEGIN = ("mode", "resume", "checkpoint", "overwrite", "trust")
 # Groups that an evaluation does not take from the saved run: it collects no steps and logs where the command line says.

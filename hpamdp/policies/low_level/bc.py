@@ -44,6 +44,7 @@ class BC(ReplayLearner):
     Options = BCOptions
     stores_own_parameters = True
     takes = frozenset(ActionFeature)
+    explores_with: ClassVar[frozenset[str]] = frozenset()  # it takes no steps
     modes: ClassVar[tuple[str, ...]] = ("offline",)
 
     def __init__(

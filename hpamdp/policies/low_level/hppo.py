@@ -14,6 +14,9 @@ Differs from the source:
   faster than the mean moves. This limit, the learning rate and the entropy bonus are annealed over `anneal_steps`, and
   so is an upper limit, if `max_scale_final` is set.
 - With `vector_products` actors and critic also see products of the vectors that the problem declares.
+- Where an exploration has taken another action than the policy's (`is_overruled`), the step counts in the values and in
+  the advantages of the steps before it, but not in the surrogates. That is the policy gradient of the return that is
+  earned with these actions among the policy's own: their probability does not depend on the policy.
 - With `memory` actors and critic share a memory of the history. A recurrent one is trained on whole sequences, each
   from the state that was stored at its first step.
 
@@ -50,6 +53,8 @@ from hpamdp.policies.shared.sequences import sequence_starts
 from hpamdp.settings import Fraction, LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
 
+# 1 for a step that the policy itself has taken, else 0.
+OWN = "is_own"
 # For each component, the part of a step's advantage that the other components contributed.
 BASELINE = "credit_baseline"
 
@@ -152,6 +157,7 @@ class HPPO(OnPolicy, Learner):
     Options = HPPOOptions
     takes = frozenset(ActionFeature)
     takes_pictures = True
+    explores_with = frozenset({"actions", "rewards"})
 
     frames: Tensor
 
@@ -210,7 +216,7 @@ class HPPO(OnPolicy, Learner):
             return {}
         if self.credit_critic is not None:
             rows["advantage"] = rows["advantage"].unsqueeze(-1) - rows[BASELINE]
-        rows["advantage"] = normalised(rows["advantage"])
+        rows["advantage"] = normalised(rows["advantage"], rows.get(OWN, None))
         for group in self.optimizer.param_groups:
             group["lr"] = options.lr + progress * (options.lr_final - options.lr)
         # A tensor, since code would be compiled again for another number.
@@ -235,11 +241,17 @@ class HPPO(OnPolicy, Learner):
         discrete_log_prob, parameter_log_prob = distribution.log_prob(rows["discrete"], rows[RAW])
         discrete_log_ratio = discrete_log_prob - rows["discrete_log_prob"]
         parameter_log_ratio = parameter_log_prob - rows["parameter_log_prob"]
+        own = rows.get(OWN)
+        if own is not None:  # before the exponential, which may overflow for actions that the policy hardly takes
+            is_own = own.reshape(-1, *[1] * (discrete_log_ratio.ndim - 1)) > 0.0
+            discrete_log_ratio = torch.where(is_own, discrete_log_ratio, 0.0)
+            parameter_log_ratio = torch.where(is_own, parameter_log_ratio, 0.0)
         advantage = rows["advantage"]
         if advantage.ndim < discrete_log_ratio.ndim:
             advantage = advantage.unsqueeze(-1)
         gain = self.surrogate(discrete_log_ratio, advantage) + self.surrogate(parameter_log_ratio, advantage)
-        gain = self.specs.components.total(gain).mean()
+        gain = self.specs.components.total(gain)
+        gain = gain.mean() if own is None else (gain * own).sum() / own.sum().clamp(min=1.0)
         discrete_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
         bonus = self.options.discrete_entropy * discrete_entropy + self.options.parameter_entropy * parameter_entropy
         critic_loss = F.mse_loss(self.critic(features).squeeze(-1), rows["target"])
@@ -275,6 +287,11 @@ class HPPO(OnPolicy, Learner):
             "advantage": advantage[mask],
             "target": target[mask],
         }
+        if self.is_overruled:
+            is_held = batch.get(keys.IS_HELD)[mask]
+            taken = self.specs.to_unit(batch.get(keys.PARAMETERS), batch)[mask]
+            rows[RAW] = torch.where(is_held.unsqueeze(-1), taken, rows[RAW])
+            rows[OWN] = (~is_held).to(torch.float32)
         if self.specs.has_action_mask:
             rows[keys.ACTION_MASK] = batch.get(keys.ACTION_MASK)[mask]
         if self.specs.has_pair_mask:
@@ -305,6 +322,8 @@ class HPPO(OnPolicy, Learner):
         columns |= {"discrete_log_prob": choice, "parameter_log_prob": choice}
         if self.credit_critic is not None:
             columns |= {BASELINE: choice, "raw_advantage": number}
+        if self.is_overruled:
+            columns[OWN] = number
         if self.specs.has_action_mask:
             columns[keys.ACTION_MASK] = torch.zeros(0, self.specs.num_discrete, dtype=torch.bool)
         if self.specs.has_pair_mask:

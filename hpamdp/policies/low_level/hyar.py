@@ -613,8 +613,11 @@ class HyAR(ReplayLearner):
         self.codec.z_high.copy_(torch.maximum(high, low + 1e-3))
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return the rows to store, with the latent actions that the actor gave."""
-        return super().transitions(batch).set(LATENT, batch[LATENT])
+        """Return the rows to store, with the latent actions that the actor gave; NaN where an exploration acted."""
+        latent = batch[LATENT]
+        if self.is_overruled:
+            latent = torch.where(batch[keys.IS_HELD].unsqueeze(-1), torch.nan, latent)
+        return super().transitions(batch).set(LATENT, latent)
 
     def augmented(self, sample: TensorDictBase) -> TensorDictBase:
         """Return a sample mapped by random symmetries; the latent actions are encoded again later."""

@@ -20,7 +20,7 @@ TorchRL's IQLLoss does not fit: it reads a single action leaf.
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
@@ -68,6 +68,7 @@ class IQL(ReplayLearner):
 
     Options = IQLOptions
     takes = frozenset(ActionFeature)
+    explores_with: ClassVar[frozenset[str]] = frozenset()  # its policy stays near the actions in the data
     stores_own_parameters = True
 
     options: IQLOptions

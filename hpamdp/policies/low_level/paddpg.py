@@ -32,6 +32,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.components import Components
 from hpamdp.policies.base import ActionFeature
 from hpamdp.policies.masks import masked_values, with_fixed
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions, TwinCriticOptions
@@ -116,6 +117,17 @@ def with_lowest_scores(output: Tensor, allowed: Tensor | None) -> Tensor:
         return output
     scores, parameters = output.tensor_split([allowed.shape[-1]], -1)
     return torch.cat([scores.masked_fill(~allowed, -1.0), parameters], -1)
+
+
+def with_best(scores: Tensor, discrete: Tensor, components: Components) -> Tensor:
+    """Return scores `[*B, num_discrete]` in which the chosen discrete action of each component has the highest one.
+
+    It has changed scores with the action that had it.
+    """
+    places = components.places(discrete)
+    best = components.places(components.best(scores))
+    swapped = scores.scatter(-1, best, scores.gather(-1, places))
+    return swapped.scatter(-1, places, scores.gather(-1, best))
 
 
 class PADDPGPolicy(TensorDictModuleBase):
@@ -218,8 +230,12 @@ class PADDPG(ReplayLearner):
         return self.value(observation, action_mask, **memory, smoothing=self.options.target_smoothing)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return the rows to store, with all scores."""
-        return super().transitions(batch).set(SCORES, batch[SCORES])
+        """Return the rows to store, with all scores; where an exploration acted, with the highest for its action."""
+        scores = batch[SCORES]
+        if self.is_overruled:
+            swapped = with_best(scores, batch[keys.DISCRETE], self.specs.components)
+            scores = torch.where(batch[keys.IS_HELD].unsqueeze(-1), swapped, scores)
+        return super().transitions(batch).set(SCORES, scores)
 
     def on_progress(self, steps: int) -> None:
         """Lower the probability of random actions."""

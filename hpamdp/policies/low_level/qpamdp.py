@@ -393,6 +393,7 @@ class QPAMDP(Learner):
 
     Options = QPAMDPOptions
     takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
+    explores_with: ClassVar[frozenset[str]] = frozenset({"actions", "rewards"})
     # A run from `low.checkpoint` goes on in the saved phase: a second warm-up would fit other bases under the weights.
     progress: ClassVar[frozenset[str]] = frozenset()
 
@@ -581,6 +582,8 @@ class QPAMDP(Learner):
             psi = self.policy.psi(observation)
             error = batch[RAW] - self.policy.mean(observation)
             score = error / self.policy.sigma.square() * self.mask[rows["discrete"]]
+            if self.is_overruled:  # the action did not come from the mean
+                score = score * ~batch[keys.IS_HELD].unsqueeze(-1)
             rows["gradient"] = (score.unsqueeze(-1) * psi.unsqueeze(-2)).flatten(-2)
         return TensorDict(rows, batch_size=mask.shape)
 

@@ -20,7 +20,7 @@ TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, wi
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
@@ -131,6 +131,7 @@ class TD3BC(ReplayLearner):
 
     Options = TD3BCOptions
     takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
+    explores_with: ClassVar[frozenset[str]] = frozenset()  # it would imitate random actions
     stores_own_parameters = True
 
     options: TD3BCOptions

@@ -127,9 +127,15 @@ class OnPolicy(nn.Module):
         return self.descent.step(self.optimizer, loss_of, *inputs, max_grad_norm=self.options.max_grad_norm)
 
 
-def normalised(advantage: Tensor) -> Tensor:
-    """Return advantages `[M]` with mean 0 and standard deviation 1."""
-    return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-6)
+def normalised(advantage: Tensor, weight: Tensor | None = None) -> Tensor:
+    """Return advantages `[M]` or `[M, components]` with mean 0 and standard deviation 1.
+
+    Args:
+        advantage: the advantages.
+        weight: 1 for the rows whose mean and deviation count, else 0, `[M]`. If None, all rows count.
+    """
+    counted = advantage if weight is None or not weight.any() else advantage[weight > 0.0]
+    return (advantage - counted.mean()) / (counted.std(correction=0) + 1e-6)
 
 
 def mean_scalars(steps: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:

@@ -50,8 +50,8 @@ class PlanningOptions(SearchOptions, EndValueOptions, ReplayOptions):
 class PlanningPolicy(TensorDictModuleBase):
     """Takes the first action of a plan; a random one until `is_trained`, and with probability `epsilon` if it explores.
 
-    Nothing is planned for finished episodes: their action is random, too, and is ignored. A subclass implements
-    `first_action`.
+    Nothing is planned for finished episodes, nor where an exploration holds an action: the random action there is
+    ignored. A subclass implements `first_action`.
     """
 
     is_trained: Tensor
@@ -80,6 +80,9 @@ class PlanningPolicy(TensorDictModuleBase):
         done = td.get(keys.DONE, None)
         if done is not None:
             is_planned = is_planned & ~done.flatten()
+        is_held = td.get(keys.IS_HELD, None)
+        if is_held is not None:
+            is_planned = is_planned & ~is_held.flatten()
         if self.epsilon > 0.0 and not is_greedy():
             is_planned = is_planned & (torch.rand(num, device=device, dtype=torch.float32) >= self.epsilon)
         if is_planned.any():

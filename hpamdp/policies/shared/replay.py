@@ -17,7 +17,7 @@ from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.observation_entries import packed, unpacked
-from hpamdp.policies.base import Learner
+from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
 from hpamdp.policies.shared.memory import MemoryOptions, ReplayMemoryOptions
 from hpamdp.policies.shared.perception import Perception
@@ -95,6 +95,8 @@ class ReplayLearner(Learner):
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
+    explores_with: ClassVar[frozenset[str]] = frozenset({"actions", "rewards"})
+    novelty_by: ClassVar[Literal["reward", "sample", "plan"]] = "sample"
     progress: ClassVar[frozenset[str]] = Learner.progress | {"last_rows"}
     stores_own_parameters: bool = False
     catches_up: bool = False
@@ -172,11 +174,19 @@ class ReplayLearner(Learner):
             self.start()
         history: dict[str, list[Tensor]] = {}
         for sample in self.sample_batches(num_updates) if num_updates > 0 else ():
+            if self.bonus is not None and self.novelty_by == "sample":
+                sample = self.with_bonus(sample, self.bonus)
             self.updates += 1
             for name, value in self.update_once(sample).items():
                 history.setdefault(name, []).append(value.detach())
         scalars = {name: torch.stack(values).mean().item() for name, values in history.items()}
         return {**scalars, "updates": self.updates.item()}
+
+    def with_bonus(self, sample: TensorDictBase, bonus: Bonus) -> TensorDictBase:
+        """Return a sample whose rewards include the bonus for the next states, as new as they are now."""
+        assert bonus.of is not None
+        more = self.reward_scale * bonus.weight * bonus.of(sample["next_state"])
+        return sample.set("reward", sample["reward"] + more)
 
     @abstractmethod
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:

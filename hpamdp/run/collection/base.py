@@ -80,6 +80,9 @@ def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, 
             raise ValueError(f"{where}: {key} is not finite")
     choices = {"discrete": steps.get(keys.DISCRETE, None), "option": steps.get(keys.OPTION, None)}
     check_choices({name: column for name, column in choices.items() if column is not None}, parts.agent.specs)
+    held = steps.get(keys.HOLD_DISCRETE, None)
+    if held is not None:
+        check_choices({"discrete": held}, parts.agent.specs)
     lengths, chosen = parts.agent.option_lengths, steps.get(keys.OPTION_LENGTH, None)
     if lengths and chosen is not None and not {*chosen.unique().tolist()} <= {*lengths}:
         raise ValueError(f"{where}: option_length holds {chosen.unique().tolist()}, but must be of {list(lengths)}")

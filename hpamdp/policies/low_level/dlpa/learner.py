@@ -43,7 +43,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import ActionFeature, option_ends
+from hpamdp.policies.base import ActionFeature, Bonus, option_ends
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
 from hpamdp.policies.low_level.dlpa.planner import Planner, PlannerOptions
 from hpamdp.policies.shared.end_values import EndValues
@@ -91,12 +91,13 @@ class DLPAPolicy(PlanningPolicy):
         self.model = planner.model  # makes the model's weights part of the policy's state
         self.end_value = planner.end_value  # and those of the values
         self.planner = planner
+        self.bonus: Bonus | None = None
 
     def first_action(
         self, td: TensorDictBase, observation: Tensor, is_planned: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Return the first action of each plan, see `PlanningPolicy.first_action`."""
-        plan = self.planner.plan(observation[is_planned], mask)
+        plan = self.planner.plan(observation[is_planned], mask, None if is_greedy() else self.bonus)
         probability, mean, deviation = (part[:, 0] for part in plan)
         components = self.specs.components
         if is_greedy():
@@ -119,6 +120,7 @@ class DLPA(ReplayLearner):
     modes: ClassVar[tuple[str, ...]] = ("train",)
     value_setting = "end_values"
     catches_up = True
+    novelty_by = "plan"
     export_refusal = "plans at every step"
 
     options: DLPAOptions
@@ -142,6 +144,11 @@ class DLPA(ReplayLearner):
         self.optimizers = {"model": torch.optim.Adam(self.model.parameters(), lr=options.lr, fused=True)}
         if self.end_values is not None:
             self.optimizers["end_values"] = self.end_values.optimizer()
+
+    def take_bonus(self, bonus: Bonus) -> None:
+        """Add a bonus to the rewards of exploring plans."""
+        super().take_bonus(bonus)
+        self.policy.bonus = bonus
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the model from windows `[batch_size, horizon]`, and the values from the first step of each."""

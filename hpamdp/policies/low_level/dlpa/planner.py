@@ -14,6 +14,7 @@ from pydantic import Field, NonNegativeFloat, model_validator
 from torch import Tensor
 from typing_extensions import Self
 
+from hpamdp.policies.base import Bonus
 from hpamdp.policies.shared.gradients import lower_products
 from hpamdp.policies.shared.planning import Prediction, absolute_temperature, discounted_return, elite_weights
 from hpamdp.policies.shared.planning_policy import PlanningOptions
@@ -73,20 +74,21 @@ class Planner:
         self.precision: torch.dtype = getattr(torch, self.options.planning_precision)
 
     @torch.no_grad()
-    def plan(self, state: Tensor, action_mask: Tensor | None = None) -> Plan:
+    def plan(self, state: Tensor, action_mask: Tensor | None = None, bonus: Bonus | None = None) -> Plan:
         """Return the final distributions for states `[N, observation_dim]`.
 
         Args:
             state: where the plans begin.
             action_mask: what the environment allows there, bool `[N, num_discrete]`. If None, everything. What it will
                 allow in predicted states is unknown, and taken to be everything.
+            bonus: a reward for predicted states that are new; None for none.
         """
         size = max(1, _CHUNK_ROWS // self.options.num_samples)
         masks = [None] * len(state) if action_mask is None else action_mask.split(size)
-        plans = [self._plan(rows, mask) for rows, mask in zip(state.split(size), masks, strict=False)]
+        plans = [self._plan(rows, mask, bonus) for rows, mask in zip(state.split(size), masks, strict=False)]
         return Plan(*(torch.cat(parts) for parts in zip(*plans, strict=True)))
 
-    def _plan(self, state: Tensor, action_mask: Tensor | None) -> Plan:
+    def _plan(self, state: Tensor, action_mask: Tensor | None, bonus: Bonus | None) -> Plan:
         shape = state.shape[0], self.options.horizon
         sizes = state.new_tensor([1.0 / size for size in self.components.sizes])
         sizes = sizes[self.components.component_of(state.device)]
@@ -105,7 +107,7 @@ class Planner:
         temperature: Tensor | None = None
         for _ in range(self.options.num_iterations):
             discrete, unit_parameters = self.sample(plan)
-            returns = self.returns(state, discrete, unit_parameters)
+            returns = self.returns(state, discrete, unit_parameters, bonus)
             if temperature is None:
                 temperature = absolute_temperature(self.options.temperature, returns)
             plan = self.re_estimate(plan, discrete, unit_parameters, returns, temperature)
@@ -122,8 +124,11 @@ class Planner:
         unit_parameters = plan.mean.unsqueeze(1) + plan.deviation.unsqueeze(1) * noise
         return discrete, unit_parameters.clamp(-1.0, 1.0)
 
-    def returns(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Tensor:
-        """Return the predicted returns `[N, S]` of action sequences from states `[N, observation_dim]`."""
+    def returns(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor, bonus: Bonus | None = None) -> Tensor:
+        """Return the predicted returns `[N, S]` of action sequences from states `[N, observation_dim]`.
+
+        With a bonus they include that of the predicted states.
+        """
         rows = state.repeat_interleave(discrete.shape[1], 0)
 
         def steps() -> Iterator[Prediction]:
@@ -133,7 +138,7 @@ class Planner:
                     chosen = discrete[:, :, h].flatten(0, 1)
                     predicted = self.model(rows, chosen, unit_parameters[:, :, h].flatten(0, 1))
                 rows = predicted.next_state
-                yield predicted
+                yield predicted if bonus is None else with_bonus(predicted, bonus)
 
         total = discounted_return(steps(), self.options.gamma, self.end_value)
         value = total.mean(0)
@@ -173,3 +178,9 @@ class Planner:
             plan.mean.lerp(torch.where(total > 1e-8, mean, plan.mean), step),
             plan.deviation.lerp(torch.where(total > 1e-8, deviation, plan.deviation), step),
         )
+
+
+def with_bonus(predicted: Prediction, bonus: Bonus) -> Prediction:
+    """Return a prediction whose reward, if the step does not terminate, includes the bonus for its next state."""
+    assert bonus.of is not None
+    return predicted._replace(continuing=predicted.continuing + bonus.weight * bonus.of(predicted.next_state.float()))

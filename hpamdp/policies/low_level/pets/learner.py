@@ -50,7 +50,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from hpamdp.policies.base import ActionFeature
+from hpamdp.policies.base import ActionFeature, Bonus
 from hpamdp.policies.low_level.pets.model import PETSModel
 from hpamdp.policies.low_level.pets.policy import PETSPolicy, PETSPolicyOptions
 from hpamdp.policies.shared.end_values import EndValues
@@ -60,6 +60,7 @@ from hpamdp.policies.shared.networks import polyak_update
 from hpamdp.policies.shared.planning_policy import plan_ends
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.policies.shared.sequences import past_of, sample_with_past, states_of_past
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 _MAX_COPIES = 16  # of a stored step under the problem's symmetries
@@ -93,6 +94,8 @@ class PETS(ReplayLearner):
     stores_own_parameters = True
     catches_up = True
     remembers_directions = True
+    novelty_by = "plan"
+    knows_disagreement = True
     export_refusal = "plans at every step"
 
     options: PETSOptions
@@ -107,7 +110,8 @@ class PETS(ReplayLearner):
         **settings: Any,
     ) -> None:
         options = PETSOptions.of(options, settings)
-        self.entries = list(range(specs.observation_dim))
+        self.num_entries = specs.observation_dim
+        self.entries = list(range(self.num_entries))
         remembers = options.memory != "none"
         uses_geometry = options.augment is not False and not remembers
         is_revealed = uses_geometry and specs.geometry is not None and specs.geometry.revealed is not None
@@ -129,6 +133,20 @@ class PETS(ReplayLearner):
         self.optimizers = {"model": adam}
         if self.end_values is not None:
             self.optimizers["end_values"] = self.end_values.optimizer()
+
+    def take_bonus(self, bonus: Bonus) -> None:
+        """Add a bonus to the rewards of exploring plans, which all members then make together.
+
+        Raises:
+            SettingError: the bonus is of whole observations, but the model predicts less, or turned ones.
+        """
+        if bonus.of is not None and (self.model.frame.turns or len(self.entries) < self.num_entries):
+            raise SettingError(
+                "in_plans=distillation: low=pets does not predict whole observations; use low.augment=false"
+            )
+        super().take_bonus(bonus)
+        self.policy.bonus = bonus
+        self.policy.samples_posterior = False
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update every member from its own minibatch of a sample `[num_members, batch_size]`.
@@ -272,12 +290,16 @@ class PETS(ReplayLearner):
         return rows.set("unit", rows["unit"].gather(-1, self.slots[rows["discrete"]]))
 
     def on_progress(self, steps: int) -> None:
-        """Let the policy plan once stored rewards or terminations differ, or at once if there are end values."""
+        """Let the policy plan once stored rewards or terminations differ.
+
+        With end values, or a reward for new states, it plans at once.
+        """
         if self.policy.is_trained:  # later steps may be the same because the plans are good
             return
         stored = self.buffer[:]
         differ = [(stored[name] != stored[name][0]).any() for name in ("reward", "terminated")]
-        self.policy.is_trained.fill_(self.end_values is not None or bool(torch.stack(differ).any()))
+        plans_at_once = self.end_values is not None or self.bonus is not None
+        self.policy.is_trained.fill_(plans_at_once or bool(torch.stack(differ).any()))
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the model's inputs and targets in a batch `[*B, T]`; a truncated step has not terminated.

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.policies.base import Bonus
 from hpamdp.policies.low_level.pets.model import PETSModel, PETSModelOptions
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
@@ -65,7 +66,12 @@ class PETSPolicy(PlanningPolicy):
 
     Acts uniformly at random until the stored steps differ in their rewards or in whether they terminate: before, all
     plans have the same value.
+
+    Attributes:
+        bonus: a reward of exploring plans for new states; None for none.
     """
+
+    bonus: Bonus | None = None
 
     def __init__(
         self,
@@ -150,6 +156,10 @@ class PETSPolicy(PlanningPolicy):
     def _follows_member(self) -> bool:
         return self.samples_posterior and not is_greedy()
 
+    @property
+    def _plan_bonus(self) -> Bonus | None:
+        return None if is_greedy() else self.bonus
+
     def plan(self, state: Tensor, member: Tensor | None = None, allowed: Tensor | None = None) -> PlannedAction:
         """Plan from states `[N, F]`, each with its own member `[N]`. If None, with the mean of all.
 
@@ -190,7 +200,8 @@ class PETSPolicy(PlanningPolicy):
     def _plan(self, state: Tensor, allowed: Tensor | None, *, is_mean: bool) -> PlannedAction:
         """Plan from states `[E, N, F]`: N plans by the mean of all members, or one for each state.
 
-        In a plan by the mean, single members choose the sequences that are refined, which takes a fraction of the time.
+        In a plan by the mean, single members choose the sequences that are refined, which takes a fraction of the time,
+        unless new states are rewarded.
         `allowed` is bool `[N, horizon, J]`, or `[E, N, horizon, J]`.
         """
         search = self.search
@@ -203,7 +214,9 @@ class PETSPolicy(PlanningPolicy):
             if own is not None:
                 own = own[begin : begin + size] if is_mean else own[:, begin : begin + size].flatten(0, 1)
             num_plans = piece.shape[1] if is_mean else piece.shape[:2].numel()
-            first_returns = self._returns_of_single_members(piece[0]) if is_mean else None
+            # Single members do not know what is new.
+            is_rough = is_mean and self._plan_bonus is None
+            first_returns = self._returns_of_single_members(piece[0]) if is_rough else None
             returns = self._returns(piece, is_mean)
             part = search(returns, num_plans, state.device, own, first_returns, is_greedy=is_greedy())
             parts.append(part if is_mean else PlannedAction(*(each.unflatten(0, piece.shape[:2]) for each in part)))
@@ -217,6 +230,7 @@ class PETSPolicy(PlanningPolicy):
         imagined step, the memory is that after the predicted observation.
         """
         num_members, num_states = state.shape[:2]
+        bonus = self._plan_bonus if is_mean else None
 
         def for_members(part: Tensor) -> Tensor:
             """Return `[N, ...]` or `[E * N, ...]` as `[E, N, ...]`."""
@@ -234,6 +248,8 @@ class PETSPolicy(PlanningPolicy):
                     discrete = for_members(step.discrete).unsqueeze(-1).expand(num_members, *shape).flatten(1)
                     own = for_members(step.own).flatten(1, 3)
                     ahead = self.model(rows.mT, discrete, own, self.precision)
+                    if bonus is not None:
+                        ahead = self._with_bonus(rows.mT, ahead, bonus)
                     next_rows = ahead.next_state
                     if place < len(steps) - 1 or self.end_value is not None:
                         next_rows = self.perception.imagined(rows.mT, next_rows)
@@ -249,6 +265,25 @@ class PETSPolicy(PlanningPolicy):
             return total.mean(0) if weight == 0.0 else total.mean(0) + weight * total.std(0, correction=0)
 
         return returns
+
+    def _with_bonus(self, state: Tensor, ahead: Prediction, bonus: Bonus) -> Prediction:
+        """Return predictions whose rewards, if the step does not terminate, include the bonus of its next state.
+
+        Disagreement is the standard deviation of the members' predicted changes, in units of the usual change, averaged
+        over the predicted entries.
+
+        Args:
+            state: `[E, B, F]`, from which each member predicts.
+            ahead: what they predict, `[E, B]`.
+            bonus: the bonus.
+        """
+        model = self.model
+        if bonus.of is not None:
+            return ahead._replace(continuing=ahead.continuing + bonus.weight * bonus.of(ahead.next_state.float()))
+        before = model.split(state)[1]
+        change = (ahead.next_state.float() - before.float()) / model.change_scale
+        spread = (change.std(0, correction=0) * model.is_predicted).sum(-1) / model.is_predicted.sum().clamp(min=1.0)
+        return ahead._replace(continuing=ahead.continuing + bonus.weight * spread)
 
     def _end_value_of_joined(self, rows: Tensor) -> Tensor:
         """Return the values `[E, N, Q, S]` of states `[E, F, N, Q, S]` at the end of a plan."""

@@ -1,0 +1,1 @@
+"""Exploration that reaches far: modules that stand beside the learners, one class each."""
