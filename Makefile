@@ -48,11 +48,12 @@ slow:
 coverage: $(VENV)/.installed-dev
 	$(PYTHON) -m pytest -n auto --dist worksteal $(COVERAGE) $(ARGS)
 
-# All slow tests, and those quick ones on sweeps that need a launcher. Those of the page of `make play` in a browser skip
-# where there is no Chromium; on Debian, `apt-get install chromium` brings one.
+# All slow tests, and those quick ones that need an extra: on sweeps a launcher, on primitives the simulator. Those of the
+# page of `make play` in a browser skip where there is no Chromium; on Debian, `apt-get install chromium` brings one.
 slow-tests: $(SLOW)/.installed
 	$(SLOW)/bin/python -m pytest -n 2 --dist worksteal -m slow -k 'not ($(RAY_TEST))' $(ARGS)
 	$(SLOW)/bin/python -m pytest tests/test_sweeps.py -k 'not missing_launcher' $(ARGS)
+	$(SLOW)/bin/python -m pytest tests/test_primitives.py $(ARGS)
 
 ray-launcher: $(RAY)/.installed
 	$(RAY)/bin/python -m pytest tests/test_sweeps.py -m slow -k '$(RAY_TEST)' $(ARGS)
@@ -107,7 +108,7 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 
 $(SLOW)/.installed: pyproject.toml constraints.txt
 	$(venv)
-	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray,browser,video,traffic]'
+	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray,browser,video,traffic,robots]'
 	@touch $@
 
 # This launcher wants cloudpickle < 3, so it has constraints of its own; without them pip searches for an hour.

@@ -8,6 +8,11 @@ import argparse
 import sys
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
+from hpamdp.analysis import film
+from hpamdp.env.primitives import players
 from hpamdp.run import watch
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -36,11 +41,21 @@ PLAYERS = {
 EPISODES = {"boatdock_unseen": "1", "traffic": "1"}
 
 
+def film_primitives(to: Path) -> None:
+    """Film the hand-written player of one task; MuJoCo needs a display, or MUJOCO_GL=egl."""
+    pictures = players.film("assembly", seed=900)
+    small = [np.array(Image.fromarray(picture).resize((200, 200))) for picture in pictures]
+    film.write(to, small, fps=10.0)
+
+
 def main(names: list[str]) -> int:
     """Write the GIFs beside the pages."""
-    for name in names or PLAYERS:
-        who = [str(ROOT / word) if word.startswith("agents/") else word for word in PLAYERS[name]]
+    for name in names or [*PLAYERS, "primitives"]:
         to = ROOT / "docs" / "domains" / f"{name}.gif"
+        if name == "primitives":
+            film_primitives(to)
+            continue
+        who = [str(ROOT / word) if word.startswith("agents/") else word for word in PLAYERS[name]]
         watch.main(
             [*who, "--to", str(to), "--episodes", EPISODES.get(name, "3"), "--size", "240"], argparse.ArgumentParser()
         )

@@ -114,7 +114,7 @@ def choices(group: str) -> list[str]:
 
 def buildable(problems: Iterable[str]) -> list:
     """Return problems as parameters of a test that builds them. Those that need an extra that `dev` lacks may skip."""
-    needed = {"traffic": "libsumo"}
+    needed = {"traffic": "libsumo", "primitives": "metaworld"}
     missing = {name for name, module in needed.items() if find_spec(module) is None}
     skip = pytest.mark.skipif(True, reason="needs the extra of its name")
     return [pytest.param(name, marks=skip if name in missing else ()) for name in problems]

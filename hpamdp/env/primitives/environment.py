@@ -1,0 +1,132 @@
+"""Manipulation by primitives as a batched TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial, update_wrapper
+from typing import Annotated, Any, ClassVar
+
+import torch
+from pydantic import Field, NonNegativeInt, PositiveInt
+
+from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
+from hpamdp.env.primitives.manipulation import ACTIONS, OBSERVED, Actions, Manipulation, Reward, Task
+from hpamdp.env.primitives.players import MEASURED
+from hpamdp.env.primitives.primitives import STEPS
+from hpamdp.settings import PositiveFraction, Settings
+
+_GROUPED_PRIMITIVES = {
+    "move": ["move", "open"],
+    "grasp": ["grasp", "close"],
+    "pull": ["lift", "drop", "left", "right", "forward", "backward"],
+}
+
+
+class PrimitivesOptions(Settings):
+    """Settings of `PrimitivesEnv`."""
+
+    task: Task = "drawer_close"
+    """Meta-World's task."""
+    reward: Reward = "sparse"
+    """`sparse`: 1 for each primitive with a success in it; `dense`: the mean of Meta-World's rewards in it, 0 to 10."""
+    decisions: PositiveInt = 5
+    """Primitives in an episode; 60 small or 6 large position steps take as long as one."""
+    actions: Actions = "primitives"
+    """What the agent chooses from: `primitives`, `small_steps` (up to 1 cm), `large_steps` (up to 10 cm), or `all`."""
+    reach: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    """Largest absolute value of a primitive's argument, in metres."""
+    negative_distances: bool = True
+    """Whether primitives along one axis also take distances below 0, which count as 0, as in the source."""
+    render: bool = False
+    """Draw the arm, for films; without a display MuJoCo needs MUJOCO_GL=egl or osmesa."""
+    reward_scaling: PositiveFraction | None = None
+    """Divide rewards in training by the running standard deviation of the return with this discount.
+
+    If None, rewards are not scaled.
+    """
+    num_workers: NonNegativeInt = 0
+    """Processes that step the environments in parallel. If 0, this process steps them."""
+
+
+class PrimitivesEnv(GymnasiumEnv):
+    """Let `num_envs` arms manipulate objects at once.
+
+    Action leaves, with the ten primitives:
+
+    - `("action", "discrete")` int64 `[N]`: move, grasp, lift, drop, left, right, forward, backward, open, close;
+    - `("action", "parameters")` float32 `[N, 12]`: three distances for each of the first two, one for each of the next
+      six, in metres.
+
+    `observation` float32 `[N, 15]`: see `manipulation.OBSERVED`, scaled to [-1, 1]. Options, if `env.grouping=default`:
+    `move`, `grasp` and `pull`; with `actions=all` instead `small_steps`, `large_steps` and `primitives`, so that an
+    option that holds for an episode is the choice of how to steer. See `Manipulation`, and `GymnasiumEnv` for the
+    arguments and the errors.
+    """
+
+    Options: ClassVar[type[Settings]] = PrimitivesOptions
+    guarded_settings: ClassVar[tuple[str, ...]] = ()
+    observation_names = OBSERVED
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        options: PrimitivesOptions | None = None,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+        **settings: Any,
+    ) -> None:
+        given = PrimitivesOptions.of(options, settings)
+        shortest = min(action.ticks for action in ACTIONS[given.actions])
+        reading = GymnasiumOptions(
+            max_steps=given.decisions * STEPS // shortest,
+            reward_scaling=given.reward_scaling,
+            num_workers=given.num_workers,
+        )
+        make = partial(
+            Manipulation,
+            given.task,
+            actions=given.actions,
+            reward=given.reward,
+            decisions=given.decisions,
+            reach=given.reach,
+            has_negative_distances=given.negative_distances,
+            render_mode="rgb_array" if given.render else None,
+        )
+        update_wrapper(make, Manipulation)  # so that errors name Manipulation
+        super().__init__(num_envs, make=make, options=reading, device=device, seed=seed, first_env=first_env)
+        self._given = given
+        self.discrete_names = tuple(action.name for action in ACTIONS[given.actions])
+
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return the facts about the problem under these settings."""
+        return ProblemFacts(
+            title=cls.__name__,
+            is_shardable=options.num_workers == 0,
+            has_statistics=options.reward_scaling is not None,
+            default_options=_default_options(options.actions),
+        )
+
+    @property
+    def default_options(self) -> Mapping[str, Sequence[int | str]]:
+        """The kinds of primitives, or with `actions=all` the ways of steering."""
+        return _default_options(self._given.actions)
+
+    def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return what the hand-written player of the task reaches in an episode of five primitives."""
+        if self._given.decisions != PrimitivesOptions().decisions:
+            return {}
+        reached = MEASURED[self._given.task]
+        return {"player of primitives": {"score": reached[self._given.reward], "success": reached["success"]}}
+
+
+def _default_options(actions: Actions) -> dict[str, list[int | str]]:
+    groups = _GROUPED_PRIMITIVES if actions == "primitives" else {}
+    if actions == "all":
+        groups = {
+            name: [action.name for action in ACTIONS[name]] for name in ("small_steps", "large_steps", "primitives")
+        }
+    return {name: [*members] for name, members in groups.items()}
