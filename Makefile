@@ -48,12 +48,13 @@ slow:
 coverage: $(VENV)/.installed-dev
 	$(PYTHON) -m pytest -n auto --dist worksteal $(COVERAGE) $(ARGS)
 
-# All slow tests, and those quick ones that need an extra: on sweeps a launcher, on primitives the simulator. Those of the
+# All slow tests, and those quick ones that need an extra: a launcher for sweeps, a simulator. Those of the
 # page of `make play` in a browser skip where there is no Chromium; on Debian, `apt-get install chromium` brings one.
 slow-tests: $(SLOW)/.installed
 	$(SLOW)/bin/python -m pytest -n 2 --dist worksteal -m slow -k 'not ($(RAY_TEST))' $(ARGS)
 	$(SLOW)/bin/python -m pytest tests/test_sweeps.py -k 'not missing_launcher' $(ARGS)
 	$(SLOW)/bin/python -m pytest tests/test_primitives.py $(ARGS)
+	$(SLOW)/bin/python -m pytest tests/test_traffic.py tests/test_pages.py tests/test_default_dtype.py -k traffic $(ARGS)
 
 ray-launcher: $(RAY)/.installed
 	$(RAY)/bin/python -m pytest tests/test_sweeps.py -m slow -k '$(RAY_TEST)' $(ARGS)

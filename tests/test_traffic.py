@@ -112,7 +112,7 @@ def test_the_actuated_player_is_sumos_own_program(tmp_path, name):
 
 def test_an_agent_that_always_takes_a_strategy_has_the_results_of_that_player(make):
     for name in ("crossing", "corridor"):
-        env = make(TrafficLights, network=name, strategies=True)
+        env = make(TrafficLights, network=name, strategies=True, minutes=2)
         for number, player in enumerate(PLAYERS):
             env.reset(seed=9)
             is_over = False

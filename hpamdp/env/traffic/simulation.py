@@ -245,9 +245,8 @@ class Simulation:
             self._step()
         if due:
             self._due = due[0]
-        reward = -(self._measure() - self._earlier) / HOUR_S
-        self._earlier = self._measure()
-        return self._seen(reward)
+        earlier, self._earlier = self._earlier, self._measure()
+        return self._seen((earlier - self._earlier) / HOUR_S)
 
     def _measure(self) -> float:
         """Return the vehicle seconds whose increase since the last decision costs the agent."""
