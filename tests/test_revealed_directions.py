@@ -95,6 +95,30 @@ def test_unknown_directions_are_guessed_opposite_to_the_known_ones(family, certa
     torch.testing.assert_close(certainty, expected)
 
 
+@pytest.mark.parametrize("family", ["turned", "any"])
+def test_sampled_directions_agree_with_the_known_ones_and_have_their_sum(family):
+    memory = KnownDirections(PAMDPSpecs.from_env(UnseenBoatsEnv(1, family=family)))
+    torch.manual_seed(0)
+    x = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.6, 0.0], [-0.5, 1.0, 0.0]])
+    y = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.8, 0.0], [0.75**0.5, 0.0, 0.0]])
+    features = torch.cat([memory.table(torch.cat([x, y], -1)), torch.randn(3, memory.num_features - 9)], -1)
+    sampled = memory.hypotheses(features, 64)
+    assert sampled.shape == (3, 64, memory.num_features)
+    torch.testing.assert_close(sampled[..., 9:], features[:, None, 9:].expand(-1, 64, -1))
+    assert not memory.unknown(sampled).any()
+    directions = sampled[..., :6].unflatten(-1, (2, 3)).mT
+    torch.testing.assert_close(directions.norm(dim=-1), torch.ones(3, 64, 3))
+    torch.testing.assert_close(directions[1, :, 1], torch.tensor([[0.6, 0.8]]).expand(64, -1))
+    torch.testing.assert_close(directions[2, :, :2], torch.tensor([[-0.5, 0.75**0.5], [1.0, 0.0]]).expand(64, -1, -1))
+    # Each unknown one points everywhere, or where the sum leaves it: in two places after the first.
+    assert directions[0].mean(0).abs().max() < 0.1
+    if family == "turned":
+        torch.testing.assert_close(directions.sum(2), torch.zeros(3, 64, 2), atol=1e-5, rtol=0.0)
+        assert len(directions[1, :, 0].round(decimals=3).unique(dim=0)) == 2
+    else:
+        assert directions[1, :, 0].mean(0).abs().max() < 0.1 and directions[2, :, 2].mean(0).abs().max() < 0.1
+
+
 def test_the_model_learns_from_states_in_which_certain_presses_go_along_x():
     env = UnseenBoatsEnv(16, seed=3)
     learner = make(env, warmup_steps=1000)

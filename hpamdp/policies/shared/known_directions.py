@@ -5,6 +5,8 @@ Nothing is learned here: a single step shows the direction of its action exactly
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -77,6 +79,32 @@ class KnownDirections(nn.Module):
         """
         return joined(features[..., : self.table_size], observation)
 
+    def unknown(self, features: Tensor) -> Tensor:
+        """Return the actions whose directions are guessed, bool `[*B, K]`, of features `[*B, num_features]`."""
+        return features[..., 2 * self.num_actions : self.table_size] < 1.0
+
+    def hypotheses(self, features: Tensor, num: int) -> Tensor:
+        """Return the features `[N, M, num_features]` under M sampled sets of directions that agree with what is known.
+
+        An unknown direction is uniform on the circle. If the directions of all actions sum to zero, the last two
+        follow from the others, up to their order, which alternates from one set to the next.
+
+        Args:
+            features: `[N, num_features]`.
+            num: M.
+        """
+        is_unknown = self.unknown(features)[:, None, :, None]
+        known = features[:, : 2 * self.num_actions].unflatten(-1, (2, -1)).mT.unsqueeze(1)
+        shape = len(features), num, self.num_actions
+        place = torch.rand(shape[1:], device=features.device, dtype=torch.float32).argsort(0)
+        angle = 2.0 * math.pi / num * (place + torch.rand(shape, device=features.device, dtype=torch.float32))
+        drawn = torch.stack([angle.cos(), angle.sin()], -1)
+        if self.sums_to_zero:
+            drawn = _with_sum(drawn, is_unknown, -torch.where(is_unknown, 0.0, known).sum(2))
+        direction = torch.where(is_unknown, drawn, known)
+        others = features[:, None, self.table_size :].expand(-1, num, -1)
+        return torch.cat([*direction.unbind(-1), torch.ones_like(angle), others], -1)
+
     def table(self, state: Tensor) -> Tensor:
         """Return x, y and certainty of all directions, `[*B, 3 K]`."""
         x, y = state.chunk(2, -1)
@@ -92,3 +120,25 @@ class KnownDirections(nn.Module):
             is_certain = is_known | (num_known == self.num_actions - 1)
         certainty = torch.where(is_certain, 1.0, 2.0 * num_known / self.num_actions - 1.0)
         return torch.cat([torch.where(is_known, x, guess_x), torch.where(is_known, y, guess_y), certainty], -1)
+
+
+def _with_sum(drawn: Tensor, is_unknown: Tensor, total: Tensor) -> Tensor:
+    """Return unit vectors of which the unknown ones have a sum, as nearly as unit vectors can.
+
+    Args:
+        drawn: `[N, M, K, 2]`. All unknown ones but the last two are kept.
+        is_unknown: bool `[N, 1, K, 1]`.
+        total: the sum, `[N, 1, 2]`.
+    """
+    side = 1.0 - 2.0 * (torch.arange(drawn.shape[1], device=drawn.device) % 2)[:, None]
+    left, rest, found = is_unknown.sum(2), total.expand(-1, drawn.shape[1], -1), []
+    for k in range(drawn.shape[2]):
+        length = rest.norm(dim=-1, keepdim=True)
+        along = torch.where(length > _SHORTEST_SUM, rest / length.clamp(min=_SHORTEST_SUM), drawn[:, :, k])
+        half = (0.5 * length).clamp(max=1.0)
+        across = torch.stack([-along[..., 1], along[..., 0]], -1)
+        pair = half * along + side * (1.0 - half.square()).sqrt() * across
+        found.append(torch.where(left > 2, drawn[:, :, k], torch.where(left == 2, pair, along)))
+        rest = torch.where(is_unknown[:, :, k], rest - found[-1], rest)
+        left = left - is_unknown[:, :, k].long()
+    return torch.stack(found, 2)

@@ -261,12 +261,12 @@ class SequenceSearch:
         for number in self.sequences(num_states, device, allowed):
             mask = has_slot[number].unsqueeze(2)
             shape = *number.shape, num_samples, has_slot.shape[-1]
-            steps.append(SequenceStep(number, (2.0 * _stratified(shape, device) - 1.0) * mask))
+            steps.append(SequenceStep(number, (2.0 * stratified(shape, device) - 1.0) * mask))
         is_last = self.options.num_iterations == 1
         value = returns(steps) if first_returns is None or is_last else first_returns(steps)
         is_allowed = None if allowed is None else self._are_allowed(steps, allowed)
         temperature = absolute_temperature(self.options.temperature, value)
-        value = _without_forbidden(value, is_allowed)
+        value = without_forbidden(value, is_allowed)
         kept = self._best_sequences(value, self.options.num_kept)
         value = value.take_along_dim(kept.unsqueeze(-1), 1)
         is_allowed = None if is_allowed is None else is_allowed.gather(1, kept)
@@ -283,9 +283,9 @@ class SequenceSearch:
                 is_allowed = None if is_allowed is None else is_allowed.gather(1, kept)
                 discrete = discrete.take_along_dim(kept.unsqueeze(-1), 1)
                 unit_parameters = unit_parameters.take_along_dim(kept[..., None, None, None], 1)
-            mean, deviation = self._gaussians(value, unit_parameters, temperature, self._lower_bound(refinement))
+            mean, deviation = self._gaussians(value, unit_parameters, temperature, self.lower_bound(refinement))
             best = _best_samples(value, unit_parameters)
-            normal = torch.special.ndtri(_stratified(unit_parameters.shape, device))
+            normal = torch.special.ndtri(stratified(unit_parameters.shape, device))
             unit_parameters = mean.unsqueeze(2) + deviation.unsqueeze(2) * normal
             unit_parameters[:, :, -1] = mean
             unit_parameters[:, :, 0] = best
@@ -293,7 +293,7 @@ class SequenceSearch:
             value = returns(
                 [SequenceStep(discrete[..., h], unit_parameters[..., h, :]) for h in range(self.options.horizon)]
             )
-            value = _without_forbidden(value, is_allowed)
+            value = without_forbidden(value, is_allowed)
         best_value, place = value.amax(-1).max(-1)
         return PlannedAction(discrete[row, place, 0], _best_samples(value, unit_parameters)[row, place, 0], best_value)
 
@@ -302,7 +302,7 @@ class SequenceSearch:
         """Return the places `[N, num]` of the sequences with the best samples, of returns `[N, Q, S]`; at least one."""
         return value.amax(-1).topk(max(1, min(num, value.shape[1])), -1).indices
 
-    def _lower_bound(self, refinement: int) -> float:
+    def lower_bound(self, refinement: int) -> float:
         """Return the smallest deviation in a refinement, counted from 0."""
         fraction = refinement / max(1, self.options.num_iterations - 2)
         return self.options.first_min_deviation ** (1.0 - fraction) * self.options.min_deviation**fraction
@@ -327,12 +327,12 @@ def _best_samples(value: Tensor, unit_parameters: Tensor) -> Tensor:
     return unit_parameters.take_along_dim(value.argmax(-1)[..., None, None, None], 2).squeeze(2)
 
 
-def _without_forbidden(value: Tensor, is_allowed: Tensor | None) -> Tensor:
+def without_forbidden(value: Tensor, is_allowed: Tensor | None) -> Tensor:
     """Return the returns `[N, Q, S]` with those of forbidden sequences, bool `[N, Q]`, below all others."""
     return value if is_allowed is None else value.masked_fill(~is_allowed.unsqueeze(-1), _FORBIDDEN_RETURN)
 
 
-def _stratified(shape: Sequence[int], device: torch.device) -> Tensor:
+def stratified(shape: Sequence[int], device: torch.device) -> Tensor:
     """Return uniform samples in (0, 1), `[N, Q, S, ...]`: for each place, one in each of S equal intervals.
 
     The order of the intervals is the same for all N, since sorting takes longer than all else.

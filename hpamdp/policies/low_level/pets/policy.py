@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import torch
-from pydantic import NonNegativeFloat
+from pydantic import NonNegativeFloat, NonNegativeInt
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
@@ -14,9 +14,11 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Bonus
 from hpamdp.policies.low_level.pets.model import PETSModel, PETSModelOptions
+from hpamdp.policies.shared.contingent_planning import ContingentSearch
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
 from hpamdp.policies.shared.joint_choice import JointChoice
+from hpamdp.policies.shared.known_directions import KnownDirections
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.planning import (
     PlannedAction,
@@ -51,6 +53,12 @@ class PETSPolicyOptions(SequenceSearchOptions, ParameterNoiseOptions, PETSModelO
     """Standard deviations of the members' returns that greedy plans subtract from the mean.
 
     It avoids plans that only an error of some members makes look good, where a slip ends the episode.
+    """
+    hypotheses: NonNegativeInt = 8
+    """Sampled sets of directions under which plans begin while the problem has not revealed where all actions point.
+
+    So plans count what an action shows. 0: plan with a guess. They also guess if there are more sequences of
+    horizon + 1 discrete actions than max_sequences.
     """
     parameter_noise: NonNegativeFloat = 0.05
     """Standard deviation of the exploring noise on the parameters, in units where their bounds are [-1, 1]."""
@@ -92,6 +100,10 @@ class PETSPolicy(PlanningPolicy):
         self.model = model
         self.joint = JointChoice(specs)
         self.search = SequenceSearch(self.joint.parameter_dims, options)
+        self.contingent: ContingentSearch | None = None
+        if isinstance(perception.memory, KnownDirections) and options.hypotheses > 0:
+            contingent = ContingentSearch(self.joint.parameter_dims, options)
+            self.contingent = contingent if contingent.search.tries_all else None
         auto = options.posterior_sampling == "auto"
         self.samples_posterior = model.frame.turns if auto else bool(options.posterior_sampling)
         self.precision: torch.dtype = getattr(torch, options.planning_precision)
@@ -168,20 +180,48 @@ class PETSPolicy(PlanningPolicy):
             member: of each of them.
             allowed: the numbered choices that each step may take, bool `[N, horizon, J]`. If None, all.
         """
+        memory = self.perception.memory
+        if self.contingent is None or not isinstance(memory, KnownDirections):
+            return self._plan_as(state.unsqueeze(1), member, allowed, None)
+        shows = memory.unknown(state)
+        is_open = shows.any(-1)
+        parts = []
+        for rows in (is_open, ~is_open):
+            if not rows.any():
+                continue
+            own_member = None if member is None else member[rows]
+            own_allowed = None if allowed is None else allowed[rows]
+            if rows is is_open:
+                sampled = memory.hypotheses(state[rows], self.options.hypotheses)
+                parts.append(self._plan_as(sampled, own_member, own_allowed, shows[rows]))
+            else:
+                parts.append(self._plan_as(state[rows].unsqueeze(1), own_member, own_allowed, None))
+        order = torch.cat([is_open.nonzero(), (~is_open).nonzero()]).squeeze(1).argsort()
+        return PlannedAction(*(torch.cat(each)[order] for each in zip(*parts, strict=True)))
+
+    def _plan_as(
+        self, state: Tensor, member: Tensor | None, allowed: Tensor | None, shows: Tensor | None
+    ) -> PlannedAction:
+        """Plan from states `[N, M, F]` under M hypotheses, as `plan` does.
+
+        `shows` are the actions that show what is not known, bool `[N, J]`; None if all is known.
+        """
         num_members = self.model.num_members
         if member is None:
-            return self._plan(state.expand(num_members, -1, -1), allowed, is_mean=True)
+            return self._plan(state.expand(num_members, -1, -1, -1), allowed, shows, is_mean=True)
         # All members at once, each with as many states as the one with the most, some of them zeros.
         is_own = member.unsqueeze(-1) == torch.arange(num_members, device=member.device)
         place = (is_own.cumsum(0) - 1).gather(1, member.unsqueeze(-1)).squeeze(-1)
         num_places = int(place.max()) + 1
-        stacked = state.new_zeros(num_members, num_places, state.shape[-1])
-        stacked[member, place] = state
-        if allowed is not None:
-            of_members = allowed.new_ones(num_members, num_places, *allowed.shape[1:])
-            of_members[member, place] = allowed
-            allowed = of_members
-        planned = self._plan(stacked, allowed, is_mean=False)
+
+        def stacked(part: Tensor, filling: float) -> Tensor:
+            whole = part.new_full((num_members, num_places, *part.shape[1:]), filling)
+            whole[member, place] = part
+            return whole
+
+        allowed = None if allowed is None else stacked(allowed, True)
+        shows = None if shows is None else stacked(shows, False)
+        planned = self._plan(stacked(state, 0.0), allowed, shows, is_mean=False)
         row = member * num_places + place
         return PlannedAction(*(part[row] for part in planned))
 
@@ -197,28 +237,33 @@ class PETSPolicy(PlanningPolicy):
         later = torch.ones_like(first) if later is None else later
         return self.joint.allowed(torch.stack([first] + [later] * (self.options.horizon - 1), 1))
 
-    def _plan(self, state: Tensor, allowed: Tensor | None, *, is_mean: bool) -> PlannedAction:
-        """Plan from states `[E, N, F]`: N plans by the mean of all members, or one for each state.
+    def _plan(self, state: Tensor, allowed: Tensor | None, shows: Tensor | None, *, is_mean: bool) -> PlannedAction:
+        """Plan from states `[E, N, M, F]`: N plans by the mean of all members, or one for each member's state.
 
         In a plan by the mean, single members choose the sequences that are refined, which takes a fraction of the time,
         unless new states are rewarded.
-        `allowed` is bool `[N, horizon, J]`, or `[E, N, horizon, J]`.
+        `allowed` is bool `[N, horizon, J]`, or `[E, N, horizon, J]`; `shows` is bool `[N, J]`, or `[E, N, J]`.
         """
-        search = self.search
+        search = self.search if shows is None or self.contingent is None else self.contingent.search
         num_sequences = min(self.options.num_kept, search.num_sequences) if is_mean else search.num_sequences
-        size = max(1, _CHUNK_ROWS // (num_sequences * search.samples_of_a_sequence(is_greedy())))
+        num_rows = state.shape[2] * num_sequences * search.samples_of_a_sequence(is_greedy())
+        size = max(1, _CHUNK_ROWS // num_rows)
         parts = []
         for begin in range(0, state.shape[1], size):
-            piece = state[:, begin : begin + size]
-            own = allowed
-            if own is not None:
-                own = own[begin : begin + size] if is_mean else own[:, begin : begin + size].flatten(0, 1)
-            num_plans = piece.shape[1] if is_mean else piece.shape[:2].numel()
+            rows = slice(begin, begin + size)
+            piece = state[:, rows]
+            own_allowed, own_shows = (_of_plans(part, rows, is_mean) for part in (allowed, shows))
+            hypotheses = piece.flatten(1, 2)
             # Single members do not know what is new.
             is_rough = is_mean and self._plan_bonus is None
-            first_returns = self._returns_of_single_members(piece[0]) if is_rough else None
-            returns = self._returns(piece, is_mean)
-            part = search(returns, num_plans, state.device, own, first_returns, is_greedy=is_greedy())
+            first_returns = self._returns_of_single_members(hypotheses[0]) if is_rough else None
+            returns = self._returns(hypotheses, is_mean)
+            if own_shows is None or self.contingent is None:
+                num_plans = piece.shape[1] if is_mean else piece.shape[:2].numel()
+                part = search(returns, num_plans, state.device, own_allowed, first_returns, is_greedy=is_greedy())
+            else:
+                num = state.shape[2]
+                part = self.contingent(returns, own_shows, num, own_allowed, first_returns, is_greedy=is_greedy())
             parts.append(part if is_mean else PlannedAction(*(each.unflatten(0, piece.shape[:2]) for each in part)))
         joined_parts = PlannedAction(*(torch.cat(each, 0 if is_mean else 1) for each in zip(*parts, strict=True)))
         return joined_parts if is_mean else PlannedAction(*(each.flatten(0, 1) for each in joined_parts))
@@ -305,6 +350,13 @@ class PETSPolicy(PlanningPolicy):
 
         returns = self._returns(padded(state).unflatten(0, (num_members, num_places)), is_mean=False)
         return lambda steps: returns([SequenceStep(*map(padded, step)) for step in steps])[:num_states]
+
+
+def _of_plans(whole: Tensor | None, rows: slice, is_mean: bool) -> Tensor | None:
+    """Return the rows of some plans, of `[N, *]` in plans by the mean of all members, else of `[E, N, *]`."""
+    if whole is None:
+        return None
+    return whole[rows] if is_mean else whole[:, rows].flatten(0, 1)
 
 
 def _each_repeated(rows: Tensor, times: int) -> Tensor:
