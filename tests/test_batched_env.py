@@ -21,6 +21,8 @@ from hpamdp.env import counter_rng, point_pictures
 from hpamdp.env.batched_adapter import BatchedEnvAdapter
 from hpamdp.env.batched_env import GOING_ON, BatchedEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.env.circuit.environment import CircuitEnv
+from hpamdp.env.circuit.registration import CIRCUIT_IDS
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.office.environment import OfficeEnv
@@ -30,7 +32,7 @@ from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.specs import PAMDPSpecs
 
 POINTS = [CatchPointEnv, HardMoveEnv, MovingEnv, SlidingEnv]
-PROBLEMS = [PlatformEnv, OfficeEnv, PinballEnv, *POINTS]
+PROBLEMS = [PlatformEnv, OfficeEnv, PinballEnv, CircuitEnv, *POINTS]
 IDS = {
     "hpamdp/Platform-v0": PlatformEnv,
     "hpamdp/Office-v0": OfficeEnv,
@@ -40,6 +42,7 @@ IDS = {
     "hpamdp/Sliding-v0": SlidingEnv,
     "hpamdp/PinballSimple-v0": PinballEnv,
     "hpamdp/PinballHard-v0": PinballEnv,
+    **dict.fromkeys(CIRCUIT_IDS.values(), CircuitEnv),
 }
 # Gymnasium recommends actions scaled to [-1, 1]; the field's own bounds are others.
 RECOMMENDATION = "we recommend using a symmetric and normalized space"
@@ -177,7 +180,7 @@ def test_a_state_of_other_environments_is_refused_and_an_empty_one_starts_new_ep
     env = problem(3)
     env.reset()
     before = snapshot(env)
-    with pytest.raises(ValueError, match=rf"{problem.__name__}: the state's x is \[2\], but must be \[3\]"):
+    with pytest.raises(ValueError, match=rf"{problem.__name__}: the state's \w+ is \[2\], but must be \[3\]"):
         env.set_env_state(problem(2).env_state())
     assert is_unchanged(env, before)
     env.set_env_state({})
@@ -198,7 +201,7 @@ def test_a_parameter_that_is_no_number_is_refused_and_changes_nothing(problem, v
         env.step(action(torch.tensor([0, 0]), parameters))
     assert is_unchanged(env, before)
     env.step(action(torch.tensor([0, 1]), parameters))  # another action's parameter is never read
-    assert env.env_state()["x"].isfinite().all()
+    assert all(column.isfinite().all() for column in env.env_state().values())
 
 
 @each_problem

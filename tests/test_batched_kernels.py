@@ -12,6 +12,8 @@ from numba import njit
 from hpamdp import keys
 from hpamdp.env import counter_rng, kernels
 from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.env.circuit.environment import CircuitEnv
+from hpamdp.env.circuit.rules import TASKS
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
@@ -71,6 +73,16 @@ PROBLEMS = {
             "slip": st.sampled_from([0.0, 0.1, 1.0]),
             "chooses_goal": st.booleans(),
             "max_steps": st.sampled_from([3, 400]),
+        },
+        1e-5,
+    ),
+    "circuit": (
+        CircuitEnv,
+        {
+            "task": st.sampled_from(TASKS),
+            "reward": st.sampled_from(["final", "progress"]),
+            "observe_depth": st.booleans(),
+            "max_steps": st.sampled_from([3, None]),
         },
         1e-5,
     ),

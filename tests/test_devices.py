@@ -27,6 +27,7 @@ from hpamdp.env.batched_env import Action
 from hpamdp.env.boatdock import episode
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.env.circuit.environment import CircuitEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.office.environment import OfficeEnv
@@ -115,7 +116,7 @@ def test_losses_and_their_gradients_stay_on_their_device(name):
         assert {gradient.device for gradient in gradients if gradient is not None} == {META}
 
 
-@pytest.mark.parametrize("problem", [CatchPointEnv, HardMoveEnv, MovingEnv, OfficeEnv, SlidingEnv])
+@pytest.mark.parametrize("problem", [CatchPointEnv, CircuitEnv, HardMoveEnv, MovingEnv, OfficeEnv, SlidingEnv])
 def test_rules_stay_on_their_device(problem):
     # Not those of Goal and Platform, whose ticks go on for as long as a tensor says so.
     env = problem(4)

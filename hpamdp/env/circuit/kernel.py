@@ -1,0 +1,277 @@
+"""The rules of circuit design for one row, and the loop over all rows that Numba compiles.
+
+It states what `rules` says of columns, for the CPU alone; a test compares the two. A gate changes the amplitudes in
+pairs, by the bits of their indices, where the rules multiply matrices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from hpamdp.env import kernels
+from hpamdp.env.circuit import gates, rules
+from hpamdp.env.circuit.rules import Design
+from hpamdp.env.kernels import HALF, ONE, OUTCOME_ROW, STEPS_ROW, TWO, ZERO, kernel, part
+from hpamdp.env.rng_streams import TRAINING
+
+# The problem's own settings: the sizes, what is rewarded and observed, whether targets are random; then the gates of
+# all sets, NUM_OF_GATE numbers each, the fixed target, and the circuits that training begins with.
+WIRES, DEPTH, COLUMNS, IS_NATIVE, PROGRESS, OBSERVES_DEPTH, IS_RANDOM, NUM_BEGINNINGS = range(
+    kernels.OWN, kernels.OWN + 8
+)
+NUM_GATES, NUM_SETS, OWN_GATES = range(kernels.OWN + 8, kernels.OWN + 11)
+NUM_OF_GATE = 6
+_KIND, _FLIPPED, _CONTROL, _HAS_ANGLE, _ANGLE, _COST = range(NUM_OF_GATE)
+_GATE_SET_ROW, _GATE_ROW = -5, -4
+_MOST_ROWS = 8  # of an operator
+
+_F = np.float32
+_PI, _MATCH = _F(math.pi), _F(rules.MATCH)
+_STOP, _PHASE, _MIX, _TURN, _FLIP = gates.STOP, gates.PHASE, gates.MIX, gates.TURN, gates.FLIP
+
+
+def settings_of(design: Design) -> Sequence[float]:
+    """Return the design in numbers."""
+    task = design.task
+    sizes = [task.n, task.depth, design.num_columns]
+    flags = [design.is_native, design.rewards_progress, design.observes_depth, design.target is None]
+    circuits, depths = design.beginnings or ([], [])
+    numbers: list[float] = [*sizes, *flags, len(circuits), len(design.gate_sets[0]), len(design.gate_sets)]
+    for gate in (gate for gate_set in design.gate_sets for gate in gate_set):
+        angle = 0.0 if gate.angle is None else gate.angle
+        numbers += [gate.kind, gate.flipped, gate.control, gate.angle is None, angle, gate.cost]
+    if design.target is not None:
+        numbers += torch.view_as_real(design.target.flatten()).T.flatten().tolist()
+    for circuit, of_wires in zip(circuits, depths, strict=True):
+        numbers += [*torch.view_as_real(circuit.flatten()).T.flatten().tolist(), *of_wires.tolist()]
+    return numbers
+
+
+@part
+def _apply(
+    floats: Any, row: Any, kind: Any, flipped: Any, control: Any, angle: Any, num_rows: Any, num_columns: Any
+) -> None:
+    """Apply a gate to the circuit of a row, in place: `gates.Gate`."""
+    imaginary = num_rows * num_columns
+    if kind == _PHASE:
+        mask = flipped | control
+        cosine, sine = math.cos(angle), math.sin(angle)
+        for i in range(num_rows):
+            if i & mask == mask:
+                for place in range(i * num_columns, (i + 1) * num_columns):
+                    real, other = floats[place, row], floats[imaginary + place, row]
+                    floats[place, row] = cosine * real - sine * other
+                    floats[imaginary + place, row] = sine * real + cosine * other
+        return
+    cosine, sine = math.cos(HALF * angle), math.sin(HALF * angle)
+    for i in range(num_rows):
+        partner = i ^ flipped
+        if i > partner or (kind == _FLIP and i & control == 0):
+            continue
+        for column in range(num_columns):
+            one, two = i * num_columns + column, partner * num_columns + column
+            a, a_i = floats[one, row], floats[imaginary + one, row]
+            b, b_i = floats[two, row], floats[imaginary + two, row]
+            if kind == _FLIP:
+                floats[one, row], floats[imaginary + one, row] = b, b_i
+                floats[two, row], floats[imaginary + two, row] = a, a_i
+            elif kind == _MIX:
+                floats[one, row], floats[imaginary + one, row] = cosine * a + sine * b_i, cosine * a_i - sine * b
+                floats[two, row], floats[imaginary + two, row] = cosine * b + sine * a_i, cosine * b_i - sine * a
+            else:
+                # The lower index of the two has the bit 0.
+                floats[one, row], floats[imaginary + one, row] = cosine * a - sine * b, cosine * a_i - sine * b_i
+                floats[two, row], floats[imaginary + two, row] = sine * a + cosine * b, sine * a_i + cosine * b_i
+
+
+@part
+def _similarity(floats: Any, row: Any, num_rows: Any, num_columns: Any) -> Any:
+    """Return how well the circuit of a row matches its target: `rules.similarity`."""
+    num = num_rows * num_columns
+    if num_columns == 1:
+        real, imaginary = ZERO, ZERO
+        for i in range(num):
+            a, a_i = floats[i, row], floats[num + i, row]
+            t, t_i = floats[2 * num + i, row], floats[3 * num + i, row]
+            real += a * t + a_i * t_i
+            imaginary += a * t_i - a_i * t
+        return min(real * real + imaginary * imaginary, ONE)
+    square = ZERO
+    for i in range(2 * num):
+        difference = floats[i, row] - floats[2 * num + i, row]
+        square += difference * difference
+    return ONE - TWO * _F(math.atan(math.sqrt(square))) / _PI
+
+
+@part
+def _depth_cost(depth: Any, limit: Any) -> Any:
+    """Return the cost of a depth: `rules.depth_cost`."""
+    return max(_F(depth) - limit / _F(3.0), ZERO) / (_F(1.5) * limit)
+
+
+@part
+def _draw_target(floats: Any, row: Any, bits: Any, step: Any, num_rows: Any, num_columns: Any, drawn: Any) -> None:
+    """Write a random target into a row: `rules.random_target`.
+
+    Args:
+        drawn: room for the real and imaginary parts, float64 `[2, 8, 8]`.
+    """
+    num = num_rows * num_columns
+    for column in range(num_columns):
+        for i in range(num_rows):
+            number = 2 * (column * num_rows + i)
+            drawn[0, i, column] = kernels.normal(bits, step, number)
+            drawn[1, i, column] = kernels.normal(bits, step, number + 1)
+        for earlier in range(column):
+            real, imaginary = 0.0, 0.0
+            for i in range(num_rows):
+                e, e_i = drawn[0, i, earlier], drawn[1, i, earlier]
+                real += e * drawn[0, i, column] + e_i * drawn[1, i, column]
+                imaginary += e * drawn[1, i, column] - e_i * drawn[0, i, column]
+            for i in range(num_rows):
+                e, e_i = drawn[0, i, earlier], drawn[1, i, earlier]
+                drawn[0, i, column] -= real * e - imaginary * e_i
+                drawn[1, i, column] -= real * e_i + imaginary * e
+        square = 0.0
+        for i in range(num_rows):
+            square += drawn[0, i, column] ** 2 + drawn[1, i, column] ** 2
+        length = math.sqrt(square)
+        for i in range(num_rows):
+            drawn[0, i, column] /= length
+            drawn[1, i, column] /= length
+            floats[2 * num + i * num_columns + column, row] = drawn[0, i, column]
+            floats[3 * num + i * num_columns + column, row] = drawn[1, i, column]
+
+
+@part
+def _start(floats: Any, integers: Any, row: Any, bits: Any, step: Any, settings: Any, drawn: Any) -> None:
+    """Begin a circuit in a row: `rules.start`."""
+    num_wires, num_columns, limit = int(settings[WIRES]), int(settings[COLUMNS]), _F(settings[DEPTH])
+    num_rows = 1 << num_wires
+    num = num_rows * num_columns
+    first = OWN_GATES + NUM_OF_GATE * int(settings[NUM_GATES]) * int(settings[NUM_SETS])
+    if settings[IS_RANDOM]:
+        _draw_target(floats, row, bits, step, num_rows, num_columns, drawn)
+    else:
+        for place in range(2 * num):
+            floats[2 * num + place, row] = settings[first + place]
+    depth, num_beginnings = 0, int(settings[NUM_BEGINNINGS])
+    if num_beginnings > 0 and settings[kernels.EPISODE_STREAM] == TRAINING:
+        number = min(int(kernels.uniform(bits, step, 0) * _F(num_beginnings)), num_beginnings - 1)
+        first += 2 * num + number * (2 * num + num_wires)
+        for place in range(2 * num):
+            floats[place, row] = settings[first + place]
+        for wire in range(num_wires):
+            integers[wire, row] = int(settings[first + 2 * num + wire])
+            depth = max(depth, integers[wire, row])
+    else:
+        for place in range(2 * num):
+            floats[place, row] = ZERO
+        for i in range(num_columns):
+            floats[i * num_columns + i, row] = ONE
+        for wire in range(num_wires):
+            integers[wire, row] = 0
+    floats[4 * num, row] = _similarity(floats, row, num_rows, num_columns)
+    floats[4 * num + 1, row], floats[4 * num + 2, row] = _depth_cost(depth, limit), ZERO
+    integers[_GATE_SET_ROW, row], integers[_GATE_ROW, row] = 0, -1
+
+
+@part
+def _act(floats: Any, integers: Any, row: Any, option: Any, action: Any, given: Any, settings: Any) -> Any:
+    """Take an action in a row and return outcome and reward: `rules.act`."""
+    num_wires, num_columns, limit = int(settings[WIRES]), int(settings[COLUMNS]), _F(settings[DEPTH])
+    num_rows = 1 << num_wires
+    num = num_rows * num_columns
+    num_gates, steps = int(settings[NUM_GATES]), integers[STEPS_ROW, row]
+    if settings[NUM_SETS] > 1 and steps == 0:
+        integers[_GATE_SET_ROW, row] = option
+    integers[_GATE_ROW, row] = action
+    first = OWN_GATES + NUM_OF_GATE * (integers[_GATE_SET_ROW, row] * num_gates + action)
+    kind, flipped, control = int(settings[first]), int(settings[first + _FLIPPED]), int(settings[first + _CONTROL])
+    angle = given if settings[first + _HAS_ANGLE] else _F(settings[first + _ANGLE])
+    floats[4 * num + 2, row] = angle
+    if kind != _STOP:
+        _apply(floats, row, kind, flipped, control, angle, num_rows, num_columns)
+    wires, level, depth = flipped | control, 0, 0
+    for wire in range(num_wires):
+        if wires >> wire & 1:
+            level = max(level, integers[wire, row])
+    for wire in range(num_wires):
+        if wires >> wire & 1:
+            integers[wire, row] = level + 1
+        depth = max(depth, integers[wire, row])
+    before = floats[4 * num, row] - floats[4 * num + 1, row]
+    similarity = _similarity(floats, row, num_rows, num_columns)
+    if settings[IS_NATIVE]:
+        cost = floats[4 * num + 1, row] + _F(settings[first + _COST])
+    else:
+        cost = _depth_cost(depth, limit)
+    floats[4 * num, row], floats[4 * num + 1, row] = similarity, cost
+    has_ended = kind == _STOP or depth >= limit
+    outcome = rules.BUILDING
+    if has_ended:
+        outcome = rules.MATCHED if similarity >= _MATCH else rules.MISSED
+    score = similarity - cost
+    if settings[PROGRESS]:
+        return outcome, score - before
+    is_last = has_ended or steps + 1 >= settings[kernels.MAX_STEPS]
+    return outcome, score if is_last else ZERO
+
+
+@part
+def _observe(floats: Any, integers: Any, row: Any, settings: Any, observation: Any) -> None:
+    """Write what is observed of a row: `rules.observe`."""
+    num_wires = int(settings[WIRES])
+    num = 4 * (1 << num_wires) * int(settings[COLUMNS])
+    for place in range(num):
+        observation[place] = floats[place, row]
+    if settings[OBSERVES_DEPTH]:
+        for wire in range(num_wires):
+            observation[num + wire] = _F(integers[wire, row]) / _F(settings[DEPTH])
+
+
+@kernel
+def advance(
+    floats: Any,
+    integers: Any,
+    option: Any,
+    discrete: Any,
+    parameters: Any,
+    places: Any,
+    bounds: Any,
+    mask: Any,
+    settings: Any,
+    mode: Any,
+    observations: Any,
+    outcomes: Any,
+    extras: Any,
+    flags: Any,
+    rewards: Any,
+) -> int:
+    """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
+    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
+    of_similarity = 4 * (1 << int(settings[WIRES])) * int(settings[COLUMNS])
+    drawn = np.empty((2, _MOST_ROWS, _MOST_ROWS))
+    for row in range(len(mask)):
+        was_over = integers[OUTCOME_ROW, row] != rules.BUILDING
+        if mode != kernels.RESTART and mask[row] and not was_over:
+            action = discrete[row]
+            given = kernels.parameter(parameters, row, 0, action, places, bounds)
+            outcome, rewards[row] = _act(floats, integers, row, option[row], action, given, settings)
+            kernels.end_step(integers, row, outcome, len(rules.OUTCOMES), settings)
+        for reading in range(len(observations)):
+            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
+                bits, step = kernels.new_episode(integers, row, settings)
+                _start(floats, integers, row, bits, step, settings, drawn)
+            _observe(floats, integers, row, settings, observations[reading, row])
+            extras[reading, 0, row] = floats[of_similarity, row]
+            extras[reading, 1, row] = floats[of_similarity + 1, row]
+            kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1

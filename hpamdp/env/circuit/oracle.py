@@ -1,0 +1,145 @@
+"""Circuits that are known to be best: the textbook's for the fixed targets, the compiler's in the native sets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite
+
+from hpamdp.env.circuit import compiler, rules
+from hpamdp.env.circuit.gates import PHASE, matrices, published
+from hpamdp.env.circuit.rules import TASK_OF, CircuitState, Design
+
+_RIGHT = 0.5 * math.pi
+_HADAMARD_2 = (("p 2", _RIGHT), ("rx 2", _RIGHT), ("p 2", _RIGHT))
+# Circuits with the published gates that make the fixed targets, with the angle of each gate.
+CIRCUITS: Mapping[str, tuple[tuple[str, float], ...]] = {
+    "hadamard": (("p 0", _RIGHT), ("rx 0", _RIGHT), ("p 0", _RIGHT)),
+    "bell": (("rx 0", _RIGHT), ("p 0", _RIGHT), ("cx 0 1", 0.0)),
+    "ghz": (("rx 0", _RIGHT), ("p 0", _RIGHT), ("cx 0 1", 0.0), ("cx 1 2", 0.0)),
+    # Nielsen and Chuang, *Quantum Computation and Quantum Information*, section 4.3, with V the square root of X.
+    "toffoli": (
+        *_HADAMARD_2,
+        ("cp 1 2", _RIGHT),
+        ("cx 0 1", 0.0),
+        ("cp 1 2", -_RIGHT),
+        ("cx 0 1", 0.0),
+        ("cp 0 2", _RIGHT),
+        *_HADAMARD_2,
+    ),
+}
+
+
+def beginnings(task: str) -> tuple[Tensor, Tensor]:
+    """Return the parts of a known circuit before each of its gates, and the depths of their wires.
+
+    Returns:
+        Operators or states, complex64 `[L, R, C]`, and int32 `[L, n]`, with a row for each of the L gates.
+    """
+    sizes = TASK_OF[task]
+    gate_set = published(sizes.n)
+    table = {gate.name: (gate, matrix) for gate, matrix in zip(gate_set, matrices(gate_set, sizes.n), strict=True)}
+    made = torch.eye(1 << sizes.n, dtype=torch.complex64)
+    depths = torch.zeros(sizes.n, dtype=torch.int32)
+    circuits, levels = [], []
+    for name, angle in CIRCUITS[task]:
+        circuits.append(made if sizes.is_operator else made[:, :1])
+        levels.append(depths)
+        gate, (fixed, of_cosine, of_sine) = table[name]
+        turn = angle if gate.kind == PHASE else 0.5 * angle
+        made = (fixed + math.cos(turn) * of_cosine + math.sin(turn) * of_sine) @ made
+        is_taken = torch.tensor([bool(gate.wires >> wire & 1) for wire in range(sizes.n)])
+        depths = torch.where(is_taken, depths[is_taken].max() + 1, depths).int()
+    return torch.stack(circuits), torch.stack(levels)
+
+
+def best_scores(state: CircuitState, design: Design) -> np.ndarray:
+    """Return the best possible score of each set for the targets of native designs, `[N, S]`."""
+    return np.stack([plans.score for plans in _compiled(state, design)], -1)
+
+
+def _compiled(state: CircuitState, design: Design) -> list[compiler.Plans]:
+    _, target = rules.circuit_and_target(state, design)
+    states = target.squeeze(-1).cpu().numpy()
+    return [compiler.best(states, gate_set) for gate_set in design.gate_sets]
+
+
+class CircuitOracle:
+    """Keep the best circuit of every option, found at the start of an episode.
+
+    Args:
+        num_envs: number of environments.
+        design: settings of the circuits; native, or with the fixed target of `task`.
+        task: name of the task.
+        device: of the tensors.
+
+    Attributes:
+        option: the best gate set, int64 `[N]`.
+        gates, angles: the circuits with the stop at their ends, `[N, S, L]`.
+    """
+
+    def __init__(self, num_envs: int, design: Design, task: str, device: torch.device | None) -> None:
+        self.design = design
+        self.option = torch.zeros(num_envs, dtype=torch.long, device=device)
+        stop = len(design.gate_sets[0]) - 1
+        if design.is_native:
+            length = max(len(form) for gate_set in design.gate_sets for form in compiler.forms(gate_set))
+        else:
+            length = len(CIRCUITS[task])
+        shape = (num_envs, len(design.gate_sets), length + 1)
+        self.gates = torch.full(shape, stop, dtype=torch.long, device=device)
+        self.angles = torch.zeros(shape, dtype=torch.float32, device=device)
+        if not design.is_native:
+            names = [gate.name for gate in design.gate_sets[0]]
+            for place, (name, angle) in enumerate(CIRCUITS[task]):
+                self.gates[..., place], self.angles[..., place] = names.index(name), angle
+
+    def spec(self) -> Composite:
+        """Return the spec of the entries that `read` returns."""
+        num, num_sets, _ = self.gates.shape
+        device = self.gates.device
+        entries = {
+            "discrete": Categorical(len(self.design.gate_sets[0]), shape=(num, num_sets), device=device),
+            "parameters": Bounded(-math.pi, math.pi, shape=(num, num_sets), device=device, dtype=torch.float32),
+        }
+        if num_sets > 1:
+            entries["option"] = Categorical(num_sets, shape=(num,), device=device)
+        return Composite(entries, shape=(num,))
+
+    def plan(self, state: CircuitState, rows: Tensor) -> None:
+        """Find the circuits for the environments of `rows`, bool `[N]`, which begin."""
+        if not self.design.is_native or not rows.any():
+            return
+        plans = _compiled(type(state)(*(column[rows] for column in state)), self.design)
+        device = self.gates.device
+        self.option[rows] = torch.from_numpy(np.stack([each.score for each in plans], -1).argmax(-1)).to(device)
+        for number, each in enumerate(plans):
+            used = each.gates.shape[-1]
+            self.gates[rows, number, :used] = torch.from_numpy(each.gates).to(device)
+            self.angles[rows, number, :used] = torch.from_numpy(each.angles).float().to(device)
+
+    def read(self, state: CircuitState) -> TensorDict:
+        """Return the next gate of each circuit, `discrete` and `parameters` `[N, S]`, and the best `option` `[N]`."""
+        place = state.steps.long().clamp(max=self.gates.shape[-1] - 1).view(-1, 1, 1)
+        place = place.expand(-1, self.gates.shape[1], 1)
+        known = {
+            "discrete": self.gates.gather(-1, place).squeeze(-1),
+            "parameters": self.angles.gather(-1, place).squeeze(-1),
+        }
+        if self.gates.shape[1] > 1:
+            known["option"] = self.option.clone()
+        return TensorDict(known, batch_size=place.shape[:1], device=self.gates.device)
+
+    def plans(self) -> dict[str, Tensor]:
+        """Return the circuits for a checkpoint. They are found only at the start of an episode."""
+        return {"option": self.option, "gates": self.gates, "angles": self.angles}
+
+    def set_plans(self, plans: Mapping[str, Tensor]) -> None:
+        """Restore the result of `plans`."""
+        for name, plan in plans.items():
+            getattr(self, name).copy_(plan)
