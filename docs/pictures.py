@@ -34,11 +34,13 @@ PLAYERS = {
         *("env=traffic", "env.render=true", "env.minutes=15", "env.strategies=true"),
         *("env.grouping={max_pressure:[max_pressure]}", "high=uniform", "low=random"),
     ],
+    "circuit": ["env=circuit", "env.task=toffoli", "high=none", "low=planner"],
 }
 
 
-# A session has several trips, and traffic's episodes are long; three episodes elsewhere.
-EPISODES = {"boatdock_unseen": "1", "traffic": "1"}
+# A session has several trips, traffic's episodes are long, and the planner's circuits are all the same; three episodes
+# elsewhere.
+EPISODES = {"boatdock_unseen": "1", "traffic": "1", "circuit": "1"}
 
 
 def film_primitives(to: Path) -> None:

@@ -397,6 +397,16 @@ def test_settings_that_make_no_sense_are_refused_in_one_line(settings, words):
         CircuitEnv(**settings)
 
 
+def test_a_film_needs_the_state_alone():
+    env = CircuitEnv(3, task="random_state", gate_set="ion", oracle=True)
+    env.reset()
+    track = [{name: column[:1] for name, column in env.film_state(2).items()}]
+    assert len([*env.film(track, 8.0, 120)]) == 2
+    copy = CircuitEnv(3, task="random_state", gate_set="ion", oracle=True)
+    copy.set_env_state(env.env_state())
+    assert (copy.read() == env.read()).all()
+
+
 @pytest.mark.parametrize("settings", [{"task": "toffoli"}, {"task": "random_state", "gate_set": "ion"}])
 def test_a_picture_shows_every_gate(settings):
     env = CircuitEnv(1, **settings)

@@ -17,7 +17,7 @@ from hpamdp.messages import exit_code
 
 AGENTS = Path(__file__).resolve().parents[2] / "agents"
 # Settings of problems in which agents differ.
-SHOWN_SETTINGS = ("controller", "n")
+SHOWN_SETTINGS = ("controller", "n", "task")
 HEAD = ("agent", "problem", "selector", "learner", "score", "ceiling", "success", "length", "trained for", "CPU, s")
 
 

@@ -29,6 +29,8 @@ NUM_OF_GATE = 6
 _KIND, _FLIPPED, _CONTROL, _HAS_ANGLE, _ANGLE, _COST = range(NUM_OF_GATE)
 _GATE_SET_ROW, _GATE_ROW = -5, -4
 _MOST_ROWS = 8  # of an operator
+# Rows that are copied at once, so that the entries of each lie side by side: they fill a cache line of a column.
+_SIDE_BY_SIDE = 16
 
 _F = np.float32
 _PI, _MATCH = _F(math.pi), _F(rules.MATCH)
@@ -54,9 +56,9 @@ def settings_of(design: Design) -> Sequence[float]:
 
 @part
 def _apply(
-    floats: Any, row: Any, kind: Any, flipped: Any, control: Any, angle: Any, num_rows: Any, num_columns: Any
+    entries: Any, kind: Any, flipped: Any, control: Any, angle: Any, num_rows: Any, num_columns: Any
 ) -> None:
-    """Apply a gate to the circuit of a row, in place: `gates.Gate`."""
+    """Apply a gate to a circuit in place: `gates.Gate`."""
     imaginary = num_rows * num_columns
     if kind == _PHASE:
         mask = flipped | control
@@ -64,9 +66,9 @@ def _apply(
         for i in range(num_rows):
             if i & mask == mask:
                 for place in range(i * num_columns, (i + 1) * num_columns):
-                    real, other = floats[place, row], floats[imaginary + place, row]
-                    floats[place, row] = cosine * real - sine * other
-                    floats[imaginary + place, row] = sine * real + cosine * other
+                    real, other = entries[place], entries[imaginary + place]
+                    entries[place] = cosine * real - sine * other
+                    entries[imaginary + place] = sine * real + cosine * other
         return
     cosine, sine = math.cos(HALF * angle), math.sin(HALF * angle)
     for i in range(num_rows):
@@ -75,35 +77,35 @@ def _apply(
             continue
         for column in range(num_columns):
             one, two = i * num_columns + column, partner * num_columns + column
-            a, a_i = floats[one, row], floats[imaginary + one, row]
-            b, b_i = floats[two, row], floats[imaginary + two, row]
+            a, a_i = entries[one], entries[imaginary + one]
+            b, b_i = entries[two], entries[imaginary + two]
             if kind == _FLIP:
-                floats[one, row], floats[imaginary + one, row] = b, b_i
-                floats[two, row], floats[imaginary + two, row] = a, a_i
+                entries[one], entries[imaginary + one] = b, b_i
+                entries[two], entries[imaginary + two] = a, a_i
             elif kind == _MIX:
-                floats[one, row], floats[imaginary + one, row] = cosine * a + sine * b_i, cosine * a_i - sine * b
-                floats[two, row], floats[imaginary + two, row] = cosine * b + sine * a_i, cosine * b_i - sine * a
+                entries[one], entries[imaginary + one] = cosine * a + sine * b_i, cosine * a_i - sine * b
+                entries[two], entries[imaginary + two] = cosine * b + sine * a_i, cosine * b_i - sine * a
             else:
                 # The lower index of the two has the bit 0.
-                floats[one, row], floats[imaginary + one, row] = cosine * a - sine * b, cosine * a_i - sine * b_i
-                floats[two, row], floats[imaginary + two, row] = sine * a + cosine * b, sine * a_i + cosine * b_i
+                entries[one], entries[imaginary + one] = cosine * a - sine * b, cosine * a_i - sine * b_i
+                entries[two], entries[imaginary + two] = sine * a + cosine * b, sine * a_i + cosine * b_i
 
 
 @part
-def _similarity(floats: Any, row: Any, num_rows: Any, num_columns: Any) -> Any:
+def _similarity(entries: Any, num_rows: Any, num_columns: Any) -> Any:
     """Return how well the circuit of a row matches its target: `rules.similarity`."""
     num = num_rows * num_columns
     if num_columns == 1:
         real, imaginary = ZERO, ZERO
         for i in range(num):
-            a, a_i = floats[i, row], floats[num + i, row]
-            t, t_i = floats[2 * num + i, row], floats[3 * num + i, row]
+            a, a_i = entries[i], entries[num + i]
+            t, t_i = entries[2 * num + i], entries[3 * num + i]
             real += a * t + a_i * t_i
             imaginary += a * t_i - a_i * t
         return min(real * real + imaginary * imaginary, ONE)
     square = ZERO
     for i in range(2 * num):
-        difference = floats[i, row] - floats[2 * num + i, row]
+        difference = entries[i] - entries[2 * num + i]
         square += difference * difference
     return ONE - TWO * _F(math.atan(math.sqrt(square))) / _PI
 
@@ -115,7 +117,7 @@ def _depth_cost(depth: Any, limit: Any) -> Any:
 
 
 @part
-def _draw_target(floats: Any, row: Any, bits: Any, step: Any, num_rows: Any, num_columns: Any, drawn: Any) -> None:
+def _draw_target(entries: Any, bits: Any, step: Any, num_rows: Any, num_columns: Any, drawn: Any) -> None:
     """Write a random target into a row: `rules.random_target`.
 
     Args:
@@ -144,45 +146,45 @@ def _draw_target(floats: Any, row: Any, bits: Any, step: Any, num_rows: Any, num
         for i in range(num_rows):
             drawn[0, i, column] /= length
             drawn[1, i, column] /= length
-            floats[2 * num + i * num_columns + column, row] = drawn[0, i, column]
-            floats[3 * num + i * num_columns + column, row] = drawn[1, i, column]
+            entries[2 * num + i * num_columns + column] = drawn[0, i, column]
+            entries[3 * num + i * num_columns + column] = drawn[1, i, column]
 
 
 @part
-def _start(floats: Any, integers: Any, row: Any, bits: Any, step: Any, settings: Any, drawn: Any) -> None:
+def _start(entries: Any, integers: Any, row: Any, bits: Any, step: Any, settings: Any, drawn: Any) -> None:
     """Begin a circuit in a row: `rules.start`."""
     num_wires, num_columns, limit = int(settings[WIRES]), int(settings[COLUMNS]), _F(settings[DEPTH])
     num_rows = 1 << num_wires
     num = num_rows * num_columns
     first = OWN_GATES + NUM_OF_GATE * int(settings[NUM_GATES]) * int(settings[NUM_SETS])
     if settings[IS_RANDOM]:
-        _draw_target(floats, row, bits, step, num_rows, num_columns, drawn)
+        _draw_target(entries, bits, step, num_rows, num_columns, drawn)
     else:
         for place in range(2 * num):
-            floats[2 * num + place, row] = settings[first + place]
+            entries[2 * num + place] = settings[first + place]
     depth, num_beginnings = 0, int(settings[NUM_BEGINNINGS])
     if num_beginnings > 0 and settings[kernels.EPISODE_STREAM] == TRAINING:
         number = min(int(kernels.uniform(bits, step, 0) * _F(num_beginnings)), num_beginnings - 1)
         first += 2 * num + number * (2 * num + num_wires)
         for place in range(2 * num):
-            floats[place, row] = settings[first + place]
+            entries[place] = settings[first + place]
         for wire in range(num_wires):
             integers[wire, row] = int(settings[first + 2 * num + wire])
             depth = max(depth, integers[wire, row])
     else:
         for place in range(2 * num):
-            floats[place, row] = ZERO
+            entries[place] = ZERO
         for i in range(num_columns):
-            floats[i * num_columns + i, row] = ONE
+            entries[i * num_columns + i] = ONE
         for wire in range(num_wires):
             integers[wire, row] = 0
-    floats[4 * num, row] = _similarity(floats, row, num_rows, num_columns)
-    floats[4 * num + 1, row], floats[4 * num + 2, row] = _depth_cost(depth, limit), ZERO
+    entries[4 * num] = _similarity(entries, num_rows, num_columns)
+    entries[4 * num + 1], entries[4 * num + 2] = _depth_cost(depth, limit), ZERO
     integers[_GATE_SET_ROW, row], integers[_GATE_ROW, row] = 0, -1
 
 
 @part
-def _act(floats: Any, integers: Any, row: Any, option: Any, action: Any, given: Any, settings: Any) -> Any:
+def _act(entries: Any, integers: Any, row: Any, option: Any, action: Any, given: Any, settings: Any) -> Any:
     """Take an action in a row and return outcome and reward: `rules.act`."""
     num_wires, num_columns, limit = int(settings[WIRES]), int(settings[COLUMNS]), _F(settings[DEPTH])
     num_rows = 1 << num_wires
@@ -194,9 +196,9 @@ def _act(floats: Any, integers: Any, row: Any, option: Any, action: Any, given: 
     first = OWN_GATES + NUM_OF_GATE * (integers[_GATE_SET_ROW, row] * num_gates + action)
     kind, flipped, control = int(settings[first]), int(settings[first + _FLIPPED]), int(settings[first + _CONTROL])
     angle = given if settings[first + _HAS_ANGLE] else _F(settings[first + _ANGLE])
-    floats[4 * num + 2, row] = angle
+    entries[4 * num + 2] = angle
     if kind != _STOP:
-        _apply(floats, row, kind, flipped, control, angle, num_rows, num_columns)
+        _apply(entries, kind, flipped, control, angle, num_rows, num_columns)
     wires, level, depth = flipped | control, 0, 0
     for wire in range(num_wires):
         if wires >> wire & 1:
@@ -205,13 +207,13 @@ def _act(floats: Any, integers: Any, row: Any, option: Any, action: Any, given: 
         if wires >> wire & 1:
             integers[wire, row] = level + 1
         depth = max(depth, integers[wire, row])
-    before = floats[4 * num, row] - floats[4 * num + 1, row]
-    similarity = _similarity(floats, row, num_rows, num_columns)
+    before = entries[4 * num] - entries[4 * num + 1]
+    similarity = _similarity(entries, num_rows, num_columns)
     if settings[IS_NATIVE]:
-        cost = floats[4 * num + 1, row] + _F(settings[first + _COST])
+        cost = entries[4 * num + 1] + _F(settings[first + _COST])
     else:
         cost = _depth_cost(depth, limit)
-    floats[4 * num, row], floats[4 * num + 1, row] = similarity, cost
+    entries[4 * num], entries[4 * num + 1] = similarity, cost
     has_ended = kind == _STOP or depth >= limit
     outcome = rules.BUILDING
     if has_ended:
@@ -224,12 +226,12 @@ def _act(floats: Any, integers: Any, row: Any, option: Any, action: Any, given: 
 
 
 @part
-def _observe(floats: Any, integers: Any, row: Any, settings: Any, observation: Any) -> None:
+def _observe(entries: Any, integers: Any, row: Any, settings: Any, observation: Any) -> None:
     """Write what is observed of a row: `rules.observe`."""
     num_wires = int(settings[WIRES])
     num = 4 * (1 << num_wires) * int(settings[COLUMNS])
     for place in range(num):
-        observation[place] = floats[place, row]
+        observation[place] = entries[place]
     if settings[OBSERVES_DEPTH]:
         for wire in range(num_wires):
             observation[num + wire] = _F(integers[wire, row]) / _F(settings[DEPTH])
@@ -259,19 +261,29 @@ def advance(
         return invalid
     of_similarity = 4 * (1 << int(settings[WIRES])) * int(settings[COLUMNS])
     drawn = np.empty((2, _MOST_ROWS, _MOST_ROWS))
-    for row in range(len(mask)):
-        was_over = integers[OUTCOME_ROW, row] != rules.BUILDING
-        if mode != kernels.RESTART and mask[row] and not was_over:
-            action = discrete[row]
-            given = kernels.parameter(parameters, row, 0, action, places, bounds)
-            outcome, rewards[row] = _act(floats, integers, row, option[row], action, given, settings)
-            kernels.end_step(integers, row, outcome, len(rules.OUTCOMES), settings)
-        for reading in range(len(observations)):
-            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
-                bits, step = kernels.new_episode(integers, row, settings)
-                _start(floats, integers, row, bits, step, settings, drawn)
-            _observe(floats, integers, row, settings, observations[reading, row])
-            extras[reading, 0, row] = floats[of_similarity, row]
-            extras[reading, 1, row] = floats[of_similarity + 1, row]
-            kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+    block = np.empty((_SIDE_BY_SIDE, len(floats)), np.float32)
+    for first in range(0, len(mask), _SIDE_BY_SIDE):
+        num = min(_SIDE_BY_SIDE, len(mask) - first)
+        for place in range(len(floats)):
+            for i in range(num):
+                block[i, place] = floats[place, first + i]
+        for i in range(num):
+            row, entries = first + i, block[i]
+            was_over = integers[OUTCOME_ROW, row] != rules.BUILDING
+            if mode != kernels.RESTART and mask[row] and not was_over:
+                action = discrete[row]
+                given = kernels.parameter(parameters, row, 0, action, places, bounds)
+                outcome, rewards[row] = _act(entries, integers, row, option[row], action, given, settings)
+                kernels.end_step(integers, row, outcome, len(rules.OUTCOMES), settings)
+            for reading in range(len(observations)):
+                if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
+                    bits, step = kernels.new_episode(integers, row, settings)
+                    _start(entries, integers, row, bits, step, settings, drawn)
+                _observe(entries, integers, row, settings, observations[reading, row])
+                extras[reading, 0, row] = entries[of_similarity]
+                extras[reading, 1, row] = entries[of_similarity + 1]
+                kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+        for place in range(len(floats)):
+            for i in range(num):
+                floats[place, first + i] = block[i, place]
     return -1
