@@ -55,9 +55,7 @@ def settings_of(design: Design) -> Sequence[float]:
 
 
 @part
-def _apply(
-    entries: Any, kind: Any, flipped: Any, control: Any, angle: Any, num_rows: Any, num_columns: Any
-) -> None:
+def _apply(entries: Any, kind: Any, flipped: Any, control: Any, angle: Any, num_rows: Any, num_columns: Any) -> None:
     """Apply a gate to a circuit in place: `gates.Gate`."""
     imaginary = num_rows * num_columns
     if kind == _PHASE:
