@@ -34,8 +34,6 @@ class PinballOptions(Settings):
     """Where episodes begin: at the start of the `map`, or `anywhere` between the walls. The ball is at rest."""
     max_steps: PositiveInt = 600
     """Steps after which an episode is truncated."""
-    compile_rules: bool = False
-    """Compile the tensor functions instead of using the kernel, for a GPU; the first action takes about a minute."""
 
 
 class PinballEnv(BatchedEnv[PinballState]):

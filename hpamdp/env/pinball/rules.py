@@ -164,9 +164,11 @@ def _touches(x: Tensor, y: Tensor, vx: Tensor, vy: Tensor, table: Table) -> Tens
 def _bounced(vx: Tensor, vy: Tensor, touches: Tensor, table: Table) -> tuple[Tensor, Tensor]:
     """Return the velocities `[N]` after the balls have touched edges: mirrored at one, reversed by several."""
     num = touches.sum(-1)
-    edge = touches.to(torch.uint8).argmax(-1)
-    side_x, side_y = table.side_x[edge], table.side_y[edge]
-    double = 2.0 * (vx * side_x + vy * side_y) / table.squared[edge]
+    # Sums find the only edge without an index, which compiled code would check even where there is none.
+    side_x, side_y, squared = (
+        torch.where(touches, each, 0.0).sum(-1) for each in (table.side_x, table.side_y, table.squared)
+    )
+    double = 2.0 * (vx * side_x + vy * side_y) / torch.where(num > 0, squared, 1.0)
     bounced_x = torch.where(num > 1, -vx, double * side_x - vx)
     bounced_y = torch.where(num > 1, -vy, double * side_y - vy)
     return torch.where(num > 0, bounced_x, vx), torch.where(num > 0, bounced_y, vy)
