@@ -28,7 +28,17 @@ import numpy as np
 from scipy import stats
 from sentences import Claim, compare, uncovered
 
-from hpamdp.analysis.study import Rows, difference, first_at, groups, read_csv, spread, standing_rows, with_enough_seeds
+from hpamdp.analysis.study import (
+    FIRST_PROTOCOL_SEED,
+    Rows,
+    difference,
+    first_at,
+    groups,
+    read_csv,
+    spread,
+    standing_rows,
+    with_enough_seeds,
+)
 from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
 from hpamdp.messages import exit_code
 from hpamdp.metrics_file import read_rows
@@ -627,7 +637,7 @@ def domain_runs() -> tuple[dict[tuple[str, str], Rows], dict[tuple[str, str], li
 
 def domains() -> list[Claim]:
     results, _, published = domain_runs()
-    best_runs, num_learners, is_above = [], [], []
+    best_runs, num_learners, is_above, are_fresh = [], [], [], []
     for domain, bar in published.items():
         measure = study("domains").DOMAINS[domain][1]
         of_domain = [
@@ -636,6 +646,7 @@ def domains() -> list[Claim]:
         best_runs.append(max(of_domain, key=lambda runs: mean(runs, measure)))
         num_learners.append(len(of_domain))
         is_above.append(mean(best_runs[-1], measure) > bar)
+        are_fresh.append(min(column(best_runs[-1], "seed")) >= FIRST_PROTOCOL_SEED)
     numbers = dict(
         all=len(published),
         seeds=span(map(seeds, best_runs)),
@@ -646,23 +657,25 @@ def domains() -> list[Claim]:
         Claim(
             README,
             "On each of the {all:word} domains with published scores, the highest mean of our learners lies above the "
-            "best published mean. It is over {seeds} seeds, and the learner was chosen among {learners} ([domains]",
+            "best published mean. It is over {seeds} seeds that nobody had used before. The learner is chosen among "
+            "{learners} ([domains]",
             numbers,
-            holds=all(is_above),
+            holds=all(is_above) and all(are_fresh),
         ),
         Claim(
             RESULTS,
             "On each of the {all:word} domains with published scores, the highest mean among our learners ({seeds} "
-            "seeds) lies above the best published mean.",
+            "seeds that nobody had used before) lies above the best published mean.",
             numbers,
-            holds=all(is_above),
+            holds=all(is_above) and all(are_fresh),
         ),
         Claim(
             page("domains"),
             "On each of the {all:word} domains with published scores, the highest mean among our learners ({seeds} "
-            "seeds) lies above the best published mean. It is chosen among {learners} learners.",
+            "seeds that nobody had used before) lies above the best published mean. It is chosen among {learners} "
+            "learners.",
             numbers,
-            holds=all(is_above),
+            holds=all(is_above) and all(are_fresh),
         ),
         Claim(page("domains"), "All runs took {cpu_hours:.1f} hours of CPU time,", numbers),
     ]
@@ -830,8 +843,8 @@ def agents() -> list[Claim]:
     return [
         Claim(
             page("agents"),
-            "{agents:Word} agents, one for each problem, each controller and the whole task. LinUCB over H-PPO scores "
-            "{score:.3f} of {ceiling:.3f} on the whole task.",
+            "{agents} agents: one for most problems, for each controller and for the whole task. LinUCB over H-PPO "
+            "scores {score:.3f} of {ceiling:.3f} on the whole task.",
             numbers,
         ),
         Claim(
