@@ -1,0 +1,125 @@
+"""Gather and tabulate what learners reach on the problems that people have, beside what others reached.
+
+python experiments/problems/study.py FOLDER...    adds the finished runs in these folders to results.csv and curves.csv,
+                                                  then tabulates
+python experiments/problems/study.py              tabulates the stored csv files
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    finished,
+    first_at,
+    groups,
+    mean_interval,
+    read_csv,
+    spread,
+    with_enough_seeds,
+    write_tables,
+)
+from hpamdp.messages import exit_code
+
+HERE = Path(__file__).resolve().parent
+CELL = ("problem", "learner", "exploration", "frames")
+RUN = ("problem", "learner", "exploration", "seed")
+# What the mean return of a run should reach, by problem, and whose return that is. PEARL's code was run once, on
+# Pinball's simple map: its first evaluation that arrives, after 800 episodes and 36 minutes.
+BARS = {"pinball simple": (9_343.0, "PEARL's code")}
+
+
+def problem_of(run: Run) -> str:
+    """Return the environment of a run, with the setting that makes it another problem."""
+    name = run.summary["env"]
+    return f"{name} {run.config['env']['map']}" if name == "pinball" else name
+
+
+def gather(runs: Sequence[Run]) -> dict[str, Rows]:
+    """Return a row for each run and a row for each evaluation."""
+    results: Rows = []
+    curves: Rows = []
+    for run in runs:
+        summary = run.summary
+        name = {
+            "problem": problem_of(run),
+            "learner": summary["low"],
+            "exploration": run.config["choices"]["exploration"],
+            "seed": summary["seed"],
+        }
+        results.append(
+            {
+                **name,
+                "frames": summary["frames"],
+                "score": round(summary["score"], 4),
+                "success": round(summary["success"], 4),
+                "cpu_s": round(summary["cpu_s"], 1),
+            }
+        )
+        curves += [
+            {**name, "frames": int(row["frames"]), "score": round(row["eval/score"], 4)} for row in run.evaluations()
+        ]
+    return {"results": results, "curves": curves}
+
+
+def merged(stored: Rows, new: Rows) -> Rows:
+    """Return the stored rows with those of repeated runs replaced, in order."""
+
+    def key(row: dict) -> tuple[str, ...]:
+        return tuple(str(row[name]) for name in RUN)
+
+    made_anew = {key(row) for row in new}
+    rows = [row for row in stored if key(row) not in made_anew] + new
+    return sorted(rows, key=lambda row: (*key(row), row["frames"]))
+
+
+def table(results: Rows, curves: Rows) -> str:
+    """Return a line for each cell with enough seeds: scores, how many runs reach the bar, and after how many steps."""
+    lines = [
+        "| problem | learner | exploration | steps | n | return | 95 % | success | lowest return | return to reach "
+        "| runs that reach it | first reached after | CPU |",
+        "|---" * 13 + "|",
+    ]
+    evaluations = groups(curves, *RUN)
+    for (problem, learner, exploration, frames), rows in groups(with_enough_seeds(results, *CELL), *CELL).items():
+        bar, whose = BARS[problem]
+        scores = [row["score"] for row in rows]
+        low, high = mean_interval(scores)
+        firsts = [first_at(evaluations[problem, learner, exploration, row["seed"]], "score", bar) for row in rows]
+        reached = [first["frames"] for first in firsts if first]
+        columns = [
+            problem,
+            learner,
+            exploration,
+            f"{frames:,}",
+            len(rows),
+            spread(scores, 0),
+            f"{low:.0f} to {high:.0f}",
+            f"{np.mean([row['success'] for row in rows]):.1%}".replace("%", " %"),
+            f"{min(scores):.0f}",
+            f"{bar:,.0f} ({whose})",
+            f"{sum(score >= bar for score in scores)} of {len(rows)}",
+            f"{min(reached):,} to {max(reached):,}" if reached else "",
+            f"{np.mean([row['cpu_s'] for row in rows]):.0f} s",
+        ]
+        lines.append("| " + " | ".join(map(str, columns)) + " |")
+    return "\n".join(lines)
+
+
+def main(folders: Sequence[str]) -> None:
+    """Add the runs in the folders, if any are given, and tabulate."""
+    if folders:
+        new = gather(finished(folders))
+        stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in new}
+        write_tables(HERE, {name: merged(stored[name], new[name]) for name in new})
+    print(table(read_csv(HERE / "results.csv"), read_csv(HERE / "curves.csv")))
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))
