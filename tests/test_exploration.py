@@ -540,7 +540,7 @@ def corridor_dlpa(specs, explore):
     settings = {"warmup_steps": 100, "batch_size": 64, "updates_per_step": 1.0, "planning_precision": "float32"}
     settings |= {"horizon": 8, "num_samples": 128, "num_elites": 16, "num_iterations": 4}
     learner = DLPA(specs, hidden_dims=[32, 32], **settings)
-    run = {"steps": 1200, "num_envs": 4, "steps_per_batch": 10}
+    run = {"steps": 800, "num_envs": 4, "steps_per_batch": 10}
     return learner, explore(learner, 0.05), run, {"length": 7.0, "max_steps": 20}
 
 
