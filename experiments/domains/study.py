@@ -33,6 +33,7 @@ from hpamdp.analysis.study import (
     spread,
     standing_rows,
     with_enough_seeds,
+    with_repeats_replaced,
     write_tables,
 )
 from hpamdp.figure_style import LEARNER_COLOURS
@@ -122,10 +123,9 @@ def learner(run: Run) -> str:
 
 def merged(stored: Rows, new: Rows) -> Rows:
     """Return the stored rows, with rows of repeated runs replaced by the new rows, by domain and learner."""
-    made_anew = {tuple(str(row[name]) for name in KEY) for row in new}
-    kept = [row for row in stored if tuple(str(row[name]) for name in KEY) not in made_anew]
-    columns = dict.fromkeys(name for row in [*new, *kept] for name in row)
-    rows = [{name: row.get(name, "") for name in columns} for row in kept + new]
+    merged_rows = with_repeats_replaced(stored, new, KEY)
+    columns = dict.fromkeys(name for row in [*new, *merged_rows] for name in row)
+    rows = [{name: row.get(name, "") for name in columns} for row in merged_rows]
     order = {name: number for number, name in enumerate(DOMAINS)}
     return sorted(
         rows, key=lambda row: (order[row["domain"]], row["learner"], float(row["frames"]), float(row["seed"]))

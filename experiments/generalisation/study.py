@@ -25,6 +25,7 @@ from hpamdp.analysis.study import (
     read_csv,
     spread,
     with_enough_seeds,
+    with_repeats_replaced,
     write_tables,
 )
 from hpamdp.env.boatdock.reference import HUMAN
@@ -85,12 +86,8 @@ def gather(runs: Sequence[Run]) -> Rows:
 
 def merged(stored: Rows, new: Rows) -> Rows:
     """Return the stored rows with those of repeated runs replaced, in order of the settings."""
-
-    def key(row: dict) -> tuple[str, ...]:
-        return tuple(str(row[name]) for name in (*SETTINGS, "frames", "seed"))
-
-    made_anew = {key(row) for row in new}
-    return sorted([row for row in stored if key(row) not in made_anew] + new, key=key)
+    names = (*SETTINGS, "frames", "seed")
+    return sorted(with_repeats_replaced(stored, new, names), key=lambda row: tuple(str(row[name]) for name in names))
 
 
 def later(row: dict) -> float:

@@ -23,6 +23,7 @@ from hpamdp.analysis.study import (
     read_csv,
     spread,
     with_enough_seeds,
+    with_repeats_replaced,
     write_tables,
 )
 from hpamdp.messages import exit_code
@@ -70,13 +71,8 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
 
 def merged(stored: Rows, new: Rows) -> Rows:
     """Return the stored rows with those of repeated runs replaced, in order."""
-
-    def key(row: dict) -> tuple[str, ...]:
-        return tuple(str(row[name]) for name in RUN)
-
-    made_anew = {key(row) for row in new}
-    rows = [row for row in stored if key(row) not in made_anew] + new
-    return sorted(rows, key=lambda row: (*key(row), row["frames"]))
+    rows = with_repeats_replaced(stored, new, RUN)
+    return sorted(rows, key=lambda row: tuple(row[name] for name in (*RUN, "frames")))
 
 
 def table(results: Rows, curves: Rows) -> str:

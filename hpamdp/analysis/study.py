@@ -171,6 +171,16 @@ def with_enough_seeds(rows: Rows, *names: str) -> Rows:
     return [row for cell in cells if len({row["seed"] for row in cell}) >= FEWEST_SEEDS for row in cell]
 
 
+def with_repeats_replaced(stored: Rows, new: Rows, names: Sequence[str]) -> Rows:
+    """Return the stored rows that no new row repeats, told apart by these columns, and then the new rows."""
+
+    def key(row: dict[str, Any]) -> tuple[str, ...]:
+        return tuple(str(row[name]) for name in names)
+
+    made_anew = {key(row) for row in new}
+    return [row for row in stored if key(row) not in made_anew] + new
+
+
 def first_at(rows: Rows, column: str, level: float) -> dict[str, Any] | None:
     """Return the first row whose column is at least `level`, or None. A row may be an evaluation of a run."""
     return next((row for row in rows if row[column] >= level), None)

@@ -295,7 +295,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         raise NotImplementedError(f"{type(self).__name__} has no pictures")
 
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
-        """Yield the pictures of `draw`, each for `seconds_per_step`; none if there are none."""
+        """Yield the pictures of `draw`, each for `seconds_per_step`; nothing if the problem has no pictures."""
         if type(self).draw is BatchedEnv.draw:
             return
         states = [type(self._state)(**columns) for columns in track]

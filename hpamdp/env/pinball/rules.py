@@ -164,7 +164,7 @@ def _touches(x: Tensor, y: Tensor, vx: Tensor, vy: Tensor, table: Table) -> Tens
 def _bounced(vx: Tensor, vy: Tensor, touches: Tensor, table: Table) -> tuple[Tensor, Tensor]:
     """Return the velocities `[N]` after the balls have touched edges: mirrored at one, reversed by several."""
     num = touches.sum(-1)
-    # Sums find the only edge without an index, which compiled code would check even where there is none.
+    # Sums find the touched edge without an index. Compiled code would check an index even if no edge is touched.
     side_x, side_y, squared = (
         torch.where(touches, each, 0.0).sum(-1) for each in (table.side_x, table.side_y, table.squared)
     )
