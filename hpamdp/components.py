@@ -67,6 +67,19 @@ class Components:
             return (choice >= 0) & (choice < self.sizes[0])
         return ((choice >= 0) & (choice < torch.tensor(self.sizes, device=choice.device))).all(-1)
 
+    def may_follow(self, choice: Tensor, pair_mask: Tensor) -> Tensor:
+        """Return whether each component's choice may follow those of earlier components, bool `[*B, num_components]`.
+
+        Args:
+            choice: int64 `[*B, num_components]`.
+            pair_mask: whether the column's action may follow the row's, bool `[*B, num_discrete, num_discrete]`.
+        """
+        places = self.places(choice)
+        num = places.shape[-1]
+        pairs = pair_mask.gather(-2, places.unsqueeze(-1).expand(*places.shape, pair_mask.shape[-1]))
+        pairs = pairs.gather(-1, places.unsqueeze(-2).expand(*places.shape, num))
+        return (pairs | pairs.new_ones(num, num).tril()).all(-2)
+
     def of_choice(self, values: Tensor, choice: Tensor) -> Tensor:
         """Return the values of the chosen discrete actions, given the values of all, `[*B, num_discrete]`."""
         entries = values.gather(-1, self.places(choice))

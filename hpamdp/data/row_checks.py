@@ -272,10 +272,7 @@ def _action_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
             keys.PARAMETERS, is_inside | ~is_own, f"within the row's {keys.PARAMETER_LOW} and {keys.PARAMETER_HIGH}"
         )
     if specs.has_pair_mask:
-        places = components.places(discrete)
-        pairs = rows.get(keys.PAIR_MASK).gather(-2, places.unsqueeze(-1).expand(-1, -1, specs.num_discrete))
-        pairs = pairs.gather(-1, places.unsqueeze(-2).expand(-1, len(components.sizes), -1))
-        may_follow = (pairs | pairs.new_ones(pairs.shape[1:]).tril()).all(-2)
+        may_follow = components.may_follow(discrete, rows.get(keys.PAIR_MASK))
         yield _Rule(keys.DISCRETE, may_follow, f"allowed by the row's {keys.PAIR_MASK}")
     if specs.has_action_mask and keys.ACTION_MASK in rows.keys():
         allowed = components.of_choice(rows.get(keys.ACTION_MASK), discrete)

@@ -146,10 +146,7 @@ class HeldPolicy(TensorDictModuleBase):
         if allowed is not None:
             is_allowed = allowed.gather(-1, places).all(-1)
         if pair_mask is not None:
-            is_chosen = self.specs.components.is_chosen(discrete)
-            is_earlier = torch.ones_like(pair_mask).triu(1)
-            is_pair = is_chosen.unsqueeze(-1) & is_chosen.unsqueeze(-2) & is_earlier
-            is_allowed = is_allowed & (pair_mask | ~is_pair).flatten(-2).all(-1)
+            is_allowed = is_allowed & self.specs.components.may_follow(discrete, pair_mask).all(-1)
         return is_allowed
 
 
