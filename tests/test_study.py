@@ -15,6 +15,7 @@ from scripts import load_script
 from hpamdp.analysis.study import (
     FIRST_PROTOCOL_SEED,
     Run,
+    add_to_tables,
     curve,
     difference,
     finished,
@@ -300,13 +301,21 @@ def test_a_file_of_runs_without_a_plan_beside_it_stands_as_it_is(tmp_path):
     assert [row["seed"] for row in standing_rows(tmp_path / "results.csv")] == [0, 100]
 
 
-def test_every_stored_run_of_the_protocol_is_planned():
+@pytest.mark.parametrize("plan", sorted(EXPERIMENTS.glob("*/cells.csv")), ids=lambda plan: plan.parent.name)
+def test_every_stored_run_of_the_protocol_is_planned(plan):
     """Tables would leave it out without a word."""
-    planned = planned_seeds(EXPERIMENTS / "domains/cells.csv")
-    stored = [row for row in read_csv(EXPERIMENTS / "domains/results.csv") if row["seed"] >= FIRST_PROTOCOL_SEED]
-    assert stored
-    for row in stored:
-        assert row["seed"] in planned.get((row["domain"], row["learner"]), ()), row
+    planned, names = planned_seeds(plan), plan.read_text().split(",seeds")[0].split(",")
+    for row in read_csv(plan.with_name("results.csv")):
+        if row["seed"] >= FIRST_PROTOCOL_SEED:
+            assert row["seed"] in planned.get(tuple(row[name] for name in names), ()), row
+
+
+def test_runs_are_added_to_a_csv_file_in_the_place_of_repeated_ones(tmp_path):
+    write_tables(tmp_path, {"results": [_row("pdqn", 0), _row("pdqn", 2)]})
+    again = {**_row("pdqn", 2), "success": 0.1}
+    add_to_tables(tmp_path, {"results": [again, _row("hyar", 1)]}, ("domain", "learner", "seed"))
+    rows = [(row["learner"], row["seed"], row["success"]) for row in read_csv(tmp_path / "results.csv")]
+    assert rows == [("hyar", 1, 0.7), ("pdqn", 0, 0.7), ("pdqn", 2, 0.1)]
 
 
 def test_domains_says_what_each_learner_was_given_as_its_settings_say():

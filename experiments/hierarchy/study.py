@@ -1,7 +1,10 @@
 """Gather the runs of the hierarchy's multirun into csv files, and draw and tabulate them.
 
-python experiments/hierarchy/study.py multirun/hierarchy     reads the runs, writes the csv files, then draws
-python experiments/hierarchy/study.py                        draws and tabulates the stored csv files
+python experiments/hierarchy/study.py FOLDER...    adds the runs in these folders to the csv files, in the place of
+                                                   earlier ones of the same pair, length and seed; then draws and
+                                                   tabulates. A cell of cells.csv shows the seeds of the protocol once
+                                                   all of them have run, and until then the earlier ones.
+python experiments/hierarchy/study.py              draws and tabulates the stored csv files
 """
 
 from __future__ import annotations
@@ -20,19 +23,21 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 from hpamdp.analysis.study import (
     Rows,
     Run,
+    add_to_tables,
     curve,
     difference,
     finished,
     groups,
-    read_csv,
     spread,
+    standing_rows,
     with_enough_seeds,
-    write_tables,
 )
 from hpamdp.env.boatdock.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
+TABLES = ("results", "curves", "choices")
+CELL = ("low", "total", "uniform_option_steps", "high")
 # Selectors with context, selectors without context, and references.
 SELECTORS = {
     "meta_critic": "#0072B2",
@@ -110,7 +115,7 @@ def table(results: Rows) -> str:
         "| oracle's | weighted | regret | gain | success | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    cases = sorted(groups(results, "low", "total", "uniform_option_steps", "high").items(), key=_order)
+    cases = sorted(groups(results, *CELL).items(), key=_order)
     for place, ((low, total, uniform, high), runs) in enumerate(cases, start=1):
         above = ""
         if place < len(cases) and cases[place][0][:3] == (low, total, uniform):
@@ -210,12 +215,9 @@ def _label(axes: Axes, title: str, x: str, y: str) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        results, curves, choices = gather(finished(folders))
-        write_tables(HERE, {"results": results, "curves": curves, "choices": choices})
-    stored = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves", "choices"))
-    results, curves, choices = (
-        with_enough_seeds(rows, "low", "total", "uniform_option_steps", "high") for rows in stored
-    )
+        add_to_tables(HERE, dict(zip(TABLES, gather(finished(folders)), strict=True)), (*CELL, "seed"))
+    stored = (standing_rows(HERE / f"{name}.csv") for name in TABLES)
+    results, curves, choices = (with_enough_seeds(rows, *CELL) for rows in stored)
     curves, choices = of_the_map(curves), of_the_map(choices)
     print(table(results))
     draw_map(of_the_map(results), HERE / "map.png")

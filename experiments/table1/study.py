@@ -1,8 +1,10 @@
 """Draw and tabulate the paper's five learners beside its Table 1, people, and the ceiling.
 
-python experiments/table1/study.py FOLDER...    gathers the runs of experiment=table1, sparse and sample_efficiency
-                                                in these folders into results.csv, curves.csv and efficiency.csv, then
-                                                draws and tabulates
+python experiments/table1/study.py FOLDER...    adds the runs of experiment=table1, sparse and sample_efficiency in
+                                                these folders to results.csv, curves.csv and efficiency.csv, in the
+                                                place of earlier ones of the same learner, boat, reward and seed; then
+                                                draws and tabulates. A cell of cells.csv shows the seeds of the
+                                                protocol once all of them have run, and until then the earlier ones.
 python experiments/table1/study.py              draws and tabulates the stored csv files
 """
 
@@ -21,6 +23,7 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 from hpamdp.analysis.study import (
     Rows,
     Run,
+    add_to_tables,
     curve,
     difference,
     finished,
@@ -28,6 +31,7 @@ from hpamdp.analysis.study import (
     middle_half,
     read_csv,
     spread,
+    standing_rows,
     write_tables,
 )
 from hpamdp.env.boatdock.harbour import CONTROLLERS
@@ -41,7 +45,9 @@ BOTH_BOATS = -1  # in the column `controller` of these
 BLOCK_EPISODES = 60
 BOATS = ("congruent", "incongruent")
 REWARDS = ("shaped", "sparse")
-SEEDS = (0, 1, 2)
+EARLIER_SEEDS = (0, 1, 2)
+TABLES = ("results", "curves", "efficiency")
+CELL = ("low", "boat", "reward")
 LEARNERS = ("hppo", "pdqn", "hyar", "qpamdp", "dlpa")
 HUMAN_COLOUR, INK, FAINT = "#D98200", "#2b2b2b", "#8c8c8c"
 
@@ -115,7 +121,7 @@ def missing_runs(tables: dict[str, Rows]) -> list[str]:
         for low in LEARNERS:
             for boat in BOATS:
                 found = {row["seed"] for row in _of(rows, low, boat)}
-                lacking = [str(seed) for seed in SEEDS if seed not in found]
+                lacking = [str(seed) for seed in EARLIER_SEEDS if seed not in found]
                 if lacking:
                     lines.append(f"{experiment}: no run of {low}, {boat}, seed {', '.join(lacking)}")
     return lines
@@ -165,34 +171,28 @@ def _above_next(results: Rows, low: str, boat: str) -> str:
 
 
 def ceilings(results: Rows) -> dict[str, float]:
-    """Return the ceiling of each boat, which is the same in all runs.
-
-    Raises:
-        ValueError: the runs have different ceilings.
-    """
-    found = {}
-    for boat in BOATS:
-        (found[boat],) = {row["ceiling"] for row in results if row["boat"] == boat}
-    return found
+    """Return the ceiling of each boat: the mean over the runs, which may have layouts of their own."""
+    return {boat: float(np.mean([row["ceiling"] for row in results if row["boat"] == boat])) for boat in BOATS}
 
 
 def brief_table(rows: Rows, results: Rows) -> str:
     """Return one line for each learner, for the project's front page."""
     lines = [
-        "| | score, congruent controller | score, incongruent controller | presses | CPU |",
-        "|---|---|---|---|---|",
+        "| | score, congruent controller | score, incongruent controller | seeds | presses | CPU |",
+        "|---|---|---|---|---|---|",
     ]
     for (low,), boats in groups(rows, "learner").items():
         scores = {row["boat"]: row["spread"] for row in boats}
         cells = " | ".join(scores.get(boat, "") for boat in BOATS)
         presses = np.mean([row["presses"] for row in boats])
         cpu_s = np.mean([row["cpu_s"] for row in boats])
-        lines.append(f"| {low} | {cells} | {presses:,.0f} | {cpu_s:.0f} s |")
+        seeds = " and ".join(dict.fromkeys(str(row["seeds"]) for row in boats))
+        lines.append(f"| {low} | {cells} | {seeds} | {presses:,.0f} | {cpu_s:.0f} s |")
     human = " | ".join(f"{HUMAN[boat]['score']:.3f}" for boat in BOATS)
-    lines.append(f"| people, mean | {human} | {HUMAN_PRESSES} | |")
+    lines.append(f"| people, mean | {human} | | {HUMAN_PRESSES} | |")
     ceiling = ceilings(results)
-    lines.append(f"| ceiling | {ceiling['congruent']:.3f} | {ceiling['incongruent']:.3f} | | |")
-    lines.append(f"| random presses | {RANDOM['score']:.3f} | {RANDOM['score']:.3f} | | |")
+    lines.append(f"| ceiling | {ceiling['congruent']:.3f} | {ceiling['incongruent']:.3f} | | | |")
+    lines.append(f"| random presses | {RANDOM['score']:.3f} | {RANDOM['score']:.3f} | | | |")
     return "\n".join(lines)
 
 
@@ -202,31 +202,35 @@ def table(rows: Rows, results: Rows) -> str:
     From five seeds on, the interquartile mean and its interval follow the score.
     """
     lines = [
-        "| | controller | score | above the next best (95 %) | human-normalised score | success | presses | CPU "
-        "| the paper's |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| | controller | seeds | score | above the next best (95 %) | human-normalised score | success | presses "
+        "| CPU | the paper's |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         middle = f"; {row['interquartile_mean']}" if row["interquartile_mean"] else ""
         lines.append(
-            f"| {row['learner']} | {row['boat']} | {row['spread']}{middle} | {row['above_next']} | "
+            f"| {row['learner']} | {row['boat']} | {row['seeds']} | {row['spread']}{middle} | {row['above_next']} | "
             f"{row['human_normalised']:.3f} | {row['success']:.1%} | {row['presses']:,.0f} | {row['cpu_s']:.0f} s | "
             f"{row['paper']} |"
         )
     for boat, paper in zip(BOATS, PAPER_HUMAN, strict=True):
         human = HUMAN[boat]
         lines.append(
-            f"| people | {boat} | {human['score']:.3f} | | 1 | {human['success']:.1%} | {HUMAN_PRESSES} | | "
+            f"| people | {boat} | | {human['score']:.3f} | | 1 | {human['success']:.1%} | {HUMAN_PRESSES} | | "
             f"{paper} (*) |"
         )
     for boat, ceiling in ceilings(results).items():
-        lines.append(f"| ceiling | {boat} | {ceiling:.3f} | | {human_normalised(ceiling, boat):.3f} | 100.0% | | | |")
-    lines.append(f"| random | both | {RANDOM['score']:.3f} | | 0 | {RANDOM['success']:.1%} | | | |")
+        lines.append(f"| ceiling | {boat} | | {ceiling:.3f} | | {human_normalised(ceiling, boat):.3f} | 100.0% | | | |")
+    lines.append(f"| random | both | | {RANDOM['score']:.3f} | | 0 | {RANDOM['success']:.1%} | | | |")
     return "\n".join(lines)
 
 
 def reward_table(results: Rows) -> str:
-    """Return a line for each learner with its scores after training with each reward, and the difference."""
+    """Return a line for each learner with its scores after training with each reward, and the difference.
+
+    Sparse rewards have earlier seeds, so shaped ones are compared with the same seeds on the same layouts.
+    """
+    results = [row for row in results if row["seed"] in EARLIER_SEEDS]
     columns = [f"{boat}, {what}" for boat in BOATS for what in (*REWARDS, "sparse less shaped (95 %)")]
     lines = [f"| learner | {' | '.join(columns)} |", "|---|---|---|---|---|---|---|"]
     for low in LEARNERS:
@@ -375,21 +379,21 @@ def human_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        write_tables(HERE, gather(finished(folders)))
-    tables = {name: read_csv(HERE / f"{name}.csv") for name in ("results", "curves", "efficiency")}
-    for line in missing_runs(tables):
+        add_to_tables(HERE, gather(finished(folders)), (*CELL, "seed"))
+    tables = {name: standing_rows(HERE / f"{name}.csv") for name in TABLES}
+    stored = read_csv(HERE / "results.csv")
+    for line in missing_runs({**tables, "results": stored}):
         print(line, file=sys.stderr)
-    results = tables["results"]
-    shaped = [row for row in results if row["reward"] == "shaped"]
+    shaped, curves = ([row for row in tables[name] if row["reward"] == "shaped"] for name in ("results", "curves"))
     rows = summarise(shaped)
     write_tables(HERE, {"table1": rows})
-    draw_curves([row for row in tables["curves"] if row["reward"] == "shaped"], shaped, HERE / "figure2.png")
+    draw_curves(curves, shaped, HERE / "figure2.png")
     draw_efficiency(tables["efficiency"], HERE / "efficiency.png")
     print(
         brief_table(rows, shaped),
         table(rows, shaped),
         efficiency_table(tables["efficiency"], shaped),
-        reward_table(results),
+        reward_table(stored),
         sep="\n\n",
     )
 

@@ -26,7 +26,7 @@ FEWEST_SEEDS = 3  # seeds that a cell needs for a place in a table
 # Seeds from here on are those of the protocol: they run once, with settings that were frozen before. Those of earlier
 # runs informed settings.
 FIRST_PROTOCOL_SEED = 100
-PLAN_NAME = "cells.csv"  # beside a file of runs: the seeds that the protocol plans for each domain and learner
+PLAN_NAME = "cells.csv"  # beside a file of runs: the seeds that the protocol plans for each cell of a table
 _MOST_FOLDERS = 100_000  # a link may lead to the whole disk
 
 
@@ -137,28 +137,35 @@ def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
     return dict(found)
 
 
-def planned_seeds(path: Path) -> dict[tuple[str, str], range]:
-    """Return the seeds of a plan, whose rows say `100-109`, by domain and learner."""
-    planned = {}
+def planned_seeds(path: Path) -> dict[tuple[Any, ...], range]:
+    """Return the seeds of a plan, whose rows say `100-109`, by cell. The columns before `seeds` name a cell."""
+    names, planned = _cell_columns(path), {}
     for cell in read_csv(path):
         first, last = map(int, cell["seeds"].split("-"))
-        planned[cell["domain"], cell["learner"]] = range(first, last + 1)
+        planned[tuple(cell[name] for name in names)] = range(first, last + 1)
     return planned
+
+
+def _cell_columns(plan: Path) -> list[str]:
+    with plan.open(newline="") as file:
+        columns = next(csv.reader(file))
+    return columns[: columns.index("seeds")]
 
 
 def standing_rows(path: Path) -> Rows:
     """Read the rows of a csv file that stand in tables.
 
-    A plan beside the file, `PLAN_NAME`, names the seeds of the protocol. The rows of a domain and learner are those
-    of the protocol's seeds once all planned ones are in the file, and until then those of the earlier seeds. Without
-    a plan all rows stand.
+    A plan beside the file, `PLAN_NAME`, names the seeds of the protocol. The rows of a cell are those of the
+    protocol's seeds once all planned ones are in the file, and until then those of the earlier seeds. Without a plan,
+    or without the plan's columns, all rows stand.
     """
     rows, plan = read_csv(path), path.with_name(PLAN_NAME)
-    if not plan.exists():
+    names = _cell_columns(plan) if plan.exists() else []
+    if not names or not rows or not {*names, "seed"} <= rows[0].keys():
         return rows
     planned = planned_seeds(plan)
     standing: Rows = []
-    for cell, of_cell in groups(rows, "domain", "learner").items():
+    for cell, of_cell in groups(rows, *names).items():
         ran = {row["seed"] for row in of_cell if row["seed"] >= FIRST_PROTOCOL_SEED}
         is_complete = cell in planned and ran.issuperset(planned[cell])
         standing += [row for row in of_cell if (row["seed"] >= FIRST_PROTOCOL_SEED) == is_complete]
@@ -179,6 +186,19 @@ def with_repeats_replaced(stored: Rows, new: Rows, names: Sequence[str]) -> Rows
 
     made_anew = {key(row) for row in new}
     return [row for row in stored if key(row) not in made_anew] + new
+
+
+def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str]) -> None:
+    """Add rows to csv files, in the place of those of repeated runs; sort them by these columns, which name a run.
+
+    Raises:
+        SystemExit: a table has no rows. Then nothing is written.
+    """
+    merged = {}
+    for table, new in tables.items():
+        rows = with_repeats_replaced(read_csv(folder / f"{table}.csv"), new, names)
+        merged[table] = sorted(rows, key=lambda row: tuple(row[name] for name in names))
+    write_tables(folder, merged)
 
 
 def first_at(rows: Rows, column: str, level: float) -> dict[str, Any] | None:
