@@ -18,6 +18,7 @@ from hpamdp import keys
 from hpamdp.env.circuit import compiler, gates, oracle, rules
 from hpamdp.env.circuit.environment import CircuitEnv
 from hpamdp.env.circuit.rules import MATCHED, MISSED, TASK_OF, TASKS
+from hpamdp.policies.shared.networks import VectorProducts
 from hpamdp.specs import PAMDPSpecs
 
 UNIT, X, Y = np.eye(2), np.array([[0, 1], [1, 0]]), np.array([[0, -1j], [1j, 0]])
@@ -180,7 +181,7 @@ def test_all_tensors_are_as_the_specs_say(gate_set):
     check_env_specs(CircuitEnv(3, task="bell", gate_set=gate_set, oracle=True), return_contiguous=True)
 
 
-@pytest.mark.parametrize("reward", ["final", "progress"])
+@pytest.mark.parametrize("reward", rules.REWARDS)
 @pytest.mark.parametrize("gate_set", ["choose", "superconducting", "ion"])
 def test_the_kernel_does_what_the_rules_say_of_native_gates(gate_set, reward):
     env = CircuitEnv(500, task="random_state", gate_set=gate_set, reward=reward, seed=3, first_env=2)
@@ -210,6 +211,38 @@ def test_progress_adds_up_to_the_score_less_that_of_no_gates():
             total += reading[keys.REWARD].squeeze(-1)
         totals.append(total)
     assert torch.allclose(totals[0], totals[1] + 0.29517, atol=1e-4)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gain_is_how_much_the_final_score_exceeds_that_of_no_gates_and_never_negative(task):
+    assert compare_with_rules(CircuitEnv(200, task=task, reward="gain", max_steps=3), 6, 1e-5)[1] <= 3
+    final, gain = (CircuitEnv(400, task=task, reward=reward, max_steps=3) for reward in ("final", "gain"))
+    returns = []
+    for env in (final, gain):
+        player = random_player(4)
+        reading, total = env.reset(), torch.zeros(400)
+        without_gates = rules.similarity(*rules.circuit_and_target(env.state, env.design), env.design)
+        while not reading[keys.DONE].all():
+            reading = env.step(player(env))["next"]
+            total += reading[keys.REWARD].squeeze(-1)
+        returns.append(total)
+    assert torch.allclose(returns[1], (returns[0] - without_gates).clamp(min=0.0), atol=1e-5)
+    assert (returns[1] == 0.0).any()
+    # No three gates make more than half of a GHZ state, or bring the identity nearer to the Toffoli gate.
+    assert (returns[1] > 0.0).any() == (task not in ("ghz", "toffoli"))
+
+
+def test_products_of_vectors_include_the_overlap_with_the_target():
+    env = CircuitEnv(50, task="random_state")
+    player = random_player(1)
+    observation = env.reset()[keys.OBSERVATION]
+    for _ in range(3):
+        observation = env.step(player(env))["next"][keys.OBSERVATION]
+    products = VectorProducts(PAMDPSpecs.from_env(env))
+    scalar, cross = products(observation)[:, 16:].chunk(2, -1)
+    of_overlap = [[*map(tuple, products.pairs.mT.tolist())].index((place, 4 + place)) for place in range(4)]
+    fidelity = scalar[:, of_overlap].sum(-1).square() + cross[:, of_overlap].sum(-1).square()
+    assert torch.allclose(fidelity, env.state.similarity, atol=1e-5)
 
 
 @pytest.mark.parametrize("task", oracle.CIRCUITS)

@@ -24,10 +24,11 @@ from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.circuit import gates, kernel, rules
 from hpamdp.env.circuit.gates import NATIVE_SETS, GateSet
 from hpamdp.env.circuit.oracle import CIRCUITS, CircuitOracle, beginnings, best_scores
-from hpamdp.env.circuit.rules import TASK_OF, CircuitState, Design, TaskName
+from hpamdp.env.circuit.rules import TASK_OF, CircuitState, Design, RewardName, TaskName
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.state_columns import check_range
+from hpamdp.geometry import PlaneGeometry
 from hpamdp.settings import FromList, SettingError, Settings
 
 _NATIVE_TASKS = ("bell", "random_state")  # whose best circuits the compiler finds
@@ -73,9 +74,10 @@ class CircuitOptions(Settings):
     """Costs of an SX and of a CX, which are subtracted from the score. RZ is free."""
     ion_costs: Costs = (0.03, 0.05)
     """Costs of an RX or RY and of an XX."""
-    reward: Literal["final", "progress"] = "final"
+    reward: RewardName = "final"
     """`final`: the score, once, at the end. `progress`: its change with each gate, which adds up to the same less a
-    constant."""
+    constant. `gain`: how much the final score exceeds that of no gates, at least 0, so that trying gates costs nothing.
+    """
     target_number: NonNegativeInt | None = None
     """With random targets: number of the one target of all episodes, as in the published runs.
 
@@ -195,7 +197,7 @@ class CircuitEnv(BatchedEnv[CircuitState]):
             gate_sets=_gate_sets(options),
             target=_target(options),
             is_native=options.gate_set != "published",
-            rewards_progress=options.reward == "progress",
+            reward=options.reward,
             observes_depth=options.observe_depth,
             max_steps=self.max_steps,
             beginnings=beginnings(options.task) if options.begin == "known" else None,
@@ -223,6 +225,16 @@ class CircuitEnv(BatchedEnv[CircuitState]):
         """The lowest and the highest observation, `[D]` each."""
         dim = len(self.observation_names)
         return [-1.0] * dim, [1.0] * dim
+
+    @property
+    def geometry(self) -> PlaneGeometry:
+        """The complex entries of states and operators as vectors of the plane.
+
+        The products of these vectors include the overlap's parts and do not depend on the global phase.
+        """
+        num = self.design.num_numbers
+        real = (2 * num * of_target + place for of_target in (0, 1) for place in range(num))
+        return PlaneGeometry(vectors=tuple((entry, num + entry) for entry in real))
 
     def extra_spec(self, name: str) -> TensorSpec:
         """Return the spec of similarity and cost, float32 `[N, 1]`."""

@@ -21,7 +21,7 @@ from hpamdp.env.rng_streams import TRAINING
 
 # The problem's own settings: the sizes, what is rewarded and observed, whether targets are random; then the gates of
 # all sets, NUM_OF_GATE numbers each, the fixed target, and the circuits that training begins with.
-WIRES, DEPTH, COLUMNS, IS_NATIVE, PROGRESS, OBSERVES_DEPTH, IS_RANDOM, NUM_BEGINNINGS = range(
+WIRES, DEPTH, COLUMNS, IS_NATIVE, REWARD, OBSERVES_DEPTH, IS_RANDOM, NUM_BEGINNINGS = range(
     kernels.OWN, kernels.OWN + 8
 )
 NUM_GATES, NUM_SETS, OWN_GATES = range(kernels.OWN + 8, kernels.OWN + 11)
@@ -34,6 +34,7 @@ _SIDE_BY_SIDE = 16
 
 _F = np.float32
 _PI, _MATCH = _F(math.pi), _F(rules.MATCH)
+_PROGRESS, _GAIN = rules.REWARDS.index("progress"), rules.REWARDS.index("gain")
 _STOP, _PHASE, _MIX, _TURN, _FLIP = gates.STOP, gates.PHASE, gates.MIX, gates.TURN, gates.FLIP
 
 
@@ -41,7 +42,7 @@ def settings_of(design: Design) -> Sequence[float]:
     """Return the design in numbers."""
     task = design.task
     sizes = [task.n, task.depth, design.num_columns]
-    flags = [design.is_native, design.rewards_progress, design.observes_depth, design.target is None]
+    flags = [design.is_native, rules.REWARDS.index(design.reward), design.observes_depth, design.target is None]
     circuits, depths = design.beginnings or ([], [])
     numbers: list[float] = [*sizes, *flags, len(circuits), len(design.gate_sets[0]), len(design.gate_sets)]
     for gate in (gate for gate_set in design.gate_sets for gate in gate_set):
@@ -105,6 +106,21 @@ def _similarity(entries: Any, num_rows: Any, num_columns: Any) -> Any:
     for i in range(2 * num):
         difference = entries[i] - entries[2 * num + i]
         square += difference * difference
+    return ONE - TWO * _F(math.atan(math.sqrt(square))) / _PI
+
+
+@part
+def _similarity_without_gates(entries: Any, num_rows: Any, num_columns: Any) -> Any:
+    """Return how well a circuit without gates matches the target of a row."""
+    num = num_rows * num_columns
+    if num_columns == 1:
+        real, imaginary = entries[2 * num], entries[3 * num]
+        return min(real * real + imaginary * imaginary, ONE)
+    square = ZERO
+    for i in range(num):
+        of_identity = ONE if i % (num_columns + 1) == 0 else ZERO
+        real, imaginary = entries[2 * num + i] - of_identity, entries[3 * num + i]
+        square += real * real + imaginary * imaginary
     return ONE - TWO * _F(math.atan(math.sqrt(square))) / _PI
 
 
@@ -217,10 +233,13 @@ def _act(entries: Any, integers: Any, row: Any, option: Any, action: Any, given:
     if has_ended:
         outcome = rules.MATCHED if similarity >= _MATCH else rules.MISSED
     score = similarity - cost
-    if settings[PROGRESS]:
+    if settings[REWARD] == _PROGRESS:
         return outcome, score - before
-    is_last = has_ended or steps + 1 >= settings[kernels.MAX_STEPS]
-    return outcome, score if is_last else ZERO
+    if not has_ended and steps + 1 < settings[kernels.MAX_STEPS]:
+        return outcome, ZERO
+    if settings[REWARD] == _GAIN:
+        return outcome, max(score - _similarity_without_gates(entries, num_rows, num_columns), ZERO)
+    return outcome, score
 
 
 @part

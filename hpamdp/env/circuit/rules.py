@@ -30,6 +30,8 @@ from hpamdp.env.state_columns import replaced
 
 TaskName = Literal["hadamard", "random_state", "bell", "ghz", "random_unitary", "toffoli"]
 TASKS: tuple[TaskName, ...] = get_args(TaskName)
+RewardName = Literal["final", "progress", "gain"]
+REWARDS: tuple[RewardName, ...] = get_args(RewardName)
 OUTCOMES = ("building", "matched", "missed", "time limit")
 BUILDING, MATCHED, MISSED, TIME_LIMIT = range(4)
 MATCH = 0.99  # similarity from which on a finished circuit matches its target
@@ -83,7 +85,7 @@ class Design:
         gate_sets: the sets that an option stands for; one set if there is no choice.
         target: the target of all episodes, complex128 `[2^n, 1]` or `[2^n, 2^n]`; None if each episode has its own.
         is_native: whether gates cost instead of depth.
-        rewards_progress: whether the reward is the change of the score.
+        reward: what is rewarded; see `CircuitOptions`.
         observes_depth: whether the depths of the wires are observed.
         max_steps: steps after which an episode is truncated.
         beginnings: circuits that training episodes begin with, and the depths of their wires, complex64 `[B, R, C]`
@@ -94,7 +96,7 @@ class Design:
     gate_sets: tuple[tuple[Gate, ...], ...]
     target: Tensor | None
     is_native: bool
-    rewards_progress: bool
+    reward: RewardName
     observes_depth: bool
     max_steps: int
     beginnings: tuple[Tensor, Tensor] | None = None
@@ -192,8 +194,7 @@ def start(episode: Tensor, rng: RngKey, design: Design, *, is_training: bool) ->
         begun, levels = circuits[number], [*depths[number].unbind(-1)]
         cost = depth_cost(depths[number].amax(-1), design.task.depth)
     else:
-        empty = torch.zeros(design.num_rows, design.num_columns, dtype=torch.complex64, device=episode.device)
-        begun, levels, cost = empty.fill_diagonal_(1.0).expand(num, -1, -1), [none] * design.task.n, nothing
+        begun, levels, cost = without_gates(design, episode.device).expand(num, -1, -1), [none] * design.task.n, nothing
     drawn = random_target(rng, design.task) if design.target is None else design.target.to(episode.device)
     target = drawn.to(torch.complex64).expand(num, -1, -1)
     return design.state_type(
@@ -209,6 +210,12 @@ def start(episode: Tensor, rng: RngKey, design: Design, *, is_training: bool) ->
         none,
         episode,
     )
+
+
+def without_gates(design: Design, device: torch.device) -> Tensor:
+    """Return the state or operator of a circuit without gates, complex64 `[R, C]`."""
+    empty = torch.zeros(design.num_rows, design.num_columns, dtype=torch.complex64, device=device)
+    return empty.fill_diagonal_(1.0)
 
 
 def _entries(matrix: Tensor) -> list[Tensor]:
@@ -274,7 +281,13 @@ def act(
     outcome = torch.where(similar >= MATCH, MATCHED, MISSED)
     is_last = has_ended | (state.steps + 1 >= design.max_steps)
     score = similar - cost
-    reward = score - (state.similarity - state.cost) if design.rewards_progress else torch.where(is_last, score, 0.0)
+    if design.reward == "progress":
+        reward = score - (state.similarity - state.cost)
+    elif design.reward == "gain":
+        nothing = similarity(without_gates(design, target.device), target, design)
+        reward = torch.where(is_last, (score - nothing).clamp(min=0.0), 0.0)
+    else:
+        reward = torch.where(is_last, score, 0.0)
     after = replaced(
         state,
         **dict(zip(design.entry_names, _entries(made), strict=False)),
