@@ -126,7 +126,7 @@ every_end = pytest.mark.parametrize("values_end", ["session", "trip"])
 
 def agent_of(learners, specs: PAMDPSpecs, values_end: str, selector: Selector | None = None, **changes):
     agent = HierarchicalAgent(selector, learners, specs, **changes)
-    agent.values_end_with_trips = values_end == "trip"
+    agent.values_end_with_trips = agent.selector_values_end_with_trips = values_end == "trip"
     return agent
 
 
@@ -248,6 +248,18 @@ def test_selectors_count_later_trips_only_if_values_last_a_session(high, values_
         assert selector.buffer[:]["discount"].tolist() == [GAMMA**2 * follows, 0.0]
     else:
         assert selector.buffer[:]["discount"].tolist() == DISCOUNTS[values_end]
+
+
+def test_the_selectors_values_may_last_a_session_while_the_learners_end_with_a_trip():
+    env = SessionsOfOptions(1)
+    specs = PAMDPSpecs.from_env(env)
+    selector = MetaCritic(specs, gamma=GAMMA, hidden_dims=[8])
+    learner = PDQN(specs.with_option_observed(), gamma=GAMMA, hidden_dims=[8], warmup_steps=1000)
+    agent = agent_of([learner], specs, "trip", selector, is_shared=True)
+    agent.selector_values_end_with_trips = False
+    agent.learn(played(env, agent))
+    assert selector.buffer[:]["discount"].tolist() == [GAMMA**2, 0.0]
+    assert learner.buffer[:]["discount"].tolist() == DISCOUNTS["trip"]
 
 
 def test_a_step_before_a_batch_ends_its_trip_for_a_selector_that_ends_options():
@@ -457,6 +469,16 @@ def test_an_agent_that_chooses_by_the_rewards_of_a_session_does_not_act_without_
     ("env", "settings", "message"),
     [
         ("platform", {"agent.values_end": "trip"}, "agent.values_end=trip: episodes of env=platform have no trips"),
+        (
+            "boatdock",
+            {"agent.selector_values_end": "trip"},
+            "agent.selector_values_end=trip: episodes of env=boatdock have no trips",
+        ),
+        (
+            "boatdock_unseen",
+            {"agent.selector_values_end": "trip"},
+            "agent.selector_values_end=trip: high=none has no values; use agent.values_end=trip",
+        ),
         (
             "boatdock",
             {"high": "ucb", "high.memory": "session"},

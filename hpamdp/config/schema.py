@@ -55,6 +55,8 @@ class AgentConfig(Settings):
     """With `termination=chosen`: lengths to choose from, in steps, increasing. If null, 1, 2, 4, 8, 16, 32, 64, 128."""
     values_end: Literal["session", "trip"] = "session"
     """How far values look, if an episode is a session of trips: to the end of the `session`, or of the `trip`."""
+    selector_values_end: Literal["session", "trip"] | None = None
+    """How far the selector's values look. If null, as far as `values_end`, which then holds for both levels."""
     uniform_option_steps: NonNegativeInt = 0
     """Steps at the start of training in which options are chosen uniformly, so that each option's learner gets data.
 

@@ -381,8 +381,9 @@ class HierarchicalAgent(nn.Module):
         policy: writes `option`, if there is a selector, and the action leaves.
         router: the low level's part of `policy`.
         pairs: the pairs of options and lengths; None if the selector chooses options alone.
-        values_end_with_trips: whether values of both levels end with a trip, if episodes are sessions of trips. The run
-            sets it.
+        values_end_with_trips: whether the learners' values end with a trip, if episodes are sessions of trips. The run
+            sets it, and the next one.
+        selector_values_end_with_trips: whether the selector's values do.
 
     Raises:
         ValueError: the selector's `specs` list other options than the pairs.
@@ -391,6 +392,7 @@ class HierarchicalAgent(nn.Module):
 
     frames: Tensor
     values_end_with_trips: bool = False
+    selector_values_end_with_trips: bool = False
 
     def __init__(  # noqa: PLR0913  (the parts of an agent, and what the run says of them)
         self,
@@ -456,21 +458,22 @@ class HierarchicalAgent(nn.Module):
         self.frames += batch.numel()
         if self.next_options is not None and self.next_options.decides_ends:
             batch = self.next_options.with_ends(batch)
-        if self.values_end_with_trips:
-            batch = ended_with_trips(batch)
         if self.selector is not None and self.next_options is not None:
             self._set_is_uniform()
-            seen = steps = self._seen_by_selector(batch)
+            seen = ended_with_trips(batch) if self.selector_values_end_with_trips else batch
+            seen = steps = self._seen_by_selector(seen)
             self._set_pending(self.selector, seen)
             if self.next_options.decides_ends:
                 steps = self.next_options.with_steps_before(seen)
-                if self.values_end_with_trips:  # the step before the batch may have ended a trip
+                if self.selector_values_end_with_trips:  # the step before the batch may have ended a trip
                     steps = ended_with_trips(steps)
             learned = self.selector.learn_from_options(steps)
             learned = {**learned, **self.selector.learn_from_steps(seen), **self._mean_length(batch)}
             scalars.update({f"high/{name}": value for name, value in learned.items()})
         if self.is_frozen:
             return scalars
+        if self.values_end_with_trips:
+            batch = ended_with_trips(batch)
         if len(self.explorations):
             batch, explored = self._explored(batch)
             scalars.update(explored)

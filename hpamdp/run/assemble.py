@@ -215,7 +215,9 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         option_lengths=lengths,
         explorations=explorations,
     )
-    agent.values_end_with_trips = config.run.agent.values_end == "trip"
+    values_end, of_selector = config.run.agent.values_end, config.run.agent.selector_values_end
+    agent.values_end_with_trips = values_end == "trip"
+    agent.selector_values_end_with_trips = (of_selector or values_end) == "trip"
     return agent.to(device)
 
 

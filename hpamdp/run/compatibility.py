@@ -184,9 +184,24 @@ def callbacks_have_evaluations(config: Config) -> str | None:
 
 def values_end_where_there_are_trips(config: Config) -> str | None:
     """Refuse `agent.values_end=trip` for episodes without trips; an evaluation, which learns nothing, ignores it."""
-    if config.run.mode == "eval" or config.run.agent.values_end == "session" or has_trips(config):
+    if config.run.mode == "eval" or has_trips(config):
         return None
-    return f"agent.values_end=trip: episodes of {config.env} have no trips; use agent.values_end=session"
+    agent = config.run.agent
+    for setting, value, other in (
+        ("values_end", agent.values_end, "session"),
+        ("selector_values_end", agent.selector_values_end, "null"),
+    ):
+        if value == "trip":
+            return f"agent.{setting}=trip: episodes of {config.env} have no trips; use agent.{setting}={other}"
+    return None
+
+
+def selector_values_have_a_selector(config: Config) -> str | None:
+    """Refuse `agent.selector_values_end` without a selector."""
+    values_end = config.run.agent.selector_values_end
+    if config.run.mode == "eval" or values_end is None or config.high.name != "none":
+        return None
+    return f"agent.selector_values_end={values_end}: high=none has no values; use agent.values_end={values_end}"
 
 
 def session_rewards_need_trips(config: Config) -> str | None:
@@ -576,6 +591,7 @@ RULES: tuple[Rule, ...] = (
     stop_score_needs_evaluations,
     callbacks_have_evaluations,
     values_end_where_there_are_trips,
+    selector_values_have_a_selector,
     session_rewards_need_trips,
     sessions_are_played_here,
     explorations_have_steps,
