@@ -67,7 +67,7 @@ def gather(runs: Sequence[Run]) -> Rows:
             "frame": env["frame"],
             "fleet_size": env["fleet_size"] or "new",
             "scored_boats": env["scored_boats"],
-            "values_end": run.config["agent"]["values_end"],
+            "values_end": _values_end(run.config["agent"]),
             "high": run.summary["high"],
             "high_memory": high.get("memory", ""),
             "low": run.summary["low"],
@@ -84,23 +84,31 @@ def gather(runs: Sequence[Run]) -> Rows:
     return rows
 
 
+def _values_end(agent: dict) -> str:
+    """Return where values end, such as `trip`, or `trip, selector: session` if the two levels differ."""
+    of_selector = agent.get("selector_values_end") or agent["values_end"]
+    return agent["values_end"] + (f", selector: {of_selector}" if of_selector != agent["values_end"] else "")
+
+
 def merged(stored: Rows, new: Rows) -> Rows:
     """Return the stored rows with those of repeated runs replaced, in order of the settings."""
     names = (*SETTINGS, "frames", "seed")
     return sorted(with_repeats_replaced(stored, new, names), key=lambda row: tuple(str(row[name]) for name in names))
 
 
-def later(row: dict) -> float:
-    """Return the mean score of a run's trips from the third on."""
-    return sum(row[f"score_{trip}"] for trip in range(FIRST_LATER, NUM_TRIPS + 1)) / (NUM_TRIPS + 1 - FIRST_LATER)
+def later(row: dict, first: int = FIRST_LATER) -> float:
+    """Return the mean score of a run's trips from this one on."""
+    scores = [row[f"score_{trip}"] for trip in range(first, NUM_TRIPS + 1)]
+    return sum(scores) / len(scores)
 
 
 def table(results: Rows) -> str:
     """Return a line for each cell: the score of the first, the second and the later trips, mean and interval."""
     lines = [
         "| family | boats | frame | training boats | scored on | values end | selector | learner, memory, sharing | n "
-        "| first trip | second trip | trips 3 to 8 | 95 % | ceiling | presses, first trip | later | CPU |",
-        "|---" * 17 + "|",
+        "| first trip | second trip | trips 3 to 8 | 95 % | trips 4 to 8 | ceiling | presses, first trip | later "
+        "| CPU |",
+        "|---" * 18 + "|",
     ]
     for settings, rows in groups(results, *SETTINGS).items():
         family, boats, frame, fleet, scored, ends, high, high_memory, low, memory, sharing = settings
@@ -120,6 +128,7 @@ def table(results: Rows) -> str:
             spread(second),
             spread(rest),
             f"{low_end:.3f} to {high_end:.3f}",
+            spread([later(row, first=4) for row in rows]),
             f"{_mean(rows, 'ceiling'):.3f}",
             f"{_mean(rows, 'presses_1'):.1f}",
             f"{sum(_mean(rows, f'presses_{trip}') for trip in range(3, 9)) / 6:.1f}",
