@@ -50,7 +50,7 @@ RECOMMENDATION = "we recommend using a symmetric and normalized space"
 each_problem = pytest.mark.parametrize("problem", PROBLEMS, ids=lambda problem: problem.__name__)
 
 
-@pytest.mark.parametrize("problem", POINTS)
+@pytest.mark.parametrize("problem", [*POINTS, OfficeEnv, PinballEnv, CircuitEnv])
 def test_all_tensors_are_as_the_specs_say(problem):
     check_env_specs(problem(3, max_steps=4, oracle=True), return_contiguous=True)
 
@@ -309,6 +309,11 @@ def test_the_oracle_writes_the_scripted_players_action(problem):
     discrete, parameter = env.scripted_action(env.state)
     assert torch.equal(reading[keys.ORACLE_DISCRETE].squeeze(-1), discrete)
     assert torch.equal(reading[keys.ORACLE_PARAMETERS].squeeze(-1), parameter)
+
+
+def test_an_oracle_is_refused_where_nobody_knows_the_best_action():
+    with pytest.raises(ValueError, match="oracle=True: PlatformEnv has no planner to ask"):
+        PlatformEnv(1, oracle=True)
 
 
 @pytest.mark.parametrize("env_id", IDS)

@@ -15,6 +15,7 @@ from hpamdp.config.outside_jobs import composed, word
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
 from hpamdp.messages import first_line
+from hpamdp.run.compatibility import lack_of
 from hpamdp.settings import SettingError, Settings
 
 
@@ -54,6 +55,10 @@ def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **
     with composed([*words, word("device", str(device))]) as cfg:
         config = read(cfg).with_objects(arguments.objects)
     needs = {each: True for each in ("oracle", "human") if getattr(sizes, each)}
+    for need in needs:
+        lack = lack_of(need, config)
+        if lack is not None:
+            raise ConfigError(f"{need}=True: {lack}")
     return config.env.build(num_envs=sizes.num_envs, device=config.run.resolve_device(), seed=sizes.seed, **needs)
 
 

@@ -98,7 +98,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     - if a subclass overrides one of the three;
     - after the first action whose parameters require gradients.
 
-    The scripted action of `oracle` is always a tensor function.
+    The scripted action of `oracle` is always a tensor function. It is one plan, or one for each option that the agent
+    chooses (P plans).
 
     Random numbers depend on the seed, the number of the environment and the episode. Training and evaluation draw
     theirs from separate streams, and so do the starts of episodes and the noise within them.
@@ -109,6 +110,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         device: of the tensors.
         seed: of all random numbers; the global generators are neither read nor moved.
         first_env: number of the first environment, if other processes have those before it.
+        oracle: whether to write the action of the problem's scripted player under `oracle`: `discrete` and
+            `parameters`, `[N, P]`.
         settings: single settings by name, in place of those in `options`.
 
     Raises:
@@ -133,7 +136,6 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     limit_terminates = False  # whether the time limit terminates an episode instead of truncating it
     float_type = torch.float32  # of observations and rewards
     seconds_per_step: ClassVar[float] = 0.25  # in films
-    _has_oracle = False
 
     def __init__(
         self,
@@ -143,6 +145,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
+        oracle: bool = False,
         **settings: Any,
     ) -> None:
         self.options = self.Options.of(options, settings)
@@ -151,6 +154,9 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         facts = self.facts(self.options)
+        if oracle and not facts.has_oracle:
+            raise SettingError(f"oracle={oracle}: {self.title} has no planner to ask")
+        self._has_oracle = oracle
         self._chooses = facts.has_choice
         self.option_names = facts.option_names
         self.can_change_option = facts.can_change_option
@@ -282,7 +288,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     def scripted_action(self, state: EpisodeState) -> tuple[Tensor, Tensor]:
         """Return the action of a hand-written player and its one parameter, `[N]` each, for comparison with learners.
 
-        A subclass that has one takes the argument `oracle`.
+        If the agent chooses among P options, return `[N, P]` each. A subclass that has a player says so in its `facts`.
         """
         raise NotImplementedError(f"{type(self).__name__} has no hand-written player")
 
@@ -396,22 +402,28 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         """Return the observations for the vectors `[N, D]` that `observe` returns: the vectors themselves."""
         return vectors
 
-    def _knowledge_specs(self) -> dict[str, Composite]:
+    def _knowledge_specs(self) -> dict[str, TensorSpec]:
         """Return the specs of what is known beside the observation, such as the action of a scripted player."""
         if not self._has_oracle:
             return {}
-        n, device = self.num_envs, self.device
+        shape, device = self._shape_of_plans, self.device
         oracle = Composite(
-            discrete=Categorical(len(self.parameter_dims), shape=(n, 1), device=device),
-            parameters=Unbounded(shape=(n, 1), device=device, dtype=torch.float32),
-            shape=(n,),
+            discrete=Categorical(len(self.parameter_dims), shape=shape, device=device),
+            parameters=Unbounded(shape=shape, device=device, dtype=torch.float32),
+            shape=shape[:1],
         )
         return {"oracle": oracle}
 
     def _knowledge(self) -> dict[str, Any]:
         """Return what `_knowledge_specs` describes, for the current states."""
-        discrete, parameter = self.scripted_action(self._state)
-        return {"oracle": {"discrete": discrete.unsqueeze(-1), "parameters": parameter.unsqueeze(-1)}}
+        if not self._has_oracle:
+            return {}
+        plan = zip(("discrete", "parameters"), self.scripted_action(self._state), strict=True)
+        return {"oracle": {name: leaf.view(self._shape_of_plans) for name, leaf in plan}}
+
+    @property
+    def _shape_of_plans(self) -> tuple[int, int]:
+        return self.num_envs, len(self.option_names) if self._chooses else 1
 
     def _place_parameters(self, low: Tensor, high: Tensor) -> None:
         """Note where the parameters of each discrete action lie, and their bounds, `[K, D]` each."""

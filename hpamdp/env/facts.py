@@ -19,7 +19,8 @@ class ProblemFacts:
         is_shardable: whether several processes can each step some of the environments.
         has_statistics: whether the scale of observations or rewards is learned.
         default_options: options to begin with, as for `PAMDPEnv.group_actions`; empty if the problem suggests none.
-        has_oracle: whether the constructor takes `oracle`.
+        has_oracle: whether the problem knows its best actions, for `oracle`; the constructor may still refuse some
+            settings.
         has_human: whether the constructor takes `human`.
         has_pictures: whether an entry of the observation is a picture, unless pictures are flattened.
     """

@@ -14,7 +14,6 @@ from hpamdp.env import point_pictures
 from hpamdp.env.batched_env import GOING_ON, SUCCESS, BatchedEnv, EpisodeColumns
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.point_agent import Located
-from hpamdp.settings import Settings
 
 
 class PointColumns(EpisodeColumns, Located, Protocol):
@@ -35,27 +34,11 @@ PointEpisode = TypeVar("PointEpisode", bound=PointColumns)
 class PointEnv(BatchedEnv[PointEpisode], Generic[PointEpisode]):
     """A batch of environments in which a point must reach a target.
 
-    If `oracle` is true, the environment writes the action of a scripted player under `oracle` (`discrete`,
-    `parameters` `[N, 1]`).
-    For the other arguments and errors see `BatchedEnv`.
+    For the constructor's arguments and errors see `BatchedEnv`.
     """
 
     target_radius: ClassVar[float]  # the distance that counts as a hit
     has_walls: ClassVar[bool] = False  # whether the agent must stay within the square
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        options: Settings | None = None,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-        oracle: bool = False,
-        **settings: Any,
-    ) -> None:
-        self._has_oracle = oracle
-        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:

@@ -430,14 +430,23 @@ def workers_fit_the_problem(config: Config, problem: ProblemFacts) -> str | None
 
 def problem_provides_needs(config: Config) -> str | None:
     """Require a problem with a planner or human data if a level needs one."""
-    assert config.env.cls is not None
-    there = constructor_arguments(config.env.cls)
-    lacks = {"oracle": "has no planner to ask", "human": "has no human data"}
     for level in _levels(config):
         for need in _needs(level):
-            if need not in there:
-                return f"{level}: {config.env} {lacks[need]}"
+            lack = lack_of(need, config)
+            if lack is not None:
+                return f"{level}: {lack}"
     return None
+
+
+def lack_of(need: str, config: Config) -> str | None:
+    """Return why the problem's constructor does not take an argument that levels may need; None if it does."""
+    assert config.env.cls is not None
+    facts = facts_of(config)
+    is_known = facts is None or getattr(facts, f"has_{need}", True)
+    if is_known and need in constructor_arguments(config.env.cls):
+        return None
+    lacks = {"oracle": "has no planner to ask", "human": "has no human data"}
+    return f"{config.env} {lacks.get(need, f'takes no argument {need}')}"
 
 
 def grouping_fits_levels(config: Config, problem: ProblemFacts) -> str | None:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
+from torchrl.data import TensorSpec
 
 from hpamdp import keys
 from hpamdp.env.base import Metric
@@ -122,8 +122,10 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         first_env: int = 0,
         **settings: Any,
     ) -> None:
-        self._has_oracle, self._has_human = oracle, human
-        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
+        self._has_human = human
+        super().__init__(
+            num_envs, options=options, device=device, seed=seed, first_env=first_env, oracle=oracle, **settings
+        )
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
@@ -378,8 +380,8 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         if self._oracle is not None:
             self._oracle.plan(self._state, mask)
 
-    def _knowledge_specs(self) -> dict[str, Composite]:
-        specs = {}
+    def _knowledge_specs(self) -> dict[str, TensorSpec]:
+        specs: dict[str, TensorSpec] = {}
         if self._has_human:
             specs["human"] = human_spec(self.num_envs, self.device)
         if self._has_oracle:

@@ -60,7 +60,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     the episode. A catch elsewhere is a miss.
 
     Only the start is random. If `flatten_pictures` is true, a picture is float32 with numbers in [0, 1], a vector like
-    any other. For the constructor's other arguments and errors see `PointEnv` and `BatchedEnv`.
+    any other. For the constructor's other arguments and errors see `BatchedEnv`.
     """
 
     Options = CatchPointOptions

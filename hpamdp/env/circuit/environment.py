@@ -14,7 +14,7 @@ import torch
 from pydantic import NonNegativeInt, PositiveInt, model_validator
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Bounded, TensorSpec
 from typing_extensions import Self
 
 from hpamdp import keys
@@ -163,20 +163,6 @@ class CircuitEnv(BatchedEnv[CircuitState]):
         Metric("oracle_agreement", "Better gate set chosen", "share"),
     )
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        options: CircuitOptions | None = None,
-        oracle: bool = False,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-        **settings: Any,
-    ) -> None:
-        self._has_oracle = oracle
-        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
-
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
         """Return what these settings tell of the problem."""
@@ -186,7 +172,7 @@ class CircuitEnv(BatchedEnv[CircuitState]):
             option_names=NATIVE_SETS if is_choice else (),
             has_choice=is_choice,
             can_change_option=False,
-            has_oracle=options.has_known_circuits,
+            has_oracle=True,  # if the best circuits are known, see `_prepare`
         )
 
     def _prepare(self) -> None:
@@ -348,7 +334,7 @@ class CircuitEnv(BatchedEnv[CircuitState]):
         if self._oracle is not None:
             self._oracle.plan(self._state, mask)
 
-    def _knowledge_specs(self) -> dict[str, Composite]:
+    def _knowledge_specs(self) -> dict[str, TensorSpec]:
         return {} if self._oracle is None else {"oracle": self._oracle.spec()}
 
     def _knowledge(self) -> dict[str, Any]:

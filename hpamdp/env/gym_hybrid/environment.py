@@ -127,7 +127,7 @@ class MovingEnv(_VehicleEnv):
     The reward is the way made towards the target, less 0.001 a step, plus 1 for stopping within 0.1 of it. Who leaves
     the field or runs out of time gets -1 instead. An episode terminates at rest in the target and outside the field.
 
-    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `BatchedEnv`.
+    Only the start is random. For the constructor's arguments and errors see `BatchedEnv`.
     """
 
     slides = False

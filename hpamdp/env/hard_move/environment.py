@@ -52,7 +52,7 @@ class HardMoveEnv(PointEnv[HardMoveState]):
 
     The reward is minus the squared distance after each step, plus 20 within 0.2 of the target, which ends the episode.
 
-    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `BatchedEnv`.
+    Only the start is random. For the constructor's arguments and errors see `BatchedEnv`.
     """
 
     Options = HardMoveOptions

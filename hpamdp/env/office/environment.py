@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from pydantic import Field, PositiveInt
 from torch import Tensor
-from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Binary, TensorSpec
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
@@ -60,9 +60,8 @@ class OfficeEnv(BatchedEnv[OfficeState]):
     A move costs 1, and one that is refused, because it would touch a wall, costs 2. Taking coffee or mail costs
     nothing. The delivery is rewarded with 1000 and terminates the episode.
 
-    Only the slips are random. If `oracle` is true, the environment writes the action of `hpamdp.env.office.player`
-    under `oracle` (`discrete`, `parameters` `[N, 1]`, or `[N, 3]` with an action for each option). For the
-    constructor's other arguments and errors see `BatchedEnv`.
+    Only the slips are random. The player of `oracle` is `hpamdp.env.office.player`. For the constructor's arguments and
+    errors see `BatchedEnv`.
     """
 
     Options = OfficeOptions
@@ -75,20 +74,6 @@ class OfficeEnv(BatchedEnv[OfficeState]):
     row_kernel = staticmethod(kernel.advance)
     choice_setting: ClassVar[str] = "env.chooses_goal=true"
     no_choice_setting: ClassVar[str] = "env.chooses_goal=false"
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        options: OfficeOptions | None = None,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-        oracle: bool = False,
-        **settings: Any,
-    ) -> None:
-        self._has_oracle = oracle
-        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
@@ -149,29 +134,17 @@ class OfficeEnv(BatchedEnv[OfficeState]):
         check_range(columns, {"coffee": (0, 2), "mail": (0, 2)})
 
     def _knowledge_specs(self) -> dict[str, TensorSpec]:
-        """Return the specs of the open goals and of the player's actions."""
-        n, device = self.num_envs, self.device
-        specs: dict[str, TensorSpec] = {}
-        num_plans = 1
+        """Return the specs of the player's actions and of the open goals."""
+        specs = super()._knowledge_specs()
         if self.options.chooses_goal:
-            num_plans = len(rules.GOALS)
-            specs[keys.OPTION_MASK] = Binary(num_plans, shape=(n, num_plans), dtype=torch.bool, device=device)
-        if self._has_oracle:
-            specs["oracle"] = Composite(
-                discrete=Categorical(len(rules.ACTIONS), shape=(n, num_plans), device=device),
-                parameters=Unbounded(shape=(n, num_plans), device=device, dtype=torch.float32),
-                shape=(n,),
-            )
+            num = len(rules.GOALS)
+            specs[keys.OPTION_MASK] = Binary(num, shape=(self.num_envs, num), dtype=torch.bool, device=self.device)
         return specs
 
     def _knowledge(self) -> dict[str, Any]:
-        knowledge: dict[str, Any] = {}
-        state = self._state
+        knowledge = super()._knowledge()
         if self.options.chooses_goal:
-            knowledge[keys.OPTION_MASK] = rules.open_goals(state)
-        if self._has_oracle:
-            discrete, length = self.scripted_action(state)
-            knowledge["oracle"] = {"discrete": discrete, "parameters": length}
+            knowledge[keys.OPTION_MASK] = rules.open_goals(self._state)
         return knowledge
 
     def draw(self, track: Sequence[OfficeState]) -> np.ndarray:

@@ -47,9 +47,8 @@ class PinballEnv(BatchedEnv[PinballState]):
     A push costs 5 and none costs 1. The step in which the ball reaches the hole has the reward 10,000 instead, and ends
     the episode.
 
-    Nothing is random, except the start with `start=anywhere`. If `oracle` is true, the environment writes the action of
-    a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`). For the constructor's other arguments and
-    errors see `BatchedEnv`.
+    Nothing is random, except the start with `start=anywhere`. For the constructor's arguments and errors see
+    `BatchedEnv`.
     """
 
     Options = PinballOptions
@@ -64,20 +63,6 @@ class PinballEnv(BatchedEnv[PinballState]):
     parameter_high = rules.PARAMETER_HIGH
     row_kernel = staticmethod(kernel.advance)
     seconds_per_step: ClassVar[float] = 0.04
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        options: PinballOptions | None = None,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-        oracle: bool = False,
-        **settings: Any,
-    ) -> None:
-        self._has_oracle = oracle
-        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
