@@ -35,6 +35,8 @@ from pydantic import (
 )
 from typing_extensions import Self
 
+from hpamdp.complaints import as_code, complaints
+
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 PositiveFraction = Annotated[float, Field(gt=0.0, le=1.0)]
 Expectile = Annotated[float, Field(ge=0.5, lt=1.0)]  # 0.5 is the mean
@@ -92,16 +94,8 @@ class Settings(BaseModel):
             raise TypeError(f"options: must be {cls.__name__}, not {type(options).__name__}")
         if options is not None and not settings:
             return options
+        values = {**({} if options is None else dict(options)), **settings}
         try:
-            return cls(**{**({} if options is None else dict(options)), **settings})
+            return cls(**values)
         except ValidationError as error:
-            raise SettingError("; ".join(map(cls._complaint, error.errors()))) from error
-
-    @classmethod
-    def _complaint(cls, error: Mapping[str, Any]) -> str:
-        """Return what is wrong with one setting, in one line."""
-        name = ".".join(map(str, error["loc"])) or cls.__name__
-        if error["type"] == "extra_forbidden":
-            return f"{name}: no such setting of {cls.__name__}; it has {', '.join(cls.model_fields)}"
-        message = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-        return f"{name}={error['input']!r:.80}: {message}"
+            raise SettingError(complaints(error, cls, values, f"setting of {cls.__name__}", show=as_code)) from error

@@ -1,5 +1,6 @@
 """Learners and their settings: built from the sizes of a problem alone, from a model, or from single settings."""
 
+import numpy as np
 import pytest
 from toy_steps import SPECS
 
@@ -10,6 +11,7 @@ from hpamdp.policies.low_level.iql import IQL
 from hpamdp.policies.low_level.paddpg import PADDPG
 from hpamdp.policies.low_level.qpamdp import QPAMDP
 from hpamdp.policies.low_level.td3_bc import TD3BC
+from hpamdp.settings import SettingError
 
 LEARNERS = [BC, HPPO, HSAC, IQL, PADDPG, QPAMDP, TD3BC]
 
@@ -39,3 +41,19 @@ def test_widths_are_a_list_or_a_tuple_and_never_a_set():
 def test_a_number_in_the_place_of_the_device_is_refused_by_python():
     with pytest.raises(TypeError, match="takes 2 positional arguments"):
         HPPO(SPECS, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"hiden_dims": (8,)}, "hiden_dims: no such setting of HPPOOptions; did you mean hidden_dims? It has "),
+        ({"learning_rate": 1e-3}, "learning_rate: no such setting of HPPOOptions; did you mean lr? It has "),
+        ({"anneal_frames": 3}, "anneal_frames: is called anneal_steps now"),
+        ({"lr": -1.0, "epochs": 0.5}, "epochs=0.5: must be a valid integer; lr=-1.0: must be above 0 and at most 1"),
+        ({"lr": np.ones((9, 9))}, "lr=array([[1., 1., 1., 1., 1., 1., 1., 1., 1.], [1., "),
+    ],
+)
+def test_python_code_gets_one_line_that_guesses_the_setting_that_was_meant(settings, complaint):
+    with pytest.raises(SettingError) as raised:
+        HPPO(SPECS, **settings)
+    assert str(raised.value).startswith(complaint) and len(str(raised.value).splitlines()) == 1

@@ -23,7 +23,8 @@ from hpamdp.analysis.seed_runs import (
     read_runs,
 )
 from hpamdp.analysis.study import mean_interval, spread
-from hpamdp.config.errors import ConfigError, no_such
+from hpamdp.complaints import no_such
+from hpamdp.config.errors import ConfigError
 from hpamdp.files import regular_size, replacing
 from hpamdp.messages import duration, one_line
 from hpamdp.metrics_file import EVALUATION

@@ -18,6 +18,7 @@ from hpamdp import keys
 from hpamdp.acting import acting
 from hpamdp.api.arguments import path_argument, problem_arguments
 from hpamdp.api.export import export_onnx
+from hpamdp.complaints import as_code
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.config.outside_jobs import composed
@@ -112,9 +113,9 @@ class Agent:
             >>> discrete, parameters = agent.act(observation)
         """
         if not isinstance(greedy, bool):
-            raise ValueError(f"act: greedy={greedy!r:.80}: must be True or False")
+            raise ValueError(f"act: greedy={as_code(greedy)}: must be True or False")
         if info is not None and not isinstance(info, Mapping):
-            raise ValueError(f"act: info={info!r:.80}: must be a dict")
+            raise ValueError(f"act: info={as_code(info)}: must be a dict")
         try:
             fresh, is_batch = self._form.read(observation, info)
         except ValueError as error:
@@ -144,7 +145,7 @@ class Agent:
         mask = np.asarray(starts)
         num = "N" if self._last is None else len(self._last)
         if mask.dtype != bool or mask.ndim != 1 or num not in ("N", len(mask)):
-            raise ValueError(f"reset: starts must be bool [{num}], but is {starts!r:.80}")
+            raise ValueError(f"reset: starts must be bool [{num}], but is {as_code(starts)}")
         if self._last is not None and self._kept:
             self._starts |= mask
 
@@ -233,7 +234,7 @@ class Agent:
         if specs != self.specs:
             both = [(each.name, getattr(specs, each.name), getattr(self.specs, each.name)) for each in fields(specs)]
             name, theirs, ours = next(each for each in both if each[1] != each[2])
-            has = f"has {name}={theirs!r:.80}, but the agent's problem {ours!r:.80}"
+            has = f"has {name}={as_code(theirs)}, but the agent's problem {as_code(ours)}"
             raise ConfigError(f"evaluate: {other.env} {has}")
         return config
 

@@ -15,11 +15,13 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 from torchrl.envs import EnvBase
 
+from hpamdp.complaints import as_code
 from hpamdp.config.components import GROUPS, takes_settings_model
 from hpamdp.config.compose import conf_dir
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import choosing_class, word
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.messages import first_line
 
 _ACCEPTED = (
     "a name such as 'platform', a Gymnasium id, a function or class that returns a Gymnasium environment, such an "
@@ -47,7 +49,7 @@ def path_argument(name: str, value: Any) -> Path:
         ConfigError: the value is no path.
     """
     if not isinstance(value, str | Path) or not str(value) or "\0" in str(value):
-        raise ConfigError(f"{name}={value!r:.80}: must be a path")
+        raise ConfigError(f"{name}={as_code(value)}: must be a path")
     return Path(value).expanduser()
 
 
@@ -77,7 +79,7 @@ def _group_words(group: str, value: Any) -> list[str]:
     if value is None:
         return [f"{group}=none"]
     if not isinstance(value, str):
-        raise ConfigError(f"{group}={value!r:.80}: must be a name, a class, None, or a dict of name and settings")
+        raise ConfigError(f"{group}={as_code(value)}: must be a name, a class, None, or a dict of name and settings")
     return [word(group, value)]
 
 
@@ -110,7 +112,7 @@ def _arguments_of_gymnasium(env: Any) -> Arguments:
         return Arguments(["env=gymnasium"], {"make": _copier(env)})
     if callable(env) and not isinstance(env, EnvBase | VectorEnv):
         return _arguments_of_callable(env)
-    raise ConfigError(f"env={env!r:.80}: must be {_ACCEPTED}")
+    raise ConfigError(f"env={as_code(env)}: must be {_ACCEPTED}")
 
 
 def _is_problem_class(env: Any) -> bool:
@@ -140,7 +142,7 @@ def _words_of_built(env: PAMDPEnv) -> list[str]:
     """Return the words for a problem like a built one, with as many environments."""
     cls = type(env)
     if not takes_settings_model(cls):
-        raise ConfigError(f"env={env!r:.80}: its settings are unknown; pass the class {cls.__name__}")
+        raise ConfigError(f"env={as_code(env)}: its settings are unknown; pass the class {cls.__name__}")
     settings = [word(f"env.{name}", value) for name, value in env.options.model_dump(mode="json").items()]
     return [choosing_class("env", cls), *settings, word("num_envs", env.num_envs)]
 
@@ -154,9 +156,8 @@ def _copier(env: gymnasium.Env) -> Callable[[], gymnasium.Env]:
     try:
         first = copy.deepcopy(env)
     except Exception as error:
-        raise ConfigError(
-            f"env={env!r:.80}: cannot be copied ({type(error).__name__}: {error}); pass a function that makes it"
-        ) from error
+        why = f"{type(error).__name__}: {first_line(error)}"
+        raise ConfigError(f"env={as_code(env)}: cannot be copied ({why}); pass a function that makes it") from error
     return partial(copy.deepcopy, first)
 
 

@@ -8,9 +8,10 @@ import gymnasium
 from pydantic import NonNegativeInt, PositiveInt
 
 from hpamdp.api.arguments import plain_name, problem_arguments
+from hpamdp.complaints import as_code, no_such
 from hpamdp.config.components import SUPPLIED_ARGUMENTS
 from hpamdp.config.compose import read
-from hpamdp.config.errors import ConfigError, no_such, validated
+from hpamdp.config.errors import ConfigError, validated
 from hpamdp.config.outside_jobs import composed, word
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
@@ -97,7 +98,7 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
 def _id_of(name: str) -> str:
     register()
     if not isinstance(name, str):
-        raise ConfigError(f"make_gymnasium: {name!r:.80} must be the name of a problem, or a Gymnasium id")
+        raise ConfigError(f"make_gymnasium: {as_code(name)} must be the name of a problem, or a Gymnasium id")
     if name in gymnasium.registry or "-v" in name or ":" in name:
         return name
     ids = {plain_name(each): each for each in gymnasium.registry if each.startswith("hpamdp/")}

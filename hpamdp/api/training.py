@@ -15,6 +15,7 @@ import torchrl
 
 from hpamdp.api.agent import Agent
 from hpamdp.api.arguments import path_argument, problem_arguments, settings_words
+from hpamdp.complaints import as_code
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching
 from hpamdp.config.schema import RESUME_AUTO
@@ -115,7 +116,7 @@ def _checked_callbacks(given: Any) -> list[Callback]:
     """
     callbacks = [given] if isinstance(given, Callback) else given
     if not isinstance(callbacks, list | tuple):
-        raise ConfigError(f"callbacks={given!r:.80}: must be a list of objects of subclasses of hpamdp.Callback")
+        raise ConfigError(f"callbacks={as_code(given)}: must be a list of objects of subclasses of hpamdp.Callback")
     check_callbacks(callbacks)
     return [*callbacks]
 
@@ -204,7 +205,7 @@ def load(
         (1, 1, 1)
     """
     if trust is not True and trust is not False:
-        raise ConfigError(f"trust={trust!r:.80}: must be True or False")
+        raise ConfigError(f"trust={as_code(trust)}: must be True or False")
     for name in settings:
         if name not in ("device", "threads") and name.partition(".")[0] not in ("env", "eval"):
             raise ConfigError(f"{name}: has no effect on a trained agent; leave it out")

@@ -14,7 +14,8 @@ from typing import Any, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, PydanticUserError, create_model
 
-from hpamdp.config.errors import ConfigError, as_json, validated
+from hpamdp.complaints import as_json
+from hpamdp.config.errors import ConfigError, validated
 from hpamdp.config.stand_ins import check_readable
 from hpamdp.memory import is_about_memory
 from hpamdp.messages import first_line

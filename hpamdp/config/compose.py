@@ -15,8 +15,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from hpamdp.complaints import as_json, no_such
 from hpamdp.config.components import CALLBACK, GROUPS, TARGET, file_of
-from hpamdp.config.errors import ConfigError, MissingChoiceError, as_json, no_such
+from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.schema import Config, RunConfig, check_run, checked_config
 from hpamdp.config.yaml_files import complete_yaml_files
 from hpamdp.messages import first_line

@@ -15,13 +15,13 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from hpamdp.complaints import no_such
 from hpamdp.config.command_line import GRAMMAR, CommandLine, as_text, choices_in, written_out
 from hpamdp.config.components import GROUPS, TARGET
 from hpamdp.config.compose import NESTED, beginning_of
-from hpamdp.config.errors import no_such
-from hpamdp.config.renamed import renamed
 from hpamdp.config.schema import RUN_FILE
 from hpamdp.messages import file_and_reason, first_line
+from hpamdp.renamed import renamed
 
 # Launchers and sweepers in separate packages, and the extra of pyproject.toml that installs each.
 _EXTRAS = {

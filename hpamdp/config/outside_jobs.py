@@ -18,6 +18,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from hpamdp.complaints import as_code
 from hpamdp.config.command_line import parse
 from hpamdp.config.components import (
     SUPPLIED_ARGUMENTS,
@@ -118,7 +119,7 @@ def _written(name: str, value: Any) -> str:
         return f"[{','.join(_written(name, item) for item in value)}]"
     if isinstance(value, Mapping) and all(is_name(entry) for entry in value):
         return f"{{{','.join(f'{entry}:{_written(name, item)}' for entry, item in value.items())}}}"
-    raise ConfigError(f"{name}={value!r:.80}: must be a number, a text, or a list or mapping of these")
+    raise ConfigError(f"{name}={as_code(value)}: must be a number, a text, or a list or mapping of these")
 
 
 def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list[str]:
@@ -134,7 +135,7 @@ def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list
     if isinstance(folders, str | Path):
         folders = [folders]
     if not isinstance(folders, list | tuple) or not all(isinstance(each, str | Path) and str(each) for each in folders):
-        raise ConfigError(f"{where}={folders!r:.80}: must be a list of folders")
+        raise ConfigError(f"{where}={as_code(folders)}: must be a list of folders")
     missing = [folder for folder in folders if not Path(folder).is_dir()]
     if missing:
         raise ConfigError(f"{where}: there is no folder {missing[0]}")

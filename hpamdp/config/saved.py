@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from hpamdp.complaints import as_json
 from hpamdp.config.components import GROUPS, RUN_VALUES, TARGET
 from hpamdp.config.compose import check, choosing, compose, is_name, names_of, plain_groups
-from hpamdp.config.errors import ConfigError, MissingChoiceError, as_json
-from hpamdp.config.renamed import with_new_names
+from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.schema import AgentConfig, Config, EnvConfig
+from hpamdp.renamed import with_new_names
 from hpamdp.settings import Settings
 
 _CHOICES = "choices"

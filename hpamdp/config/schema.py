@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
 
+from hpamdp.complaints import as_json
 from hpamdp.config.components import CALLBACK, GROUPS, TARGET, Component, check_base_class, component, file_of
-from hpamdp.config.errors import ConfigError, as_json, validated
+from hpamdp.config.errors import ConfigError, validated
 from hpamdp.settings import FromList, Settings
 
 if TYPE_CHECKING:

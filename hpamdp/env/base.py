@@ -15,6 +15,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategoric
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.complaints import as_code
 from hpamdp.components import MAX_PAIRED, Components
 from hpamdp.env.errors import ProblemError as ProblemError  # part of what a problem may use
 from hpamdp.env.facts import ProblemFacts
@@ -486,7 +487,7 @@ def checked_option_names(given: object) -> tuple[str, ...]:
         ProblemError: the value is not a list of names, or a name occurs twice.
     """
     if not isinstance(given, list | tuple) or not all(isinstance(name, str) for name in given):
-        raise ProblemError(f"option_names is {given!r:.80}, but must be a list of names")
+        raise ProblemError(f"option_names is {as_code(given)}, but must be a list of names")
     if len({*given}) < len(given):
         raise ProblemError(f"option_names has a name twice: {', '.join(given)}")
     return tuple(given)

@@ -17,6 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
+from hpamdp.complaints import as_code
 
 if TYPE_CHECKING:
     from hpamdp.env.base import PAMDPEnv
@@ -143,7 +144,7 @@ class VectorForm(GymnasiumForm):
         for name, shape in self._mask_shapes.items():
             mask = self._entry(name, "forbids some choices", info, (num, *shape))
             if not np.isin(mask, (0, 1)).all():
-                raise ValueError(f"{name} must be 0 or 1, but is {info and info[name]!r:.80}")
+                raise ValueError(f"{name} must be 0 or 1, but is {as_code(info and info[name])}")
             sizes = self._components.sizes if name == keys.ACTION_MASK and not self._components.is_single else ()
             rows[name] = checked_mask(name, mask, sizes)
         for name in self._bounds:
@@ -164,7 +165,7 @@ class VectorForm(GymnasiumForm):
                 vectors = vectors.reshape(*vectors.shape[: -len(self._picture)], -1)
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"the observation must hold {self.num_entries} numbers, but is {observation!r:.80}"
+                f"the observation must hold {self.num_entries} numbers, but is {as_code(observation)}"
             ) from error
         if vectors.ndim not in (1, 2) or vectors.shape[-1] != self.num_entries or not vectors.size:
             one = ", ".join(map(str, self._picture or (self.num_entries,)))
@@ -184,7 +185,7 @@ class VectorForm(GymnasiumForm):
             raise ValueError(f"the problem {why}, so give the info of the step with its {name}")
         array = np.asarray(info[name])
         if array.shape not in (shape, shape[1:] if shape[0] == 1 else shape) or array.dtype.kind not in "biuf":
-            raise ValueError(f"{name} must be numbers in shape {list(shape)}, but is {info[name]!r:.80}")
+            raise ValueError(f"{name} must be numbers in shape {list(shape)}, but is {as_code(info[name])}")
         return array.reshape(shape)
 
     def write(self, acted: TensorDictBase, *, is_batch: bool) -> Any:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
+from hpamdp.complaints import as_code
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import replacing
 from hpamdp.messages import first_line, warn
@@ -226,7 +227,7 @@ class OwnMetrics(Callback):
 
     def __init__(self, function: Callable[[Trainer], Mapping[str, float]]) -> None:
         if not callable(function):
-            raise SettingError(f"OwnMetrics: function={function!r:.80}: must be a function of the trainer")
+            raise SettingError(f"OwnMetrics: function={as_code(function)}: must be a function of the trainer")
         self._function = function
 
     def metrics(self, trainer: Trainer) -> Mapping[str, float]:

@@ -7,8 +7,9 @@ from contextlib import contextmanager
 
 import torch
 
+from hpamdp.complaints import as_json
 from hpamdp.config.components import Component
-from hpamdp.config.errors import ConfigError, as_json
+from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.memory import in_gigabytes, is_about_memory, total_memory

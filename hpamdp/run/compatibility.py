@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
+from hpamdp.complaints import as_json
 from hpamdp.config.components import Component, constructor_arguments, is_passed
-from hpamdp.config.errors import ConfigError, as_json
+from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.pickling import why_unsendable

@@ -12,9 +12,10 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from hpamdp.complaints import as_json
 from hpamdp.config.components import GROUPS
 from hpamdp.config.compose import RECIPE, choosing, chosen_names, conf_dir, names_of, plain, read
-from hpamdp.config.errors import ConfigError, MissingChoiceError, as_json
+from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.outside_jobs import searched, searching
 from hpamdp.config.saved import choices_of, read_saved, upgraded
 from hpamdp.config.schema import Config

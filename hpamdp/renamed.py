@@ -78,7 +78,7 @@ def renamed(setting: str, known: Iterable[str]) -> str | None:
         if setting.endswith(f".{old}")
     ]
     meaning = f" ({', '.join(values)})" if values else ""
-    return f"is called {setting.rpartition('.')[0]}.{new} now{meaning}"
+    return f"is called {setting.removesuffix(setting.rpartition('.')[2])}{new} now{meaning}"
 
 
 def elsewhere(name: str, known: Iterable[str]) -> list[str]:
