@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import CONF, OF_EACH_KIND, buildable, choices, compose_config, make_config
+from conftest import CONF, OF_EACH_KIND, buildable, choices, make_config
 from tensordict import TensorDict
 from test_masks import CASES, make_learner, play_and_learn
 from toy_masks import Forbidden
 
+import hpamdp
 from hpamdp import keys
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.low_level.random import Random
-from hpamdp.run.train import run
 from hpamdp.specs import PAMDPSpecs
 
 # What torch, its layers and TorchRL's specs make in the default dtype, unless they are told another.
@@ -111,8 +111,24 @@ def test_a_learner_learns_the_same_with_float64_as_the_default_dtype(name):
     assert_same_with_float64(learned)
 
 
-def test_a_run_works_with_float64_as_the_default_dtype(tmp_path):
-    words = ["env=platform", "+env.grouping=default", "high=ucb", "low=hppo"]
-    words += ["low.minibatch_size=16", "num_envs=4", "steps_per_batch=8", "total_frames=64"]
-    with default_dtype(torch.float64):
-        assert run(compose_config([*words, "eval.layouts=4", "eval.every=0"]), tmp_path) == 0
+def test_training_and_loading_give_the_same_numbers_with_float64_as_the_default_dtype_and_leave_it(tmp_path):
+    settings = {"env.grouping": "default", "low.minibatch_size": 16, "eval.layouts": 4, "eval.every": 0}
+    file = tmp_path / "agent.zip"
+
+    def trained() -> dict[str, Any]:
+        before = torch.get_default_dtype()
+        sizes = {"num_envs": 4, "steps_per_batch": 8, "total_frames": 64}
+        agent = hpamdp.train("platform", high="ucb", low="hppo", progress=False, **sizes, **settings)
+        agent.save(file)
+        loaded = hpamdp.load(file)
+        returns = loaded.evaluate(episodes=5, per_episode=True)["return"]
+        hpamdp.make("platform").reset()
+        assert torch.get_default_dtype() == before
+        return {**agent.policy.state_dict(), "returns": torch.from_numpy(returns)}
+
+    assert_same_with_float64(trained)
+
+
+def test_nothing_sets_the_default_dtype_which_other_threads_share():
+    package = CONF.parent / "hpamdp"
+    assert not [file for file in package.rglob("*.py") if "set_default_dtype" in file.read_text()]

@@ -8,10 +8,12 @@ from conftest import global_generators_unmoved
 from tensordict import TensorDict
 from torch.distributions import Categorical, Normal
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
 from hpamdp.geometry import PlaneGeometry
 from hpamdp.policies.low_level.hppo import HPPO, RAW
+from hpamdp.policies.shared.on_policy import generalised_advantages
 from hpamdp.specs import PAMDPSpecs
 
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
@@ -141,6 +143,16 @@ def test_the_surrogate_stops_rewarding_beyond_the_clip():
     ratio, advantage = torch.tensor([0.5, 1.0, 1.5, 0.5, 1.5]), torch.tensor([1.0, 1.0, 1.0, -1.0, -1.0])
     expected = torch.tensor([0.5, 1.0, 1.2, -0.8, -1.5])
     torch.testing.assert_close(make().surrogate(ratio.log(), advantage), expected)
+
+
+def test_generalised_advantages_are_torchrls_to_the_last_bit():
+    torch.manual_seed(0)
+    value, next_value, reward = torch.randn(3, 5, 20, 1)
+    done = torch.rand(5, 20, 1) < 0.2
+    steps = value, next_value, reward, done, done & (torch.rand(5, 20, 1) < 0.5)
+    given = generalised_advantages(*steps, gamma=0.97, gae_lambda=0.9)
+    for ours, theirs in zip(given, generalized_advantage_estimate(0.97, 0.9, *steps), strict=True):
+        assert torch.equal(ours, theirs)
 
 
 def test_advantages_bootstrap_past_truncation_and_stop_at_every_end():

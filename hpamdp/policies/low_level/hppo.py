@@ -34,20 +34,18 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torchrl.objectives.value.functional import generalized_advantage_estimate
 from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.policies.base import ActionFeature, Learner
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.credit import Credit, CreditCritic
-from hpamdp.policies.shared.default_dtype import float32_by_default
 from hpamdp.policies.shared.exported_policy import exported_actor
 from hpamdp.policies.shared.hybrid_actor import RAW, HeadOptions, HybridActor, HybridPolicy, hidden_layers
 from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.policies.shared.memory import MemoryOptions
 from hpamdp.policies.shared.networks import InitialParameters, OutputLinear
-from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised
+from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, generalised_advantages, mean_scalars, normalised
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.sequences import sequence_starts
 from hpamdp.settings import Fraction, LearningRate, Widths
@@ -352,15 +350,14 @@ class HPPO(OnPolicy, Learner):
             reward = torch.zeros_like(value)
             reward[mask] = after.get(keys.REWARD)[mask]
         ends = after.get(keys.DONE), after.get(keys.TERMINATED)
-        with float32_by_default():
-            advantage, target = generalized_advantage_estimate(
-                self.options.gamma,
-                self.options.gae_lambda,
-                value,
-                next_value,
-                self.options.reward_scale * reward,
-                *ends,
-            )
+        advantage, target = generalised_advantages(
+            value,
+            next_value,
+            self.options.reward_scale * reward,
+            *ends,
+            gamma=self.options.gamma,
+            gae_lambda=self.options.gae_lambda,
+        )
         return advantage.squeeze(-1), target.squeeze(-1)
 
     def value(

@@ -127,6 +127,40 @@ class OnPolicy(nn.Module):
         return self.descent.step(self.optimizer, loss_of, *inputs, max_grad_norm=self.options.max_grad_norm)
 
 
+def generalised_advantages(
+    value: Tensor,
+    next_value: Tensor,
+    reward: Tensor,
+    done: Tensor,
+    terminated: Tensor,
+    *,
+    gamma: float,
+    gae_lambda: float,
+) -> tuple[Tensor, Tensor]:
+    """Return generalised advantages, and the targets of V, each in the shape of the values.
+
+    TorchRL's function of this kind computes in torch's default dtype, and this one in that of the values.
+
+    Source: Schulman et al. 2016, arXiv:1506.02438, equation 16.
+
+    Args:
+        value, next_value: V of the states before and after the steps, `[*B, T, 1]`.
+        reward: rewards of the steps.
+        done: whether the trace stops after the step, bool.
+        terminated: whether the step has no value after it, bool.
+        gamma, gae_lambda: discount of rewards, and of the trace.
+    """
+    error = reward + gamma * (~terminated).to(value.dtype) * next_value - value
+    decay = gae_lambda * gamma * (~done).to(value.dtype)
+    trace = torch.zeros_like(error[..., 0, :])
+    traces = []
+    for of_step, kept in zip(reversed(error.unbind(-2)), reversed(decay.unbind(-2)), strict=True):
+        trace = of_step + kept * trace
+        traces.append(trace)
+    advantage = torch.stack(traces[::-1], -2)
+    return advantage, advantage + value
+
+
 def normalised(advantage: Tensor, weight: Tensor | None = None) -> Tensor:
     """Return advantages `[M]` or `[M, components]` with mean 0 and standard deviation 1.
 
