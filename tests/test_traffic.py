@@ -5,7 +5,10 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+import subprocess
+import sys
 import threading
+import time
 from xml.etree import ElementTree
 
 import gymnasium
@@ -232,6 +235,24 @@ def test_the_process_of_sumo_and_its_files_are_gone_after_close():
     assert process.poll() is None and os.path.isdir(folder)
     env.close()
     assert process.poll() == 0 and not os.path.exists(folder)
+
+
+def test_the_files_of_a_run_that_was_killed_are_removed_by_its_simulation():
+    program = """
+import os, signal
+from hpamdp.env.traffic.lights import TrafficLights
+env = TrafficLights(minutes=1)
+env.reset(seed=0)
+print(env._simulation._folder.name, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    ended = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, check=False)
+    folder = ended.stdout.strip()
+    assert ended.returncode == -signal.SIGKILL and "hpamdp-traffic-" in folder
+    until = time.monotonic() + 30.0
+    while os.path.exists(folder) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not os.path.exists(folder)
 
 
 def test_several_who_need_a_network_at_once_make_it_once(tmp_path, monkeypatch):

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -332,8 +334,23 @@ class Simulation:
 
 
 def serve() -> None:
-    """Serve the calls that arrive through the connection whose number is the argument, until it is closed."""
+    """Serve the calls that arrive through the connection whose number is the argument, until it is closed.
+
+    Then remove the working directory, which is the folder of this simulation: a run that was killed cannot do it.
+    """
     connection = Connection(int(sys.argv[1]))
+    folder = Path.cwd()
+    try:
+        _serve(connection)
+    except BrokenPipeError:  # the run was killed while it waited for an answer
+        pass
+    finally:
+        os.chdir(folder.parent)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _serve(connection: Connection) -> None:
+    """Answer calls until the connection is closed."""
     simulation: Simulation | None = None
     while True:
         try:
