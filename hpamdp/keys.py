@@ -17,6 +17,9 @@ ACTION_MASK = "action_mask"  # discrete actions
 PAIR_MASK = "pair_mask"  # discrete actions of a later component, given one of an earlier component
 OPTION_MASK = "option_mask"  # options
 
+# Written by an environment whose steps take different times: how long this step took, in the unit of the discount.
+DURATION = "duration"
+
 # Written by an environment whose parameters have other bounds in each state.
 PARAMETER_LOW, PARAMETER_HIGH = "parameter_low", "parameter_high"
 

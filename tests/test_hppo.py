@@ -155,6 +155,19 @@ def test_generalised_advantages_are_torchrls_to_the_last_bit():
         assert torch.equal(ours, theirs)
 
 
+def test_a_step_is_discounted_for_as_long_as_it_took():
+    learner = make()
+    td = random_rows(learner, 1, 2, torch.tensor([[[False], [True]]]))
+    td["next", keys.TERMINATED] = torch.zeros(1, 2, 1, dtype=torch.bool)
+    td["next", keys.DURATION] = torch.tensor([[[3.0], [0.5]]])
+    advantage, _ = learner.advantages(td, everything(td))
+    with torch.no_grad():
+        value = learner.critic(td[keys.OBSERVATION]).flatten()
+        next_value = learner.critic(td["next", keys.OBSERVATION]).flatten()
+    delta = td["next", keys.REWARD].flatten() + torch.tensor([0.9**3, 0.9**0.5]) * next_value - value
+    torch.testing.assert_close(advantage[0], torch.stack([delta[0] + 0.9**3 * 0.8 * delta[1], delta[1]]))
+
+
 def test_advantages_bootstrap_past_truncation_and_stop_at_every_end():
     learner = make()
     # Row 0 terminates at its second step, row 1 is truncated there, row 2 goes on. What follows in row 0 is another

@@ -144,6 +144,12 @@ def test_n_step_returns_end_with_episodes_and_bootstrap_unless_terminated():
     torch.testing.assert_close(stored["reward"], torch.tensor(expected))
     torch.testing.assert_close(stored["discount"], torch.tensor([0, 0, 0, g**2, g, g**3, g**2, g]))
     assert stored["next_state"][:, 0].tolist() == [102, 102, 102, 104, 104, 109, 109, 109]
+    # Steps of other durations: 2 units of the discount each.
+    batch["next", keys.DURATION] = torch.full((2, 5, 1), 2.0)
+    lasting = learner.transitions(batch)[1, 2:]
+    torch.testing.assert_close(lasting["reward"], torch.tensor([4 + 8 * g**2 + 16 * g**4, 8 + 16 * g**2, 16]))
+    torch.testing.assert_close(lasting["discount"], torch.tensor([g**6, g**4, g**2]))
+    del batch["next", keys.DURATION]
     truncated = learner.transitions(batch)[1, :2]
     torch.testing.assert_close(truncated["reward"], torch.tensor([1 + 2 * g, 2]))
     torch.testing.assert_close(truncated["discount"], torch.tensor([g**2, g]))

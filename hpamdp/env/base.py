@@ -67,6 +67,8 @@ class PAMDPEnv(EnvBase):
     - if an episode is a session of several trips (`has_trips`), `trip_ended` bool `[N, 1]` beside the observation:
       whether the step ended a trip. It is also true where `done`, and false after a reset. The next trip begins at
       once: the observation of the same step is its first one;
+    - if steps take different times, `duration` float32 `[N, 1]` beside the observation: how long the step took, in
+      units of one discount. `policies.base.step_discounts` says which learners count it. It is 0 after a reset;
     - `reward`, `done`, `terminated`, `truncated` `[N, 1]`; a time limit is `truncated` only.
 
     A step does not change an episode that is over, and its reward is 0.

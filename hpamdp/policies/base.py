@@ -57,6 +57,17 @@ def option_ends(batch: TensorDictBase) -> Tensor:
     return is_end | batch.get(("next", keys.OPTION_ENDED), False)
 
 
+def step_discounts(batch: TensorDictBase, gamma: float) -> float | Tensor:
+    """Return `gamma`, or if the environment writes durations, its power for each step, `[*B, T, 1]`.
+
+    If long and short steps had one discount, an agent would gain by stretching time: if costs are going to rise, many
+    short steps put them off. H-PPO and the learners with a replay buffer count durations; Q-PAMDP, planning by a model
+    and selectors do not.
+    """
+    duration = batch.get(("next", keys.DURATION), None)
+    return gamma if duration is None else gamma**duration
+
+
 def finished_decisions(steps: TensorDictBase) -> TensorDictBase:
     """Return the last step of every option that ended in steps `[*B, T]`, `[N]`, oldest first."""
     is_end = steps.get(("next", keys.IS_DECISION)).squeeze(-1)

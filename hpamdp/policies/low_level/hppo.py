@@ -37,7 +37,7 @@ from torch.nn import functional as F
 from typing_extensions import Self
 
 from hpamdp import keys
-from hpamdp.policies.base import ActionFeature, Learner
+from hpamdp.policies.base import ActionFeature, Learner, step_discounts
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.credit import Credit, CreditCritic
 from hpamdp.policies.shared.exported_policy import exported_actor
@@ -355,7 +355,7 @@ class HPPO(OnPolicy, Learner):
             next_value,
             self.options.reward_scale * reward,
             *ends,
-            gamma=self.options.gamma,
+            gamma=step_discounts(batch, self.options.gamma),
             gae_lambda=self.options.gae_lambda,
         )
         return advantage.squeeze(-1), target.squeeze(-1)

@@ -50,7 +50,7 @@ from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import ActionFeature, option_ends
+from hpamdp.policies.base import ActionFeature, option_ends, step_discounts
 from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete, with_fixed
 from hpamdp.policies.shared.actor_critic import set_learning_rates
 from hpamdp.policies.shared.actor_search import (
@@ -432,12 +432,12 @@ class PDQN(ReplayLearner):
         rows = super().transitions(batch)
         done = option_ends(batch).squeeze(-1)
         terminated = batch["next", keys.TERMINATED].squeeze(-1)
-        reward, last = n_step_returns(rows["reward"], done, self.options.n_step, self.options.gamma)
-        num_rewards = last - torch.arange(done.shape[-1], device=last.device) + 1
+        discounts = step_discounts(batch, self.options.gamma) * torch.ones_like(batch["next", keys.REWARD])
+        reward, last, discount = n_step_returns(rows["reward"], discounts.squeeze(-1), done, self.options.n_step)
         next_state = rows["next_state"]
         rows["reward"] = reward
         rows["next_state"] = next_state.gather(-2, last.unsqueeze(-1).expand_as(next_state))
-        rows["discount"] = self.options.gamma ** num_rewards.float() * ~terminated.gather(-1, last)
+        rows["discount"] = discount * ~terminated.gather(-1, last)
         for name in ("option_ended", "next_option"):
             if name in rows.keys():
                 rows[name] = rows[name].gather(-1, last)
@@ -450,27 +450,29 @@ class PDQN(ReplayLearner):
         return rows
 
 
-def n_step_returns(reward: Tensor, done: Tensor, n: int, gamma: float) -> tuple[Tensor, Tensor]:
-    """Return the discounted sums of the next `n` rewards and the times of the last of them, each `[*B, T]`.
+def n_step_returns(reward: Tensor, discount: Tensor, done: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the discounted sums of the next `n` rewards, the times of the last of them and the discounts after it.
 
-    Sums end early where `done`, and at the end of the batch. TorchRL's MultiStep computes the same sums, but its memory
-    grows with episodes times steps of a batch: 9 GB for a data set of 25,000 steps in 8,000 episodes.
+    Each has the shape `[*B, T]`. Sums end early where `done`, and at the end of the batch. TorchRL's MultiStep computes
+    the same sums, but its memory grows with episodes times steps of a batch: 9 GB for a data set of 25,000 steps in
+    8,000 episodes.
 
     Args:
         reward: `[*B, T]`.
+        discount: of each step, `[*B, T]`.
         done: where the episode or the option ends, bool `[*B, T]`.
         n: largest number of rewards in a sum.
-        gamma: discount of a step.
     """
     num_steps = reward.shape[-1]
     time = torch.arange(num_steps, device=reward.device).expand_as(done)
-    total = reward
+    total, product = reward, discount
     last = time
     is_over = done
     for i in range(1, min(n, num_steps)):
         following = (time + i).clamp(max=num_steps - 1)
         is_over = is_over | (time + i >= num_steps)
-        total = torch.where(is_over, total, total + gamma**i * reward.gather(-1, following))
+        total = torch.where(is_over, total, total + product * reward.gather(-1, following))
+        product = torch.where(is_over, product, product * discount.gather(-1, following))
         last = torch.where(is_over, last, following)
         is_over = is_over | done.gather(-1, following)
-    return total, last
+    return total, last, product

@@ -134,7 +134,7 @@ def generalised_advantages(
     done: Tensor,
     terminated: Tensor,
     *,
-    gamma: float,
+    gamma: float | Tensor,
     gae_lambda: float,
 ) -> tuple[Tensor, Tensor]:
     """Return generalised advantages, and the targets of V, each in the shape of the values.
@@ -148,7 +148,8 @@ def generalised_advantages(
         reward: rewards of the steps.
         done: whether the trace stops after the step, bool.
         terminated: whether the step has no value after it, bool.
-        gamma, gae_lambda: discount of rewards, and of the trace.
+        gamma: discount of rewards, or that of each step, `[*B, T, 1]`.
+        gae_lambda: further discount of the trace.
     """
     error = reward + gamma * (~terminated).to(value.dtype) * next_value - value
     decay = gae_lambda * gamma * (~done).to(value.dtype)

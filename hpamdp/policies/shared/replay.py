@@ -17,7 +17,7 @@ from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.observation_entries import packed, unpacked
-from hpamdp.policies.base import Bonus, Learner
+from hpamdp.policies.base import Bonus, Learner, step_discounts
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
 from hpamdp.policies.shared.memory import MemoryOptions, ReplayMemoryOptions
 from hpamdp.policies.shared.perception import Perception
@@ -289,8 +289,9 @@ class ReplayLearner(Learner):
         """Return what is stored of a batch `[*B, T]`, with scaled rewards.
 
         `unit` holds the parameters, mapped from their bounds to [-1, 1]. `discount` is 0 if the step terminated, else
-        gamma.
+        the one of `step_discounts`.
         """
+        goes_on = (~batch["next", keys.TERMINATED]).float()
         rows = TensorDict(
             {
                 "state": batch[keys.OBSERVATION],
@@ -298,7 +299,7 @@ class ReplayLearner(Learner):
                 "unit": self.specs.to_unit(batch[keys.PARAMETERS], batch),
                 "reward": self.reward_scale * batch["next", keys.REWARD].squeeze(-1),
                 "next_state": batch["next", keys.OBSERVATION],
-                "discount": self.options.gamma * (~batch["next", keys.TERMINATED]).squeeze(-1).float(),
+                "discount": (step_discounts(batch, self.options.gamma) * goes_on).squeeze(-1),
             },
             batch_size=batch.shape,
         )
