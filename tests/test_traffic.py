@@ -24,7 +24,7 @@ from hpamdp.env.registration import register
 from hpamdp.env.traffic import network
 from hpamdp.env.traffic.environment import TrafficEnv
 from hpamdp.env.traffic.lights import TrafficLights
-from hpamdp.env.traffic.network import GREENS, PHASES, network_file, run_tool
+from hpamdp.env.traffic.network import ARMS, GREENS, PHASES, network_file, run_tool
 from hpamdp.env.traffic.players import PLAYERS
 from hpamdp.env.traffic.simulation import Simulation, Task
 from hpamdp.specs import PAMDPSpecs
@@ -60,7 +60,7 @@ def test_its_actions_are_phases_with_a_green_and_strategies_without(make):
     specs = PAMDPSpecs.from_env(make())
     assert specs.parameter_dims == (1, 1, 1, 1)
     assert specs.parameter_low == (5.0,) * 4 and specs.parameter_high == (60.0,) * 4
-    assert PAMDPSpecs.from_env(make(strategies=True)).parameter_dims == (1, 1, 1, 1, 0, 0, 0)
+    assert PAMDPSpecs.from_env(make(strategies=True)).parameter_dims == (1, 1, 1, 1, 0, 0, 0, 0)
     assert make(whole_seconds=True).integer_parameters == (True,) * 4
 
 
@@ -151,6 +151,20 @@ def test_with_queue_the_return_is_minus_the_vehicle_hours_waited(make):
     assert info["delay"] > 0.0 and info["stops"] > 0.0 and info["throughput"] > 0.0
 
 
+def test_the_duration_of_a_step_is_the_time_until_the_next_decision(make):
+    env = make(TrafficEnv, 1)
+    td = env.reset()
+    assert not td[keys.DURATION].any()
+    durations = []
+    for phase, green in ((0, 10.0), (0, 12.4), (2, 30.0), (1, 60.0), (0, 60.0), (1, 60.0)):
+        td.set(keys.DISCRETE, torch.tensor([phase]))
+        td.set(keys.PARAMETERS, torch.full((1, 4), green, dtype=torch.float32))
+        td = env.step(td)["next"]
+        durations.append(round(10.0 * td[keys.DURATION].item()))
+    # 3 s of yellow between different phases; the last step ends with the episode of 4 minutes.
+    assert durations == [10, 12, 33, 63, 63, 59]
+
+
 def test_with_waiting_the_return_is_minus_the_time_that_standing_vehicles_have_waited_at_the_end(tmp_path):
     run = simulation(tmp_path, reward="waiting")
     run.begin(1)
@@ -211,11 +225,45 @@ def test_the_closing_table_shows_the_players_on_the_demands_of_the_evaluation(ma
     assert figures["webster"]["delay"] == pytest.approx(np.mean(delays))
 
 
+def test_a_crossing_that_is_turned_has_the_same_phases_for_the_turned_lanes(make):
+    """Of each lane a number of vehicles, and the phase that serves it: also after a turn."""
+    env = make(strategies=True)
+    maps, names = env.symmetries, env.observation_names
+    assert len(maps) == 4 and make(network="corridor").symmetries is None
+    number = torch.arange(4)
+    for phase in range(len(PHASES)):
+        for arm, lane in network.lanes_of(phase):
+            seen = torch.zeros(len(names), dtype=torch.float32)
+            seen[[names.index(f"queue_{ARMS[arm]}_{lane}"), names.index(f"phase_{phase}")]] = 1.0
+            turned = maps.map_observation(number, seen.repeat(4, 1))
+            chosen, _ = maps.map_action(
+                number, torch.zeros_like(number), torch.full((4,), phase), torch.zeros(4, 4, dtype=torch.float32)
+            )
+            for turn in range(4):
+                to = [names[entry] for entry in turned[turn].nonzero().flatten().tolist()]
+                assert to == [f"queue_{ARMS[(arm + turn) % 4]}_{lane}", f"phase_{int(chosen[turn])}"]
+                assert ((arm + turn) % 4, lane) in network.lanes_of(int(chosen[turn]))
+
+
+def test_the_initial_green_of_a_phase_grows_with_the_vehicles_that_it_serves(make):
+    weight, bias = make().initial_parameters()
+    names = make().observation_names
+    assert torch.allclose(27.5 * (bias + 1.0) + 5.0, torch.tensor(3.0))
+    for phase in range(len(PHASES)):
+        served = {names.index(f"queue_{ARMS[arm]}_{lane}") for arm, lane in network.lanes_of(phase)}
+        assert set(weight[phase].nonzero().flatten().tolist()) == served
+    # Ten vehicles on a lane for left, and ten on one for through.
+    assert torch.allclose(27.5 * weight[1, names.index("queue_north_2")] * 10.0 / 20.0, torch.tensor(12.0))
+    assert torch.allclose(27.5 * weight[0, names.index("queue_north_1")] * 10.0 / 20.0, torch.tensor(7.0))
+    weight, bias = make(network="corridor").initial_parameters()
+    assert not weight.any() and torch.allclose(27.5 * (bias + 1.0) + 5.0, torch.tensor(15.0))
+
+
 def test_strategies_are_options_for_the_high_level(make):
     env = make(TrafficEnv, 1, strategies=True)
     env.group_actions(env.default_options)
     assert env.option_names == (*PLAYERS, "learned")
-    assert [sum(row) for row in env.option_actions] == [1, 1, 1, 4]
+    assert [sum(row) for row in env.option_actions] == [1, 1, 1, 1, 4]
     assert not make().default_options
 
 

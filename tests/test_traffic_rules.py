@@ -58,10 +58,10 @@ class Recorder:
 
     def begin(self, number):
         self.numbers.append(number)
-        return lights.Seen(np.zeros(29, np.float32), 0.0, False, {}, None)
+        return lights.Seen(np.zeros(29, np.float32), 0.0, 0, False, {}, None)
 
     def act(self, phase, green):
-        return lights.Seen(np.zeros(29, np.float32), 0.0, True, dict.fromkeys(("delay", "queue"), 0.0), None)
+        return lights.Seen(np.zeros(29, np.float32), 0.0, 0, True, dict.fromkeys(("delay", "queue"), 0.0), None)
 
     def close(self):
         pass

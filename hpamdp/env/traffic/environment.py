@@ -11,20 +11,24 @@ import torch
 from pydantic import Field, NonNegativeInt, PositiveInt
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.data import Unbounded
 
+from hpamdp import keys
 from hpamdp.env.base import Metric
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
 from hpamdp.env.traffic.demand import HELD_OUT, Kind
 from hpamdp.env.traffic.lights import TrafficLights
-from hpamdp.env.traffic.network import MAX_GREEN, MIN_GREEN, NETWORKS, PHASES
-from hpamdp.env.traffic.players import PLAYERS
-from hpamdp.env.traffic.simulation import observation_names
+from hpamdp.env.traffic.network import ARMS, MAX_GREEN, MIN_GREEN, NETWORKS, PHASES, lanes_of
+from hpamdp.env.traffic.players import PLAYERS, START_S, VEHICLE_S
+from hpamdp.env.traffic.simulation import VEHICLES, observation_names
+from hpamdp.geometry import Symmetries, make_symmetries
 from hpamdp.settings import PositiveFraction, Settings
 
 _RESULTS = ("delay", "queue", "stops", "throughput")
 _LEARNED = "learned"
-_INITIAL_GREEN_S = 15.0
+_DURATION_S = 10.0  # for which a discount stands
+_INITIAL_GREEN_S = 15.0  # in the corridor
 
 
 class TrafficOptions(Settings):
@@ -46,7 +50,7 @@ class TrafficOptions(Settings):
     whole_seconds: bool = False
     """Whether greens are whole numbers. Otherwise they are continuous, and rounded to the simulator's step of 1 s."""
     strategies: bool = False
-    """Whether fixed times, SUMO's actuated signals and max-pressure are discrete actions, too."""
+    """Whether what the players by hand would do are discrete actions, too."""
     render: bool = False
     """Draw the network, for films; steps then take longer."""
     reward_scaling: PositiveFraction | None = None
@@ -63,11 +67,12 @@ class TrafficEnv(GymnasiumEnv):
 
     Action leaves:
 
-    - `("action", "discrete")` int64 `[N]`: the next phase; with `strategies` also `webster`, `actuated` and
-      `max_pressure`, which do what these players by hand would do now;
+    - `("action", "discrete")` int64 `[N]`: the next phase; with `strategies` also `webster`, `actuated`, `max_pressure`
+      and `longest_queue`, which do what these players by hand would do now;
     - `("action", "parameters")` float32 `[N, 4]`: for each phase the seconds of green, in [5, 60].
 
-    A step lasts until the next decision. See `TrafficLights`, and `GymnasiumEnv` for the arguments and the errors.
+    A step lasts until the next decision. Its `duration` is in units of 10 s, so a discount stands for 10 s. See
+    `TrafficLights`, and `GymnasiumEnv` for the arguments and the errors.
     """
 
     Options: ClassVar[type[Settings]] = TrafficOptions
@@ -98,6 +103,7 @@ class TrafficEnv(GymnasiumEnv):
         given = TrafficOptions.of(options, settings)
         names = ("network", "demand", "minutes", "traffic", "reward", "whole_seconds", "strategies")
         self._has_strategies = given.strategies
+        self._is_single = len(NETWORKS[given.network]) == 1
         # Names before the base class reads them.
         self.discrete_names = (*PHASES, *(PLAYERS if given.strategies else ()))
         self.observation_names = tuple(observation_names(given.network))
@@ -123,16 +129,52 @@ class TrafficEnv(GymnasiumEnv):
             default_options=_options(options.strategies),
         )
 
+    def _make_specs(self) -> None:
+        super()._make_specs()
+        shape = (self.num_envs, 1)
+        self.observation_spec[keys.DURATION] = Unbounded(shape=shape, device=self.device, dtype=torch.float32)
+
+    def _read(self, reward: np.ndarray | None = None) -> TensorDict:
+        seconds = [0] * self.num_envs if reward is None else self._copies.call("last_seconds")
+        duration = torch.tensor(seconds, dtype=torch.float32, device=self.device).unsqueeze(-1) / _DURATION_S
+        return super()._read(reward).set(keys.DURATION, duration)
+
     @property
     def default_options(self) -> Mapping[str, Sequence[int | str]]:
         """With `strategies`, each of them, and all phases for the learner."""
         return _options(self._has_strategies)
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
-        """Return constant greens of 15 s. Those of mid-range, 32 s, are too long for phases of few vehicles."""
-        bias = 2.0 * (_INITIAL_GREEN_S - MIN_GREEN) / (MAX_GREEN - MIN_GREEN) - 1.0
-        num, dim = len(PHASES), len(self.observation_names)
-        return torch.zeros(num, dim, dtype=torch.float32), torch.full((num,), bias, dtype=torch.float32)
+        """Return the greens of the player `longest_queue`; in the corridor 15 s.
+
+        The player's green is linear in the queues of its signal. A linear function cannot tell which signal is due.
+        """
+        unit = 2.0 / (MAX_GREEN - MIN_GREEN)  # of a second
+        names = list(self.observation_names)
+        weight = torch.zeros(len(PHASES), len(names), dtype=torch.float32)
+        if self._is_single:
+            for phase, seconds in enumerate(VEHICLE_S):
+                for arm, lane in lanes_of(phase):
+                    weight[phase, names.index(f"queue_{ARMS[arm]}_{lane}")] = unit * VEHICLES * seconds
+        green = START_S if self._is_single else _INITIAL_GREEN_S
+        return weight, torch.full((len(PHASES),), unit * (green - MIN_GREEN) - 1.0, dtype=torch.float32)
+
+    @property
+    def symmetries(self) -> Symmetries | None:
+        """The quarter turns of the crossing; the corridor has none."""
+        if not self._is_single:
+            return None
+        names, num_turns = list(self.observation_names), len(ARMS)
+        weight = torch.zeros(num_turns, len(names), len(names), dtype=torch.float32)
+        discrete = torch.arange(len(self.discrete_names)).repeat(num_turns, 1)  # strategies stay as they are
+        for turn in range(num_turns):
+            for entry, name in enumerate(names):
+                weight[turn, names.index(_turned(name, turn)), entry] = 1.0
+            for phase in range(len(PHASES)):
+                discrete[turn, phase] = _turned_phase(phase, turn)
+        # A green moves with its phase. Turning phases twice leaves them as they were, so each map is its own inverse.
+        source = discrete[:, : len(PHASES)]
+        return make_symmetries(weight, discrete=discrete, source=source, num_parameters=len(PHASES))
 
     def fixed_episodes(self, seed: int) -> TensorDict:
         """Return numbers of demands that training never draws, one for each copy."""
@@ -165,3 +207,15 @@ class TrafficEnv(GymnasiumEnv):
 
 def _options(has_strategies: bool) -> dict[str, Sequence[int | str]]:
     return {**{player: [player] for player in PLAYERS}, _LEARNED: [*PHASES]} if has_strategies else {}
+
+
+def _turned(name: str, turn: int) -> str:
+    """Return the entry of the observation to which an entry moves by quarter turns, clockwise."""
+    kind, *where = name.split("_")
+    if kind in ("queue", "approaching"):
+        return f"{kind}_{ARMS[(ARMS.index(where[0]) + turn) % len(ARMS)]}_{where[1]}"
+    return f"phase_{_turned_phase(int(where[0]), turn)}" if kind == "phase" else name
+
+
+def _turned_phase(phase: int, turn: int) -> int:
+    return (phase + 2 * turn) % len(PHASES)

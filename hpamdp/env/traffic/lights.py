@@ -24,8 +24,8 @@ class TrafficLights(gymnasium.Env):
     different phases there are 3 s of yellow. An episode is an hour of demand, at whose end it is truncated.
 
     The action is `Tuple(Discrete(4), Tuple(Box, Box, Box, Box))`: the phase, and the green of each phase. With
-    `strategies` there are three more discrete actions without parameters: what fixed times by Webster's formula, SUMO's
-    actuated signals and max-pressure would do now.
+    `strategies` there are four more discrete actions without parameters: what fixed times by Webster's formula, SUMO's
+    actuated signals, max-pressure and the longest queue would do now.
 
     `reset(seed=n)` begins the demand number n, below 2**31. Without a seed, the demand is drawn from those below 2**30;
     so all others are unknown in training. The info of the last step has `delay`, `queue`, `stops` and `throughput`.
@@ -99,6 +99,11 @@ class TrafficLights(gymnasium.Env):
     def last_results(self) -> dict[str, float]:
         """Return the attribute `results`."""
         return self.results
+
+    def last_seconds(self) -> int:
+        """Return how long the last step took, in simulated s."""
+        assert self._last is not None
+        return self._last.seconds
 
     def play(self, player: str) -> dict[str, float]:
         """Return the results of a player by hand with the demand of the last episode, whose own end remains unknown."""

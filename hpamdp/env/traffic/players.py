@@ -1,4 +1,4 @@
-"""Players by hand: fixed times by Webster's formula, and max-pressure. SUMO's own actuated signals are the third."""
+"""Players by hand: fixed times by Webster's formula, max-pressure and the longest queue; SUMO has the actuated one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ if TYPE_CHECKING:
     from hpamdp.env.traffic.simulation import Simulation
 
 ACTUATED = "actuated"
-PLAYERS = ("webster", ACTUATED, "max_pressure")
+PLAYERS = ("webster", ACTUATED, "max_pressure", "longest_queue")
+START_S = 3.0
+"""Green (s) of `LongestQueue` for the start of the first vehicle."""
+VEHICLE_S = (0.7, 1.2, 0.7, 1.2)
+"""Green (s) of `LongestQueue` for each waiting vehicle, by phase. Phases for left turns have half as many lanes."""
 _SATURATION = 1800.0  # vehicles an hour that a lane discharges at green
 _LOST_S = 4.0  # that a phase loses by its start and its yellow
 _SHORTEST_CYCLE_S, _LONGEST_CYCLE_S = 40.0, 120.0
@@ -67,6 +71,17 @@ class MaxPressure:
         lamp = simulation.lamps[signal]
         pressures[lamp.phase] += 1e-6
         return int(pressures.argmax()), _PERIOD_S
+
+
+class LongestQueue:
+    """The phase for which the most vehicles wait, for as long as they need to leave."""
+
+    def choose(self, simulation: Simulation, signal: int) -> tuple[int, int]:
+        """Return the next phase of a signal and its green (s). Ties take the first phase."""
+        queues = simulation.queues(signal)
+        waiting = [sum(queues[arm, lane] for arm, lane in lanes_of(phase)) for phase in range(len(PHASES))]
+        phase = int(np.argmax(waiting))
+        return phase, min(max(round(START_S + VEHICLE_S[phase] * waiting[phase]), MIN_GREEN), MAX_GREEN)
 
 
 def _flow_ratios(demand: Demand, signal: Signal) -> np.ndarray:

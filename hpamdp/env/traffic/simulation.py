@@ -18,7 +18,7 @@ import numpy as np
 
 from hpamdp.env.traffic.demand import Demand, draw, write_vehicles
 from hpamdp.env.traffic.network import ARMS, GREENS, MAX_GREEN, NETWORKS, NUM_LANES, PHASES, YELLOW
-from hpamdp.env.traffic.players import ACTUATED, PLAYERS, MaxPressure, Webster
+from hpamdp.env.traffic.players import ACTUATED, LongestQueue, MaxPressure, Webster
 from hpamdp.messages import one_line
 
 VEHICLES = 20.0
@@ -98,6 +98,7 @@ class Seen:
     Attributes:
         observation: float32.
         reward: of the time since the last decision.
+        seconds: this time.
         is_over: whether the episode has ended.
         results: of the whole episode if it has ended: `delay`, `queue`, `stops`, `throughput`.
         scene: for a picture, if the task is drawn.
@@ -105,6 +106,7 @@ class Seen:
 
     observation: np.ndarray
     reward: float
+    seconds: int
     is_over: bool
     results: dict[str, float]
     scene: Scene | None
@@ -159,7 +161,7 @@ class Simulation:
         self._vehicles = write_vehicles(self._demand, number, Path(self._task.network_file), self._folder)
         self._number = number
         self._start()
-        return self._seen(0.0)
+        return self._seen(0.0, 0)
 
     def _start(self) -> None:
         self._stop()
@@ -173,7 +175,7 @@ class Simulation:
         self._now = 0
         self._queue_s = 0.0  # vehicles times seconds, of the whole episode
         self._earlier = 0.0  # what the reward is counted from
-        self._strategies: dict[str, Webster | MaxPressure] = {}
+        self._strategies: dict[str, Webster | MaxPressure | LongestQueue] = {}
         self.lamps = [Lamp() for _ in self._signals]
         self._due = 0
 
@@ -203,10 +205,15 @@ class Simulation:
             seen = self.follow(player)
         return seen.results
 
-    def _strategy(self, player: str) -> Webster | MaxPressure:
+    def _strategy(self, player: str) -> Webster | MaxPressure | LongestQueue:
         if player not in self._strategies:
-            assert self._demand is not None
-            self._strategies[player] = Webster(self._demand) if player == PLAYERS[0] else MaxPressure()
+            if player == "longest_queue":
+                self._strategies[player] = LongestQueue()
+            elif player == "max_pressure":
+                self._strategies[player] = MaxPressure()
+            else:
+                assert self._demand is not None
+                self._strategies[player] = Webster(self._demand)
         return self._strategies[player]
 
     def _set_phase(self, number: int, phase: int, green: int) -> None:
@@ -238,6 +245,7 @@ class Simulation:
 
     def _go_on(self) -> Seen:
         """Simulate until a signal is due or the episode is over."""
+        before = self._now
         while True:
             due = [
                 number for number, lamp in enumerate(self.lamps) if lamp.until is not None and lamp.until <= self._now
@@ -248,7 +256,7 @@ class Simulation:
         if due:
             self._due = due[0]
         earlier, self._earlier = self._earlier, self._measure()
-        return self._seen((earlier - self._earlier) / HOUR_S)
+        return self._seen((earlier - self._earlier) / HOUR_S, self._now - before)
 
     def _measure(self) -> float:
         """Return the vehicle seconds whose increase since the last decision costs the agent."""
@@ -288,11 +296,11 @@ class Simulation:
             [0.0 if edge is None else self._sumo.edge.getLastStepHaltingNumber(edge) / NUM_LANES for edge in edges]
         )
 
-    def _seen(self, reward: float) -> Seen:
+    def _seen(self, reward: float, seconds: int) -> Seen:
         is_over = self._now >= self._task.duration_s
         observation = np.concatenate([self._observed(number) for number in range(len(self._signals))])
         scene = self._scene() if self._task.is_drawn else None
-        return Seen(observation.astype(np.float32), reward, is_over, self._results() if is_over else {}, scene)
+        return Seen(observation.astype(np.float32), reward, seconds, is_over, self._results() if is_over else {}, scene)
 
     def _observed(self, number: int) -> np.ndarray:
         lamp = self.lamps[number]
