@@ -23,6 +23,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Bonus
+from hpamdp.policies.exploration.counts import Counts, CountsOptions, VisitTable
 from hpamdp.policies.exploration.held import Held, HeldOptions, HeldPolicy, zeta_distribution
 from hpamdp.policies.exploration.novelty import Novelty
 from hpamdp.policies.low_level.dlpa.learner import DLPA
@@ -341,6 +342,29 @@ def test_a_replay_learner_stores_the_reward_and_adds_the_bonus_of_today_to_what_
     assert added[1].mean() < 0.7 * added[0].mean()
 
 
+def test_the_bonus_of_a_cell_is_one_over_the_root_of_its_visits():
+    learner = HPPO(SPECS)
+    counts = Counts(learner, weight=0.5, resolution=2.0)
+    batch = one_step_rows(learner, 10)
+    batch["next", keys.OBSERVATION] = torch.full((10, 1, 4), 0.6)
+    mask = torch.ones(10, 1, dtype=torch.bool)
+    mask[9] = False
+    explored = counts.learn(batch, mask)
+    assert explored.bonus[:9].eq(0.5 / 3.0).all() and explored.bonus[9] == 0.0, "nine visits, and another's step"
+    assert explored.scalars == {"bonus": pytest.approx(1.0 / 3.0), "cells": 1.0}
+    same, other = torch.full((1, 4), 0.4), torch.full((1, 4), 0.8)
+    assert learner.bonus.of(same) == pytest.approx(1.0 / 3.0) and learner.bonus.of(other) == 1.0
+
+
+def test_cells_have_places_of_their_own_in_the_table_of_counts():
+    table = VisitTable(3, CountsOptions(resolution=10.0))
+    axis = torch.linspace(-1.0, 1.0, 21)
+    cells = torch.cartesian_prod(axis, axis, axis)
+    assert len(table.places(cells).unique()) > 0.97 * len(cells), "few of 9,261 cells share one of 262,139 places"
+    table.see(cells)
+    assert table.counts.sum() == len(cells)
+
+
 @pytest.mark.parametrize("kind", [DLPA, PETS])
 def test_exploring_plans_seek_what_is_new_and_greedy_plans_do_not(kind):
     """The models know nothing: one discrete action is said to lead to new states, or members differ about it."""
@@ -436,14 +460,14 @@ def test_each_options_learner_has_its_own_exploration():
         parts.close()
 
 
-@pytest.mark.parametrize("kind", ["held", "novelty"])
+@pytest.mark.parametrize("kind", ["held", "novelty", "counts"])
 @pytest.mark.parametrize("low", QUICK)
 def test_every_learner_that_takes_an_exploration_trains_with_it_and_is_reloaded(kind, low, tmp_path):
     words = [*PLATFORM, f"low={low}", f"exploration={kind}", *SHORT.get(low, []), *SMALL, "film=false"]
     assert run(compose_config(words), tmp_path, words) == 0
     header = (tmp_path / "metrics.csv").read_text().splitlines()[0].split(",")
     is_measured_by_the_learner = (low, kind) == ("pets", "novelty")
-    assert is_measured_by_the_learner or {"held": "low/held", "novelty": "low/bonus"}[kind] in header
+    assert is_measured_by_the_learner or ("low/held" if kind == "held" else "low/bonus") in header
     assert hpamdp.load(tmp_path).evaluate(episodes=4)["score"] is not None
 
 
@@ -462,6 +486,11 @@ REFUSED = [
     ("low=hppo low.freeze=true exploration=held", "exploration=held: low.freeze=true keeps the learners as they are"),
     ("low=hppo exploration=held exploration.mu=1", "exploration.mu=1: must be greater than 1 (Held"),
     ("low=pdqn low.augment=true exploration=novelty", "exploration: low.augment=true: maps states to others that were"),
+    ("low=pdqn low.augment=true exploration=counts", "exploration: low.augment=true: maps states to others that were"),
+    (
+        "low=hppo env=catch_point_picture exploration=counts",
+        "exploration: no picture is seen twice; use exploration=novelty",
+    ),
     (
         "low=hppo +low.per_option={congruent:random} exploration=held",
         "exploration=held: changes actions, which low=random does not take",
@@ -489,11 +518,11 @@ def test_an_exploration_is_chosen_from_python_and_is_part_of_the_saved_config(gi
         assert saved["choices"]["exploration"] == name
 
 
-RESUMED = [("pdqn", "held"), ("hppo", "novelty")]
+RESUMED = [("pdqn", "held"), ("hppo", "novelty"), ("hppo", "counts")]
 RESUMED += [
     pytest.param(low, kind, marks=pytest.mark.slow)
     for low in EXPLORING
-    for kind in ("held", "novelty")
+    for kind in ("held", "novelty", "counts")
     if (low, kind) not in RESUMED
 ]
 
@@ -548,6 +577,7 @@ EXPLORATIONS = {
     "none": lambda learner, weight: None,
     "held": lambda learner, weight: Held(learner),
     "novelty": lambda learner, weight: Novelty(learner, weight=weight),
+    "counts": lambda learner, weight: Counts(learner, weight=weight),
 }
 
 

@@ -1,0 +1,126 @@
+"""A reward for reaching states that were seldom visited, by counting visits of cells.
+
+Source: Tang, Houthooft, Foote, Stooke, Chen, Duan, Schulman, De Turck and Abbeel, *#Exploration: A Study of Count-Based
+Exploration for Deep Reinforcement Learning*, 2017, arXiv 1611.04717, section 2.2: states are hashed, and a state whose
+hash was counted n times has the bonus n^-1/2.
+
+Differs from the source:
+- a state's cell is its observation, multiplied by `resolution` and rounded. Random projections suit pictures; they
+  mix places with what the agent holds;
+- learners with a replay buffer add the bonus when they sample, and learners that plan add it in exploring plans, as
+  with `novelty`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field, PositiveFloat
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from hpamdp import keys
+from hpamdp.policies.base import Bonus, Learner
+from hpamdp.policies.exploration.base import Exploration, Explored
+from hpamdp.policies.exploration.novelty import NoveltyPolicy
+from hpamdp.settings import SettingError, Settings
+
+_HASH_SEED = 0  # of the factors of the hash, which are the same in every run
+_LARGEST_FACTOR = 2**40
+
+
+class CountsOptions(Settings):
+    """Settings of `Counts`."""
+
+    weight: PositiveFloat = 0.01
+    """Reward of a bonus of 1, which the first visit of a cell has, in the unit of the problem's rewards."""
+    resolution: PositiveFloat = 10.0
+    """Cells in a unit of each entry of the observation: entries are multiplied by it and rounded.
+
+    With 1, an entry that is 0 or 1, such as a tile, has two cells, and an entry in [-1, 1] has three.
+    """
+    table_size: Annotated[int, Field(ge=1, le=10_000_000)] = 262_139
+    """Places in the table of counts; a prime. Cells that share a place share their count."""
+
+
+class VisitTable(nn.Module):
+    """Counts how often cells were visited.
+
+    Args:
+        observation_dim: entries of an observation.
+        options: the settings.
+    """
+
+    counts: Tensor
+    factors: Tensor
+
+    def __init__(self, observation_dim: int, options: CountsOptions) -> None:
+        super().__init__()
+        self.resolution = options.resolution
+        generator = torch.Generator().manual_seed(_HASH_SEED)
+        factors = torch.randint(_LARGEST_FACTOR, (observation_dim,), generator=generator)
+        self.register_buffer("factors", factors, persistent=False)
+        self.register_buffer("counts", torch.zeros(options.table_size, dtype=torch.long))
+
+    def places(self, observation: Tensor) -> Tensor:
+        """Return the places in the table, int64 `[*B]`, of observations `[*B, observation_dim]`."""
+        cell = (self.resolution * observation).round().long()
+        return (cell * self.factors).sum(-1).remainder(len(self.counts))
+
+    @torch.no_grad()
+    def bonus(self, observation: Tensor) -> Tensor:
+        """Return the bonus `[*B]` for reaching observations `[*B, observation_dim]`, in (0, 1]."""
+        return self.counts[self.places(observation)].clamp(min=1).float().rsqrt()
+
+    @torch.no_grad()
+    def see(self, observation: Tensor) -> None:
+        """Count visits of observations `[N, observation_dim]`."""
+        places = self.places(observation)
+        self.counts.index_add_(0, places, torch.ones_like(places))
+
+
+class Counts(Exploration):
+    """A bonus for states that were seldom visited, from a table of counts."""
+
+    Options = CountsOptions
+    changes = "rewards"
+
+    def __init__(
+        self,
+        learner: Learner,
+        *,
+        device: torch.device | str = "cpu",
+        options: CountsOptions | None = None,
+        **settings: Any,
+    ) -> None:
+        super().__init__(learner)
+        self.options: CountsOptions = CountsOptions.of(options, settings)
+        if learner.specs.has_pictures:
+            raise SettingError("no picture is seen twice; use exploration=novelty")
+        if learner.novelty_by == "sample" and getattr(learner, "symmetry", None) is not None:
+            raise SettingError("low.augment=true: maps states to others that were never visited; use low.augment=false")
+        self.adds_to_reward = learner.novelty_by == "reward"
+        self.plans = learner.novelty_by == "plan"
+        self.table = VisitTable(learner.specs.observation_dim, self.options)
+        self.to(device)
+        learner.take_bonus(Bonus(self.options.weight, self.table.bonus))
+
+    def acting_policy(self, learner: Learner) -> TensorDictModuleBase:
+        """Return the learner's policy, with the table if its plans need it."""
+        return NoveltyPolicy(learner.policy, self.table) if self.plans else learner.policy
+
+    def learn(self, batch: TensorDictBase, mask: Tensor) -> Explored:
+        """Count the states that were reached; return the bonus of the steps, if it is due."""
+        if not mask.any():
+            return Explored(None, {})
+        observation = batch.get(("next", keys.OBSERVATION))[mask]
+        self.table.see(observation)
+        bonus = self.table.bonus(observation)
+        scalars = {"bonus": bonus.mean().item(), "cells": float(self.table.counts.count_nonzero())}
+        if not self.adds_to_reward:
+            return Explored(None, scalars)
+        of_batch = torch.zeros(*mask.shape, 1, device=mask.device, dtype=torch.float32)
+        of_batch[mask] = self.options.weight * bonus.unsqueeze(-1)
+        return Explored(of_batch, scalars)
