@@ -213,10 +213,12 @@ def test_progress_adds_up_to_the_score_less_that_of_no_gates():
     assert torch.allclose(totals[0], totals[1] + 0.29517, atol=1e-4)
 
 
+@pytest.mark.parametrize("floor", [None, 0.1])
 @pytest.mark.parametrize("task", TASKS)
-def test_gain_is_how_much_the_final_score_exceeds_that_of_no_gates_and_never_negative(task):
-    assert compare_with_rules(CircuitEnv(200, task=task, reward="gain", max_steps=3), 6, 1e-5)[1] <= 3
-    final, gain = (CircuitEnv(400, task=task, reward=reward, max_steps=3) for reward in ("final", "gain"))
+def test_gain_is_how_much_the_final_score_exceeds_the_floor_and_never_negative(task, floor):
+    gaining = {"task": task, "reward": "gain", "floor": floor, "max_steps": 3}
+    assert compare_with_rules(CircuitEnv(200, **gaining), 6, 1e-5)[1] <= 3
+    final, gain = CircuitEnv(400, task=task, max_steps=3), CircuitEnv(400, **gaining)
     returns = []
     for env in (final, gain):
         player = random_player(4)
@@ -226,10 +228,10 @@ def test_gain_is_how_much_the_final_score_exceeds_that_of_no_gates_and_never_neg
             reading = env.step(player(env))["next"]
             total += reading[keys.REWARD].squeeze(-1)
         returns.append(total)
-    assert torch.allclose(returns[1], (returns[0] - without_gates).clamp(min=0.0), atol=1e-5)
-    assert (returns[1] == 0.0).any()
+    counts_from = without_gates if floor is None else floor
+    assert torch.allclose(returns[1], (returns[0] - counts_from).clamp(min=0.0), atol=1e-5)
     # No three gates make more than half of a GHZ state, or bring the identity nearer to the Toffoli gate.
-    assert (returns[1] > 0.0).any() == (task not in ("ghz", "toffoli"))
+    assert (returns[1] > 0.0).any() == (floor is not None or task not in ("ghz", "toffoli"))
 
 
 def test_products_of_vectors_include_the_overlap_with_the_target():
@@ -421,6 +423,8 @@ def test_the_oracle_with_the_planner_reaches_the_ceiling_and_always_chooses_righ
         ({"task": "toffoli", "gate_set": "ion"}, "gate_set=ion: native sets are for task=bell and random_state, not"),
         ({"task": "random_state", "begin": "known"}, "begin=known: needs gate_set=published and a target with a"),
         ({"task": "bell", "target_number": 1}, "target_number=1: task=bell has one target; leave it out"),
+        ({"floor": 0.9}, "floor=0.9: needs reward=gain, not reward=final"),
+        ({"reward": "gain", "floor": 1.0}, "floor=1.0: must be less than 1"),
         ({"ion_costs": [0.0, 0.1]}, r"ion_costs=\[0.0, 0.1\]: must lie between 0.001 and 1, and the second"),
         ({"task": "random_unitary", "oracle": True}, "task=random_unitary: nobody knows its best circuits"),
     ],

@@ -49,7 +49,15 @@ def test_modules_with_stand_ins_are_not_seen_afterwards(quick):
 
 @pytest.mark.parametrize(
     "words",
-    ["low.gamma=hi", "low.gama=1", "total_frames=-1", "high=none", "env=goal high=ucb", "num_envs=3 collector=multi"],
+    [
+        "low.gamma=hi",
+        "low.gama=1",
+        "total_frames=-1",
+        "high=none",
+        "env=goal high=ucb",
+        "num_envs=3 collector=multi",
+        "env=circuit env.task=bell env.target_number=1 high=none",
+    ],
 )
 def test_a_wrong_setting_is_refused_before_torch_is_imported(words, tmp_path):
     program = f"""

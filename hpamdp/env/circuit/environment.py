@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from pydantic import NonNegativeInt, PositiveInt, model_validator
+from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
@@ -24,7 +24,7 @@ from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.circuit import gates, kernel, rules
 from hpamdp.env.circuit.gates import NATIVE_SETS, GateSet
 from hpamdp.env.circuit.oracle import CIRCUITS, CircuitOracle, beginnings, best_scores
-from hpamdp.env.circuit.rules import TASK_OF, CircuitState, Design, RewardName, TaskName
+from hpamdp.env.circuit.rules import RANDOM_TASKS, TASK_OF, CircuitState, Design, RewardName, TaskName
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.state_columns import check_range
@@ -76,7 +76,12 @@ class CircuitOptions(Settings):
     """Costs of an RX or RY and of an XX."""
     reward: RewardName = "final"
     """`final`: the score, once, at the end. `progress`: its change with each gate, which adds up to the same less a
-    constant. `gain`: how much the final score exceeds that of no gates, at least 0, so that trying gates costs nothing.
+    constant. `gain`: how much the final score exceeds `floor`, at least 0, so that trying gates costs nothing.
+    """
+    floor: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
+    """With `reward=gain`: the score from which the gain counts. Local maxima below it are not rewarded.
+
+    If None, the score of no gates.
     """
     target_number: NonNegativeInt | None = None
     """With random targets: number of the one target of all episodes, as in the published runs.
@@ -104,6 +109,8 @@ class CircuitOptions(Settings):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.floor is not None and self.reward != "gain":
+            raise ValueError(f"floor={self.floor}: needs reward=gain, not reward={self.reward}")
         if self.gate_set != "published" and self.task not in _NATIVE_TASKS:
             raise ValueError(
                 f"gate_set={self.gate_set}: native sets are for task={' and '.join(_NATIVE_TASKS)}, "
@@ -119,7 +126,7 @@ class CircuitOptions(Settings):
                 raise ValueError(
                     f"{name}_costs={[one, two]}: must lie between 0.001 and 1, and the second must not be the smaller"
                 )
-        if self.target_number is not None and rules.fixed_target(self.task) is not None:
+        if self.target_number is not None and self.task not in RANDOM_TASKS:
             raise ValueError(f"target_number={self.target_number}: task={self.task} has one target; leave it out")
         return self
 
@@ -184,6 +191,7 @@ class CircuitEnv(BatchedEnv[CircuitState]):
             target=_target(options),
             is_native=options.gate_set != "published",
             reward=options.reward,
+            floor=options.floor,
             observes_depth=options.observe_depth,
             max_steps=self.max_steps,
             beginnings=beginnings(options.task) if options.begin == "known" else None,

@@ -24,7 +24,7 @@ from hpamdp.env.rng_streams import TRAINING
 WIRES, DEPTH, COLUMNS, IS_NATIVE, REWARD, OBSERVES_DEPTH, IS_RANDOM, NUM_BEGINNINGS = range(
     kernels.OWN, kernels.OWN + 8
 )
-NUM_GATES, NUM_SETS, OWN_GATES = range(kernels.OWN + 8, kernels.OWN + 11)
+FLOOR, NUM_GATES, NUM_SETS, OWN_GATES = range(kernels.OWN + 8, kernels.OWN + 12)
 NUM_OF_GATE = 6
 _KIND, _FLIPPED, _CONTROL, _HAS_ANGLE, _ANGLE, _COST = range(NUM_OF_GATE)
 _GATE_SET_ROW, _GATE_ROW = -5, -4
@@ -44,7 +44,8 @@ def settings_of(design: Design) -> Sequence[float]:
     sizes = [task.n, task.depth, design.num_columns]
     flags = [design.is_native, rules.REWARDS.index(design.reward), design.observes_depth, design.target is None]
     circuits, depths = design.beginnings or ([], [])
-    numbers: list[float] = [*sizes, *flags, len(circuits), len(design.gate_sets[0]), len(design.gate_sets)]
+    floor = math.nan if design.floor is None else design.floor
+    numbers: list[float] = [*sizes, *flags, len(circuits), floor, len(design.gate_sets[0]), len(design.gate_sets)]
     for gate in (gate for gate_set in design.gate_sets for gate in gate_set):
         angle = 0.0 if gate.angle is None else gate.angle
         numbers += [gate.kind, gate.flipped, gate.control, gate.angle is None, angle, gate.cost]
@@ -238,7 +239,10 @@ def _act(entries: Any, integers: Any, row: Any, option: Any, action: Any, given:
     if not has_ended and steps + 1 < settings[kernels.MAX_STEPS]:
         return outcome, ZERO
     if settings[REWARD] == _GAIN:
-        return outcome, max(score - _similarity_without_gates(entries, num_rows, num_columns), ZERO)
+        floor = _F(settings[FLOOR])
+        if math.isnan(floor):
+            floor = _similarity_without_gates(entries, num_rows, num_columns)
+        return outcome, max(score - floor, ZERO)
     return outcome, score
 
 

@@ -32,6 +32,7 @@ TaskName = Literal["hadamard", "random_state", "bell", "ghz", "random_unitary", 
 TASKS: tuple[TaskName, ...] = get_args(TaskName)
 RewardName = Literal["final", "progress", "gain"]
 REWARDS: tuple[RewardName, ...] = get_args(RewardName)
+RANDOM_TASKS = ("random_state", "random_unitary")
 OUTCOMES = ("building", "matched", "missed", "time limit")
 BUILDING, MATCHED, MISSED, TIME_LIMIT = range(4)
 MATCH = 0.99  # similarity from which on a finished circuit matches its target
@@ -86,6 +87,7 @@ class Design:
         target: the target of all episodes, complex128 `[2^n, 1]` or `[2^n, 2^n]`; None if each episode has its own.
         is_native: whether gates cost instead of depth.
         reward: what is rewarded; see `CircuitOptions`.
+        floor: score that `gain` counts from; None for that of no gates.
         observes_depth: whether the depths of the wires are observed.
         max_steps: steps after which an episode is truncated.
         beginnings: circuits that training episodes begin with, and the depths of their wires, complex64 `[B, R, C]`
@@ -97,6 +99,7 @@ class Design:
     target: Tensor | None
     is_native: bool
     reward: RewardName
+    floor: float | None
     observes_depth: bool
     max_steps: int
     beginnings: tuple[Tensor, Tensor] | None = None
@@ -285,7 +288,8 @@ def act(
         reward = score - (state.similarity - state.cost)
     elif design.reward == "gain":
         nothing = similarity(without_gates(design, target.device), target, design)
-        reward = torch.where(is_last, (score - nothing).clamp(min=0.0), 0.0)
+        floor = nothing if design.floor is None else design.floor
+        reward = torch.where(is_last, (score - floor).clamp(min=0.0), 0.0)
     else:
         reward = torch.where(is_last, score, 0.0)
     after = replaced(
