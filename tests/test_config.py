@@ -250,7 +250,8 @@ def test_a_yaml_and_its_class_have_the_same_options(group, name):
     assert group != "low" or set(cfg[group].budget) == {"num_envs", "steps_per_batch", "total_frames", "eval_every"}
 
 
-EXPERIMENTS = [*choices("experiment"), *(f"domains/{name}" for name in choices("experiment/domains"))]
+EXPERIMENTS = [*choices("experiment")]
+EXPERIMENTS += [f"{folder}/{name}" for folder in ("circuits", "domains") for name in choices(f"experiment/{folder}")]
 EXPERIMENTS += [
     f"lengths/{problem}_{ends}"
     for problem in ("rooms", "crossing")
