@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -31,15 +31,26 @@ def as_code(value: object) -> str:
     return text if len(text) <= _LONGEST_CODE else f"{text[:_LONGEST_CODE]}..."
 
 
-def no_such(what: str, name: str, known: Iterable[str]) -> str:
-    """Return a message that a name does not exist, with the likely ones and all known names."""
+def no_such(
+    what: str, name: str, known: Iterable[str], *, guesses: Sequence[str] = (), where: str | None = None
+) -> str:
+    """Return a message that a name does not exist, with the likely ones and all known names.
+
+    Args:
+        what: kind of the name, such as `setting of HPPO`.
+        name: the name.
+        known: the names that exist.
+        guesses: what the name probably means. If empty, the known names that are closest.
+        where: what has these names, such as `conf/low`; None for the owner that `what` names.
+    """
     known = sorted(known)
-    guesses = elsewhere(name, known) or _close(name, known)
-    guess = f"did you mean {' or '.join(guesses)}? It" if guesses else "it"
-    return f"no such {what}; {guess} has {', '.join(known) or 'none'}"
+    guesses = guesses or elsewhere(name, known) or close_names(name, known)
+    guess = f"did you mean {' or '.join(guesses)}? " if guesses else ""
+    owner = where or ("It" if guesses else "it")
+    return f"no such {what}; {guess}{owner} has {', '.join(known) or 'none'}"
 
 
-def _close(name: str, known: list[str]) -> list[str]:
+def close_names(name: str, known: Sequence[str]) -> list[str]:
     """Return the known names that are closest to a name, best first; several if they are about as close."""
     close = difflib.get_close_matches(name, known, n=_MOST_GUESSES)
     similarity = [difflib.SequenceMatcher(None, each, name).ratio() for each in close]

@@ -1,4 +1,4 @@
-"""Translate names of settings: old names in errors and saved runs, and names of other libraries in errors."""
+"""Translate names: old ones of settings in errors and saved runs, and those of other libraries in errors."""
 
 from __future__ import annotations
 
@@ -54,6 +54,14 @@ _ELSEWHERE: dict[str, tuple[str, ...]] = {
     "eval_freq": ("eval.every",),
     "n_eval_episodes": ("eval.layouts",),
 }
+# Methods of other libraries' agents, and what to use here.
+_MEMBERS_ELSEWHERE = {
+    "predict": "act(observation)",
+    "get_action": "act(observation)",
+    "get_action_and_value": "act(observation)",
+    "learn": "hpamdp.train",
+    "load": "hpamdp.load",
+}
 # Names that stand for values of the run, which a group does not have.
 _OF_RUN = ("steps_per_batch", "total_frames", "num_envs", "eval.every", "eval.layouts")
 # Old values whose meaning changed with the name.
@@ -85,6 +93,13 @@ def elsewhere(name: str, known: Iterable[str]) -> list[str]:
     """Return our names for a setting of another library: those among the known names, or values of the run."""
     known = set(known)
     return [ours for ours in _ELSEWHERE.get(name, ()) if ours in known or ours in _OF_RUN]
+
+
+def no_member(owner: object, name: str) -> AttributeError:
+    """Return the error for a missing attribute, which names ours for one of another library."""
+    ours = _MEMBERS_ELSEWHERE.get(name)
+    hint = "" if ours is None else f"; use {ours} (docs/coming-from.md)"
+    return AttributeError(f"{type(owner).__name__!r} object has no attribute {name!r}{hint}", name=name, obj=owner)
 
 
 def with_new_names(group: str, settings: Mapping[str, Any], known: Iterable[str]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.complaints import as_code
 from hpamdp.components import Components
 from hpamdp.geometry import PlaneGeometry, Symmetries
 from hpamdp.observation_entries import ObservationEntry, observation_dtype
@@ -299,8 +300,11 @@ class PAMDPSpecs:
         """Return the specs of a `PAMDPEnv`.
 
         Raises:
-            ValueError: the initial parameters, symmetries or geometry do not fit the observation and the action.
+            ValueError: it is no `PAMDPEnv`, or the initial parameters, symmetries or geometry do not fit the
+                observation and the action.
         """
+        if not hasattr(env, "parameter_dims"):
+            raise ValueError(f"from_env: {as_code(env)} is no PAMDPEnv; hpamdp.make makes one")
         action = env.full_action_spec_unbatched
         parameters = action[keys.PARAMETERS]
         observation_dim = env.observation_spec_unbatched[keys.OBSERVATION].shape[-1]

@@ -569,7 +569,25 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make(Reach, oracle=True), "oracle=True: env=gymnasium has no planner to ask"),
         (lambda: hpamdp.make("platform", device="gpu"), "device"),
         (lambda: hpamdp.make("platform", device="cuda:9"), "device"),
+        (lambda: hpamdp.make("platform", max_steps=5, **{"env.max_steps": 5}), "env.max_steps is given, too"),
         (lambda: hpamdp.make_gymnasium(None), "must be the name of a problem"),
+        (lambda: hpamdp.make_gymnasium("platfom"), "did you mean hpamdp/Platform-v0?"),
+        (lambda: hpamdp.make_gymnasium("platform", seed=-1), "seed=-1: must be greater than or equal to 0"),
+        (lambda: hpamdp.make_gymnasium("platform", render_mode="ansi"), "must be None or rgb_array"),
+        (lambda: hpamdp.train("platform", max_steps=5, **{"env.max_steps": 5}), "env.max_steps is given, too"),
+        (lambda: hpamdp.train("platform", max_stps=5), r"did you mean env\.max_steps"),
+        (lambda: hpamdp.train("platform", low="hppo", lr=1e-3), r"did you mean low\.lr\?"),
+        (lambda: hpamdp.train("platfrom"), r"did you mean platform\? conf/env has "),
+        (lambda: hpamdp.train("platform", num_envs=0), r"num_envs=0: .* \(conf/config.yaml, given as an argument\)"),
+        (lambda: hpamdp.train("platform", progress="no"), "progress='no': must be True or False"),
+        (lambda: hpamdp.load("hppo_platform", max_stps=5), r"did you mean max_steps\?"),
+        (lambda: hpamdp.load("hppo_platform", low="pdqn"), "low: has no effect on a trained agent"),
+        (lambda: hpamdp.report(), "name the folder of a run"),
+        (lambda: hpamdp.report(3), "folders=3: must be a path"),
+        (lambda: hpamdp.report(".", metric=3), "metric=3: must be the name of a column"),
+        (lambda: hpamdp.HPPO("platform"), r"specs='platform': must be PAMDPSpecs.from_env\(env\)"),
+        (lambda: hpamdp.UCB("rooms"), r"specs='rooms': must be PAMDPSpecs.from_env\(env\)"),
+        (lambda: hpamdp.PAMDPSpecs.from_env("platform"), "'platform' is no PAMDPEnv; hpamdp.make makes one"),
         (lambda: hpamdp.make_gymnasium("x-v3"), "x-v3"),
         (lambda: hpamdp.make_gymnasium("platform", max_steps=-1), "max_steps=-1"),
         (lambda: hpamdp.Patience(evaluations=0), "evaluations=0: must be greater than 0"),
@@ -581,6 +599,33 @@ def test_wrong_arguments_of_constructors_are_one_line(make, message):
     with pytest.raises(ValueError, match=message) as raised:
         make()
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["max_steps", "env.max_steps"])
+def test_a_setting_of_the_problem_has_the_same_names_for_all_functions(name, platform_agent):
+    settings = {name: 2}
+    short = {"num_envs": 4, "steps_per_batch": 8, "total_frames": 32, "progress": False, "eval.layouts": 4}
+    assert hpamdp.make("platform", **settings).max_steps == 2
+    env = hpamdp.make_gymnasium("platform", **settings)
+    env.reset(seed=0)
+    steps = [env.step(env.action_space.sample()) for _ in range(2)]
+    assert any(steps[-1][2:4])
+    trained = hpamdp.train("platform", low={"name": "hppo", "minibatch_size": 16}, **short, **settings)
+    for agent in (trained, hpamdp.load("hppo_platform", **settings)):
+        assert agent.evaluate(episodes=3)["steps"] <= 2.0
+    assert platform_agent.evaluate(episodes=3, **settings)["steps"] <= 2.0
+    assert platform_agent.evaluate("platform", episodes=3, **settings)["steps"] <= 2.0
+
+
+def test_make_groups_actions_as_train_does():
+    assert hpamdp.make("platform", grouping="default").option_names == ("run", "jump")
+
+
+@pytest.mark.parametrize(("name", "ours"), [("predict", "act\\(observation\\)"), ("learn", "hpamdp.train")])
+def test_a_method_of_another_library_names_ours(name, ours, platform_agent):
+    with pytest.raises(AttributeError, match=f"no attribute '{name}'; use {ours} \\(docs/coming-from.md\\)"):
+        getattr(platform_agent, name)
+    assert not hasattr(platform_agent, "no_such_thing")
 
 
 def test_make_takes_what_train_takes():

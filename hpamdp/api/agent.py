@@ -16,16 +16,18 @@ from torchrl.envs.utils import ExplorationType
 
 from hpamdp import keys
 from hpamdp.acting import acting
-from hpamdp.api.arguments import path_argument, problem_arguments
+from hpamdp.api.arguments import flag, own_settings, path_argument, problem_arguments
 from hpamdp.api.export import export_onnx
 from hpamdp.complaints import as_code
+from hpamdp.config.components import TARGET, Component, component
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
-from hpamdp.config.outside_jobs import composed
+from hpamdp.config.outside_jobs import composed, word
 from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import DecisionTracker, decision_tracker
 from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.renamed import no_member
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env, make_evaluation, option_length
 from hpamdp.settings import Settings
@@ -83,6 +85,9 @@ class Agent:
         trained = "untrained" if not frames else f"after {frames:,} frames"
         return f"Agent({self._config.high}, {self._config.low}, {self._config.env}, {trained})"
 
+    def __getattr__(self, name: str) -> Any:
+        raise no_member(self, name)
+
     @property
     def num_parameters(self) -> int:
         """Number of weights of all networks."""
@@ -112,8 +117,7 @@ class Agent:
             >>> observation, info = env.reset(seed=0)
             >>> discrete, parameters = agent.act(observation)
         """
-        if not isinstance(greedy, bool):
-            raise ValueError(f"act: greedy={as_code(greedy)}: must be True or False")
+        flag("act: greedy", greedy)
         if info is not None and not isinstance(info, Mapping):
             raise ValueError(f"act: info={as_code(info)}: must be a dict")
         try:
@@ -183,7 +187,13 @@ class Agent:
             )
 
     def evaluate(
-        self, env: Any = None, episodes: int = 100, *, seed: int | None = None, per_episode: bool = False
+        self,
+        env: Any = None,
+        episodes: int = 100,
+        *,
+        seed: int | None = None,
+        per_episode: bool = False,
+        **settings: Any,
     ) -> dict[str, Any]:
         """Play episodes greedily and return their means.
 
@@ -193,6 +203,7 @@ class Agent:
             episodes: number of episodes.
             seed: of the episodes. If None, that of the agent's own evaluations, so 100 episodes are their first 100.
             per_episode: whether to return arrays with one entry for each episode instead of means.
+            settings: of the problem, such as `max_steps=50`.
 
         Returns:
             The means by name: `score`, `return`, `steps`, and what else the problem measures, such as `success`.
@@ -200,7 +211,8 @@ class Agent:
         Raises:
             ConfigError: the problem has other sizes, or a number is wrong.
         """
-        config = self._config if env is None else self._config_at(env)
+        flag("per_episode", per_episode)
+        config = self._config_at(env, own_settings(settings))
         seed = config.run.eval.seed if seed is None else seed
         asked = {"episodes": episodes, "seed": seed}
         numbers = {name: int(value) if isinstance(value, np.integer) else value for name, value in asked.items()}
@@ -213,21 +225,38 @@ class Agent:
         finally:
             evaluation.env.close()
 
-    def _config_at(self, env: Any) -> Config:
-        """Return the agent's config at another problem.
+    def _config_at(self, env: Any, settings: Mapping[str, Any]) -> Config:
+        """Return the agent's config at another problem; if `env` is None, at its own with other settings.
+
+        Raises:
+            ConfigError: the problem has other sizes, or a setting is wrong.
+        """
+        if env is None and not settings:
+            return self._config
+        if env is None:
+            own = self._config.env
+            assert own.cls is not None
+            target = f"{own.cls.__module__}.{own.cls.__qualname__}"
+            changed = component("env", own.name, {TARGET: target, **own.settings, **settings})
+            return self._fitting(replace(changed, objects=own.objects))
+        arguments = problem_arguments(env)
+        words = [*arguments.words, *(word(f"env.{name}", value) for name, value in settings.items())]
+        with composed(words) as cfg:
+            other = read(cfg).with_objects(arguments.objects)
+            own = self._config.env
+            if other.env.cls is own.cls:
+                given = {each.partition("=")[0].removeprefix("env.") for each in words}
+                kept = {name: value for name, value in own.settings.items() if name not in (*given, *_SOURCES)}
+                other = other.with_problem(replace(other.env, settings={**other.env.settings, **kept}))
+        return self._fitting(other.env)
+
+    def _fitting(self, env: Component) -> Config:
+        """Return the agent's config at another problem with the same sizes.
 
         Raises:
             ConfigError: the problem has other sizes.
         """
-        arguments = problem_arguments(env)
-        with composed(arguments.words) as cfg:
-            other = read(cfg).with_objects(arguments.objects)
-            own = self._config.env
-            if other.env.cls is own.cls:
-                given = {each.partition("=")[0].removeprefix("env.") for each in arguments.words}
-                kept = {name: value for name, value in own.settings.items() if name not in (*given, *_SOURCES)}
-                other = other.with_problem(replace(other.env, settings={**other.env.settings, **kept}))
-        config = self._config.with_problem(other.env)
+        config = self._config.with_problem(env)
         built = make_env(config, 1, self._env.device, config.run.seed)
         specs = PAMDPSpecs.from_env(built)
         built.close()
@@ -235,7 +264,7 @@ class Agent:
             both = [(each.name, getattr(specs, each.name), getattr(self.specs, each.name)) for each in fields(specs)]
             name, theirs, ours = next(each for each in both if each[1] != each[2])
             has = f"has {name}={as_code(theirs)}, but the agent's problem {as_code(ours)}"
-            raise ConfigError(f"evaluate: {other.env} {has}")
+            raise ConfigError(f"evaluate: {env} {has}")
         return config
 
     def save(self, path: str | Path) -> None:
@@ -259,7 +288,8 @@ class Agent:
         The file scales observations as the agent does. Its properties name the actions and hold the parameters' bounds.
 
         Raises:
-            ConfigError: the agent has no greedy policy that can be exported, or `hpamdp[onnx]` is not installed.
+            ConfigError: the path is none, the agent has no greedy policy that can be exported, or `hpamdp[onnx]` is not
+                installed.
             OSError: the file cannot be written.
 
         Example:
@@ -272,7 +302,7 @@ class Agent:
             >>> discrete, parameters = session.run(None, {"observation": observation})  # doctest: +SKIP
         """
         about = {group: getattr(self._config, group).name for group in ("env", "high", "low")}
-        export_onnx(Path(path), self._agent, self._env, option_length(self._config), about)
+        export_onnx(path_argument("export", path), self._agent, self._env, option_length(self._config), about)
 
 
 def _like(mask: torch.Tensor, value: torch.Tensor) -> torch.Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from hpamdp.config.components import GROUPS, takes_settings_model
 from hpamdp.config.compose import conf_dir
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import choosing_class, word
+from hpamdp.config.schema import RunConfig
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import first_line
 
@@ -53,6 +54,21 @@ def path_argument(name: str, value: Any) -> Path:
     return Path(value).expanduser()
 
 
+def flag(name: str, value: Any) -> None:
+    """Refuse an argument that is neither True nor False.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    if value is not True and value is not False:
+        raise ConfigError(f"{name}={as_code(value)}: must be True or False")
+
+
+def without(settings: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """Return the settings that have none of the names."""
+    return {name: value for name, value in settings.items() if name not in names}
+
+
 def settings_words(settings: Mapping[str, Any]) -> list[str]:
     """Return the words for settings by their names on the command line, such as `seed` and `low.lr`.
 
@@ -67,6 +83,45 @@ def settings_words(settings: Mapping[str, Any]) -> list[str]:
             raise ConfigError(f"{name}: Hydra runs no job here; give folder or config_dirs instead")
         words += _group_words(name, value) if name in GROUPS else [word(name, value)]
     return words
+
+
+def bare_names(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings without a dot that are neither a value of the run nor a group, such as `max_steps`."""
+    names = {*RunConfig.model_fields, *GROUPS, *(folder.name for folder in conf_dir().iterdir())}
+    return {name: value for name, value in settings.items() if "." not in name and name not in names}
+
+
+def with_problem(bare: Mapping[str, Any], of_problem: Iterable[str], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings with `env.` before the names that the problem has; other names stay, for `composed` to refuse.
+
+    Args:
+        bare: what `bare_names` returned.
+        of_problem: names of the problem's settings.
+        given: all settings.
+
+    Raises:
+        ConfigError: a setting is given twice.
+    """
+    known = set(of_problem)
+    for name in bare:
+        if f"env.{name}" in given:
+            raise ConfigError(f"{name}: env.{name} is given, too; leave one out")
+    return {f"env.{name}" if name in known else name: value for name, value in bare.items()}
+
+
+def own_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of the problem without the `env.` that `train` writes before them.
+
+    Raises:
+        ConfigError: a setting is given twice.
+    """
+    plain: dict[str, Any] = {}
+    for name, value in settings.items():
+        own = name.removeprefix("env.")
+        if own in plain:
+            raise ConfigError(f"{own}: env.{own} is given, too; leave one out")
+        plain[own] = value
+    return plain
 
 
 def _group_words(group: str, value: Any) -> list[str]:

@@ -7,8 +7,8 @@ from typing import Any
 import gymnasium
 from pydantic import NonNegativeInt, PositiveInt
 
-from hpamdp.api.arguments import plain_name, problem_arguments
-from hpamdp.complaints import as_code, no_such
+from hpamdp.api.arguments import own_settings, plain_name, problem_arguments
+from hpamdp.complaints import as_code, close_names, no_such
 from hpamdp.config.components import SUPPLIED_ARGUMENTS
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
@@ -16,6 +16,7 @@ from hpamdp.config.outside_jobs import composed, word
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
 from hpamdp.messages import first_line
+from hpamdp.run.assemble import grouped
 from hpamdp.run.compatibility import lack_of
 from hpamdp.settings import SettingError, Settings
 
@@ -37,8 +38,8 @@ def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **
         num_envs: number of environments in the batch.
         device: of the tensors.
         seed: of the episodes.
-        settings: the problem's settings by their names without `env.`, such as `max_steps=50`. `oracle=True`
-            and `human=True` add entries for players that need them.
+        settings: the problem's settings, such as `max_steps=50` or, as for `train`, `**{"env.max_steps": 50}`.
+            `oracle=True` and `human=True` add entries for players that need them.
 
     Raises:
         ConfigError: there is no such problem, or a setting is wrong.
@@ -52,7 +53,7 @@ def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **
     supplied = {each: settings.pop(each) for each in SUPPLIED_ARGUMENTS["env"] if each in settings}
     sizes = validated(_Sizes, {"num_envs": num_envs, "seed": seed, **supplied}, "", "argument", "hpamdp.make")
     arguments = problem_arguments(name)
-    words = [*arguments.words, *(word(f"env.{each}", value) for each, value in settings.items())]
+    words = [*arguments.words, *(word(f"env.{each}", value) for each, value in own_settings(settings).items())]
     with composed([*words, word("device", str(device))]) as cfg:
         config = read(cfg).with_objects(arguments.objects)
     needs = {each: True for each in ("oracle", "human") if getattr(sizes, each)}
@@ -60,7 +61,8 @@ def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **
         lack = lack_of(need, config)
         if lack is not None:
             raise ConfigError(f"{need}=True: {lack}")
-    return config.env.build(num_envs=sizes.num_envs, device=config.run.resolve_device(), seed=sizes.seed, **needs)
+    env = config.env.build(num_envs=sizes.num_envs, device=config.run.resolve_device(), seed=sizes.seed, **needs)
+    return grouped(env, config)
 
 
 def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> Any:
@@ -85,12 +87,14 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         (9,)
     """
     env_id = _id_of(name)
-    if num_envs is not None:
-        validated(_Sizes, {"num_envs": num_envs}, "", "argument", "hpamdp.make_gymnasium")
+    sizes = {} if num_envs is None else {"num_envs": num_envs}
+    if "seed" in settings and env_id.startswith("hpamdp/"):
+        sizes["seed"] = settings["seed"]
+    validated(_Sizes, sizes, "", "argument", "hpamdp.make_gymnasium")
     try:
         if num_envs is None:
-            return gymnasium.make(env_id, **settings)
-        return gymnasium.make_vec(env_id, num_envs=num_envs, **settings)
+            return gymnasium.make(env_id, **own_settings(settings))
+        return gymnasium.make_vec(env_id, num_envs=num_envs, **own_settings(settings))
     except (gymnasium.error.Error, SettingError) as error:
         raise ConfigError(f"{env_id}: {first_line(error)}") from error
 
@@ -103,5 +107,6 @@ def _id_of(name: str) -> str:
         return name
     ids = {plain_name(each): each for each in gymnasium.registry if each.startswith("hpamdp/")}
     if plain_name(name) not in ids:
-        raise ConfigError(f"{name}: {no_such('problem with a Gymnasium id', name, ids.values())}")
+        guesses = [ids[each] for each in close_names(plain_name(name), [*ids])]
+        raise ConfigError(f"{name}: {no_such('problem with a Gymnasium id', name, ids.values(), guesses=guesses)}")
     return ids[plain_name(name)]

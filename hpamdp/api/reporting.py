@@ -6,6 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from hpamdp.analysis.seed_report import DEFAULT_METRIC, report_on
+from hpamdp.api.arguments import path_argument
+from hpamdp.complaints import as_code
+from hpamdp.config.errors import ConfigError
 
 
 def report(*folders: str | Path, metric: str = DEFAULT_METRIC, to: str | Path | None = None) -> list[dict[str, Any]]:
@@ -30,15 +33,20 @@ def report(*folders: str | Path, metric: str = DEFAULT_METRIC, to: str | Path | 
         A statistic is None if there are too few seeds for it.
 
     Raises:
-        ConfigError: a folder does not exist or has no runs, no run has the metric, or `to` holds a file of one of
-            these names that no report has written.
+        ConfigError: an argument is wrong, a folder does not exist or has no runs, no run has the metric, or `to` holds
+            a file of one of these names that no report has written.
         OSError: a file cannot be written.
 
     Example:
         >>> import hpamdp
         >>> rows = hpamdp.report("multirun/mystudy")  # doctest: +SKIP
     """
-    report = report_on(folders, metric)
-    if to is not None:
-        report.write(Path(to))
+    if not folders:
+        raise ConfigError("report: name the folder of a run, or one that contains runs")
+    if not isinstance(metric, str):
+        raise ConfigError(f"metric={as_code(metric)}: must be the name of a column of metrics.csv")
+    target = None if to is None else path_argument("to", to)
+    report = report_on([path_argument("folders", folder) for folder in folders], metric)
+    if target is not None:
+        report.write(target)
     return report.rows()

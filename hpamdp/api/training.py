@@ -14,8 +14,18 @@ import torch
 import torchrl
 
 from hpamdp.api.agent import Agent
-from hpamdp.api.arguments import path_argument, problem_arguments, settings_words
-from hpamdp.complaints import as_code
+from hpamdp.api.arguments import (
+    Arguments,
+    bare_names,
+    flag,
+    path_argument,
+    problem_arguments,
+    settings_words,
+    with_problem,
+    without,
+)
+from hpamdp.complaints import as_code, no_such
+from hpamdp.config.components import TARGET
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching
 from hpamdp.config.schema import RESUME_AUTO
@@ -31,6 +41,9 @@ from hpamdp.run.resume import resolve, saved_words
 from hpamdp.run.stopping import exits_explained
 from hpamdp.run.train import begin, check_callbacks, problems_explained
 from hpamdp.run_files import METRICS_NAME
+
+# Values of the run that count for a trained agent, too.
+_OF_LOADING = ("device", "threads")
 
 
 def train(
@@ -58,6 +71,7 @@ def train(
         settings: the settings of the command line by their names, such as `low="hppo"`, `high=None`,
             `total_frames=200_000`, `seed=1` or `collector="multi"`. Settings of a group follow its name:
             `low={"name": "hppo", "lr": 1e-3}`, or `**{"low.lr": 1e-3}`. Instead of a name a group takes a class.
+            Settings of the problem may do without `env.`, as for `make`: `max_steps=50`.
 
     Raises:
         ConfigError: a value is wrong, values do not go together, or the folder holds another run. Nothing is written.
@@ -71,6 +85,7 @@ def train(
     """
     if settings.get("mode") == "eval":
         raise ConfigError("mode=eval: use hpamdp.load(...).evaluate()")
+    flag("progress", progress)
     output_dir = None if folder is None else path_argument("folder", folder)
     callbacks = _checked_callbacks(callbacks)
     arguments = problem_arguments(env)
@@ -79,9 +94,7 @@ def train(
         raise ConfigError("resume=auto: goes on with the run in a folder, so give folder")
     if goes_on:
         settings = {**settings, "resume": None}
-    words = [*searching(config_dirs), *arguments.words, *settings_words(settings)]
-    resumed = settings.get("resume")
-    saved = [] if resumed is None else saved_words(str(resumed), "resume", words)
+    saved, words = _words_of(settings, [*searching(config_dirs), *arguments.words])
     with _torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
         stack.enter_context(_counted())
         with composed([*saved, *words]) as cfg:
@@ -106,6 +119,18 @@ def train(
             say(f"Stopped at {trainer.frames:,}{trainer.unit}")
     parts = trainer.parts
     return Agent(config, parts.agent, parts.env.base_env, trainer.progress(), trainer.recorder.metrics.rows())
+
+
+def _words_of(settings: Mapping[str, Any], others: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the words of the run to resume, if there is one, and the words of all settings after the others."""
+    bare = bare_names(settings)
+    words = [*others, *settings_words(without(settings, bare))]
+    resumed = settings.get("resume")
+    saved = [] if resumed is None else saved_words(str(resumed), "resume", words)
+    if bare:
+        with composed([*saved, *words]) as cfg:
+            words += settings_words(with_problem(bare, cfg.env, settings))
+    return saved, words
 
 
 def _checked_callbacks(given: Any) -> list[Callback]:
@@ -193,8 +218,8 @@ def load(
         config_dirs: folders of yaml files of your own, if the training had them.
         trust: whether the file may name code to run, such as the entry point of an environment, and the folders of
             yaml files that the training had.
-        settings: `device`, `threads`, and settings of the problem and of evaluations, such as
-            `**{"env.max_steps": 50}`.
+        settings: `device`, `threads`, and settings of the problem and of evaluations, such as `max_steps=50` and
+            `**{"eval.seed": 7}`.
 
     Raises:
         ConfigError: there is no such agent, it does not fit the problem, or it needs your trust.
@@ -204,13 +229,19 @@ def load(
         >>> hpamdp.load("hppo_platform").specs.parameter_dims
         (1, 1, 1)
     """
-    if trust is not True and trust is not False:
-        raise ConfigError(f"trust={as_code(trust)}: must be True or False")
-    for name in settings:
-        if name not in ("device", "threads") and name.partition(".")[0] not in ("env", "eval"):
-            raise ConfigError(f"{name}: has no effect on a trained agent; leave it out")
+    flag("trust", trust)
     file = checkpoint.find(path_argument("load", source), "load")
     arguments = problem_arguments(env)
+    bare = without(bare_names(settings), _OF_LOADING)
+    if bare:
+        known = _names_of_problem(file, arguments)
+        unknown = [name for name in bare if name not in known]
+        if unknown:
+            raise ConfigError(f"{unknown[0]}: {no_such('setting of the problem', unknown[0], known)}")
+        settings = {**without(settings, bare), **with_problem(bare, known, settings)}
+    for name in settings:
+        if name not in _OF_LOADING and name.partition(".")[0] not in ("env", "eval"):
+            raise ConfigError(f"{name}: has no effect on a trained agent; leave it out")
     words = [*searching(config_dirs), *arguments.words, *settings_words(settings), *(["trust=true"] if trust else [])]
     if env is None:
         _check_problem(file, settings)
@@ -218,6 +249,15 @@ def load(
         loaded = load_agent(str(file), words, arguments.objects)
     rows = read_rows(file.parent / METRICS_NAME)
     return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, rows)
+
+
+def _names_of_problem(file: Path, arguments: Arguments) -> list[str]:
+    """Return the names of the settings of the problem that the arguments choose, or else of a saved agent's."""
+    if not arguments.words:
+        saved = checkpoint.progress_of(file)["config"].get("env")
+        return [*saved] if isinstance(saved, Mapping) else []
+    with composed(arguments.words) as cfg:
+        return [name for name in cfg.env if name != TARGET]
 
 
 def _check_problem(file: Path, settings: Mapping[str, Any]) -> None:

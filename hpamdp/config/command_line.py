@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp import __version__
+from hpamdp.complaints import no_such
 from hpamdp.config.components import CALLBACK, GROUPS
 from hpamdp.config.compose import beginning_of
 from hpamdp.config.errors import ConfigError
@@ -175,9 +176,9 @@ def _check_groups(line: CommandLine, conf: Path) -> None:
             continue
         values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
         if not all(_is_choice(value) for value in values):
-            raise ConfigError(
-                f"{override.input_line}: no such choice; conf/{folder.name} has {', '.join(choices_in(folder))}"
-            )
+            given = str(override.value())
+            wrong = no_such("choice", given, choices_in(folder), where=f"conf/{folder.name}")
+            raise ConfigError(f"{override.input_line}: {wrong}")
 
 
 def _is_choice(value: object) -> bool:

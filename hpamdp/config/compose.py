@@ -158,7 +158,7 @@ def check(
     Raises:
         ConfigError: a value is wrong.
     """
-    run = check_run(given, names)
+    run = check_run(given, names, place_of)
     learners = _learners_of_options(run, names["env"])
     return checked_config(run, given, names, learners, listed_callbacks(run.callbacks, run.model_dump()), place_of)
 

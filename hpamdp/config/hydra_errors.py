@@ -15,13 +15,13 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hpamdp.complaints import no_such
+from hpamdp.complaints import close_names, no_such
 from hpamdp.config.command_line import GRAMMAR, CommandLine, as_text, choices_in, written_out
 from hpamdp.config.components import GROUPS, TARGET
 from hpamdp.config.compose import NESTED, beginning_of
 from hpamdp.config.schema import RUN_FILE
 from hpamdp.messages import file_and_reason, first_line
-from hpamdp.renamed import renamed
+from hpamdp.renamed import elsewhere, renamed
 
 # Launchers and sweepers in separate packages, and the extra of pyproject.toml that installs each.
 _EXTRAS = {
@@ -60,7 +60,7 @@ def _missing_choice(file: str, there: Sequence[str], conf: Path) -> str:
         return f"{group}={name}: no such choice; there is {', '.join(sorted({*there, *_EXTRAS[group]}))}"
     if not group.startswith("hydra"):  # a folder of a group may be part of the choice
         group, _, name = file.partition("/")
-    return f"{group}={name}: no such choice; conf/{group} has {', '.join(sorted({*there, *choices_in(conf / group)}))}"
+    return f"{group}={name}: {no_such('choice', name, {*there, *choices_in(conf / group)}, where=f'conf/{group}')}"
 
 
 def _first_lines(error: Exception, words: Sequence[str]) -> str:
@@ -112,10 +112,23 @@ def _missing_setting(cfg: DictConfig, setting: str, conf: Path) -> str | None:
     return None
 
 
+def _in_groups(cfg: DictConfig, name: str) -> list[str]:
+    """Return the settings of groups, such as `env.max_steps`, that have a name, or else one close to it."""
+    settings = {group: [*cfg[group]] for group in GROUPS if isinstance(cfg.get(group), DictConfig)}
+    exact = [f"{group}.{name}" for group, names in settings.items() if name in names]
+    return exact or [
+        f"{group}.{each}"
+        for group, names in settings.items()
+        for each in elsewhere(name, names) or close_names(name, names)
+    ]
+
+
 def _no_such_setting(cfg: DictConfig, path: list[str], name: str, known: list[str], conf: Path) -> str:
     if not path:
         folders = {folder.name for folder in conf.iterdir() if folder.is_dir()}
-        return no_such(f"group or value of the run ({RUN_FILE})", name, {*known, *folders} - {"hydra"})
+        names = sorted({*known, *folders} - {"hydra"})
+        guesses = elsewhere(name, names) or close_names(name, names) or _in_groups(cfg, name)
+        return no_such(f"group or value of the run ({RUN_FILE})", name, names, guesses=guesses)
     if len(path) == 1 and path[0] in GROUPS:
         cls = str(OmegaConf.to_container(cfg[path[0]]).get(TARGET) or "none").rpartition(".")[2]  # type: ignore[union-attr]
         return no_such(f"setting of {cls}", name, known)

@@ -251,21 +251,29 @@ class Config:
         return yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True)
 
 
-def check_run(given: Mapping[str, Any], names: Mapping[str, str]) -> RunConfig:
+def check_run(
+    given: Mapping[str, Any], names: Mapping[str, str], place_of: Callable[[str], str | None] | None = None
+) -> RunConfig:
     """Check the values of the run.
 
     Args:
         given: the values of the run, including its values in the groups `env` and `low`.
         names: the name that was chosen for each group.
+        place_of: as for `checked_config`.
 
     Raises:
         ConfigError: a wrong value.
     """
+
+    def where(setting: str | None) -> str:
+        place = None if setting is None or place_of is None else place_of(setting)
+        return RUN_FILE if place is None else f"{RUN_FILE}, {place}"
+
     values = {name: value for name, value in given.items() if name not in GROUPS}
     own: dict[str, type[Settings]] = {"env": EnvConfig, "low": StartConfig}
     for group, entries in own.items():
         values[group] = {name: given[group][name] for name in entries.model_fields if name in given[group]}
-    run = validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
+    run = validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", where)
     if "budget" in given["low"]:
         file, budget = file_of("low", names["low"]), given["low"]["budget"]
         if not isinstance(budget, dict):

@@ -16,6 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from hpamdp.env.kernel_rows import KernelRows
 from hpamdp.env.kernels import OUTCOME_ROW
+from hpamdp.settings import SettingError
 
 RenderMode = Literal["rgb_array"] | None
 
@@ -140,7 +141,7 @@ class GymnasiumAdapter(gymnasium.Env):
 
     def __init__(self, problem: NumpyEnv, render_mode: RenderMode) -> None:
         if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"{type(self).__name__}: render_mode={render_mode!r}, but must be None or rgb_array")
+            raise SettingError(f"{type(self).__name__}: render_mode={render_mode!r}, but must be None or rgb_array")
         self._problem = problem
         self.action_space = problem.action_space
         self.observation_space = problem.observation_space

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.complaints import as_code
 from hpamdp.policies.masks import random_choice
 from hpamdp.policies.stored_rows import check_stored_rows
 from hpamdp.settings import SettingError
@@ -154,12 +155,14 @@ class Level:
     takes_pictures: ClassVar[bool] = False
     specs: PAMDPSpecs
 
-    def check_observation(self, specs: PAMDPSpecs) -> None:
-        """Refuse pictures, unless the level `takes_pictures`.
+    def check_specs(self, specs: PAMDPSpecs) -> None:
+        """Refuse anything but specs, and pictures unless the level `takes_pictures`.
 
         Raises:
-            SettingError: an entry of the observation is a picture.
+            SettingError: they are no specs, or an entry of the observation is a picture.
         """
+        if not isinstance(specs, PAMDPSpecs):
+            raise SettingError(f"{type(self).__name__}: specs={as_code(specs)}: must be PAMDPSpecs.from_env(env)")
         if specs.has_pictures and not self.takes_pictures:
             raise SettingError(f"{type(self).__name__}: has no encoder for pictures; encoder=mlp flattens them")
 
@@ -298,7 +301,7 @@ class Selector(Level, TensorDictModuleBase):
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
-        self.check_observation(specs)
+        self.check_specs(specs)
         self.in_keys = [keys.OBSERVATION, keys.IS_DECISION]
         if specs.has_option_mask:
             self.in_keys.append(keys.OPTION_MASK)
@@ -539,7 +542,7 @@ class Learner(Level, nn.Module):
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
-        self.check_observation(specs)
+        self.check_specs(specs)
         self.specs = specs
         present = {
             ActionFeature.COMPONENTS: not specs.components.is_single,

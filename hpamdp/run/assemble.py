@@ -121,6 +121,15 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
     if flattens and env.observation_entries:
         env.close()
         raise ConfigError(f"{config.encoder}: {config.env} cannot flatten its pictures; use encoder=cnn")
+    return grouped(env, config)
+
+
+def grouped(env: PAMDPEnv, config: Config) -> PAMDPEnv:
+    """Return the environment with the options of `env.grouping`, if it is set.
+
+    Raises:
+        ConfigError: names of options are wrong, or the environment refuses the grouping.
+    """
     env.option_names = checked_option_names(env.option_names)
     grouping = config.run.env.grouping
     if grouping is not None:
