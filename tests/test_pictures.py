@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -88,6 +89,41 @@ def test_a_picture_is_a_uint8_box_of_0_to_255_with_16_px_a_side(space, counts):
     read = ObservationSpace(space)
     assert bool(read.entries()) == counts
     assert read.dim == (0 if counts else np.prod(space.shape))
+
+
+@pytest.mark.parametrize("highest", [1.0, 255.0])
+@pytest.mark.parametrize("shape", [(40, 36, 3), (3, 40, 36), (40, 36, 1)])
+def test_a_colour_picture_of_floats_is_refused_unless_it_is_flattened(shape, highest):
+    space = spaces.Box(0.0, highest, shape)
+    with pytest.raises(SettingError, match=r"observation camera: .* must be uint8 from 0 to 255; encoder=mlp reads it"):
+        ObservationSpace(spaces.Dict(camera=space))
+    assert ObservationSpace(space, flattens_pictures=True).dim == np.prod(shape)
+
+
+@pytest.mark.parametrize("space", [spaces.Box(0.0, 1.0, (40, 36)), spaces.Box(-1.0, 1.0, (40, 36, 3))])
+def test_a_box_that_need_not_be_a_picture_is_a_vector(space):
+    assert ObservationSpace(space).dim == np.prod(space.shape)
+
+
+class Scaled(gymnasium.Env):
+    """An environment whose camera gives floats from 0 to 1."""
+
+    observation_space = spaces.Box(0.0, 1.0, (40, 36, 3))
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 1.0, False, False, {}
+
+
+def test_training_on_pictures_of_floats_needs_flattening():
+    short = {"total_frames": 8, "num_envs": 2, "progress": False, "max_steps": 2, "eval.layouts": 1, "eval.every": 0}
+    with pytest.raises(hpamdp.ConfigError, match="must be uint8 from 0 to 255"):
+        hpamdp.train(Scaled, low="random", **short)
+    hpamdp.train(Scaled, low="random", encoder="mlp", **short)
 
 
 # The way through Gymnasium environments.

@@ -5,7 +5,8 @@ Accepted are `Box`, `Discrete`, `MultiDiscrete`, `MultiBinary` and `Tuple` and `
 
 A `Box` of uint8 from 0 to 255 is a picture if it has 2 or 3 dimensions and at least 16 px a side. Channels may come
 first or last, see `hpamdp.observation_entries.channels_axis`. Pictures stay uint8 and are never scaled. They follow the
-vector of all other numbers.
+vector of all other numbers. A `Box` with the shape of a colour picture and other numbers, such as floats from 0 to 1,
+is refused unless pictures are flattened: it would become a long vector without a word.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from gymnasium.spaces.utils import flatdim, flatten_space
 
 from hpamdp.env.gymnasium.action_spaces import written
 from hpamdp.env.gymnasium.leaves import Leaf, OutOfBounds, children, leaves
-from hpamdp.observation_entries import ObservationEntry, is_picture_shape
+from hpamdp.observation_entries import ObservationEntry, channels_axis, is_picture_shape
 from hpamdp.settings import SettingError
+
+_CHANNELS = (1, 3, 4)  # of grey, RGB and RGBA
 
 
 class ObservationSpace:
@@ -37,7 +40,8 @@ class ObservationSpace:
         num_pixels: number of pixels of all pictures, each channel counted.
 
     Raises:
-        ValueError: the space or `out_of_bounds` is not accepted, or the space has no such entry.
+        ValueError: the space or `out_of_bounds` is not accepted, the space has no such entry, or a picture is not made
+            of uint8 from 0 to 255.
     """
 
     def __init__(
@@ -56,6 +60,9 @@ class ObservationSpace:
         if entries is not None:
             _check_entries(space, entries)
             self.leaves = [leaf for entry in entries for leaf in self.leaves if leaf.path[0] == entry]
+        if not flattens_pictures:
+            for leaf in self.leaves:
+                _refuse_other_pixels(leaf)
         self._pictures = [] if flattens_pictures else [leaf for leaf in self.leaves if _is_picture(leaf.space)]
         self.leaves = [leaf for leaf in self.leaves if leaf not in self._pictures]
         self._cures = [self._cure(leaf) for leaf in self.leaves]
@@ -211,6 +218,24 @@ def _is_picture(space: spaces.Space) -> bool:
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or not is_picture_shape(space.shape):
         return False
     return bool((space.low == 0).all() and (space.high == 255).all())
+
+
+def _refuse_other_pixels(leaf: Leaf) -> None:
+    """Refuse a box with the shape of a colour picture whose numbers are pixels in another form.
+
+    Raises:
+        SettingError: they lie between 0 and 1 or between 0 and 255, but are not uint8 from 0 to 255.
+    """
+    space = leaf.space
+    if not isinstance(space, spaces.Box) or _is_picture(space) or not is_picture_shape(space.shape):
+        return
+    axis = channels_axis(space.shape)
+    is_colour = axis is not None and space.shape[axis] in _CHANNELS
+    if is_colour and (space.low == 0).all() and any((space.high == highest).all() for highest in (1, 255)):
+        raise SettingError(
+            f"observation {_name(leaf)}: {written(space)} has the shape of a picture, whose pixels must be uint8 from "
+            "0 to 255; encoder=mlp reads it as a vector"
+        )
 
 
 def _check_entries(space: spaces.Space, entries: Sequence[int | str]) -> None:
