@@ -50,7 +50,7 @@ RECOMMENDATION = "we recommend using a symmetric and normalized space"
 each_problem = pytest.mark.parametrize("problem", PROBLEMS, ids=lambda problem: problem.__name__)
 
 
-@pytest.mark.parametrize("problem", [*POINTS, OfficeEnv, PinballEnv, CircuitEnv])
+@pytest.mark.parametrize("problem", POINTS)
 def test_all_tensors_are_as_the_specs_say(problem):
     check_env_specs(problem(3, max_steps=4, oracle=True), return_contiguous=True)
 
