@@ -31,11 +31,13 @@ from hpamdp.messages import exit_code
 HERE = Path(__file__).resolve().parent
 CELL = ("problem", "learner", "exploration", "frames")
 RUN = ("problem", "learner", "exploration", "seed")
-# What the mean return of a run should reach, by problem, and whose return that is. PEARL's code was run once, on
-# Pinball's simple map: its first evaluation that arrives, after 800 episodes and 36 minutes. The published scores of
-# circuits are means of 8 seeds, read off a figure.
+# What the mean return of a run should reach, by problem, and whose return that is. PEARL's code was run once on each
+# problem. Pinball's simple map: its first evaluation that arrives, after 800 episodes and 36 minutes. Office: its last
+# evaluation, after 2,100 episodes and 43 minutes. The published scores of circuits are means of 8 seeds, read off a
+# figure.
 BARS = {
     "pinball simple": (9_343.0, "PEARL's code"),
+    "office": (806.0, "PEARL's code"),
     "circuit hadamard": (0.88, "published"),
     "circuit bell": (0.95, "published"),
     "circuit ghz": (0.68, "published"),
