@@ -176,7 +176,7 @@ def test_help_shows_groups_and_values_with_their_meaning_and_examples(command):
     words = " ".join(out.split())
     for group in (*GROUPS, "search"):
         assert f" {group} {', '.join(choices(group))} " in words
-    assert " experiment domains, domains/catch_point, " in words and ", domains/sliding, few_steps, " in words
+    assert ", domains, domains/catch_point, " in words and ", domains/sliding, few_steps, " in words
     lines = out.splitlines()
     for name in ("mode", "num_envs", "eval.layouts", "agent.sharing", "low.freeze", "film"):
         place = next(i for i, line in enumerate(lines) if line.startswith(f"  {name}="))
