@@ -37,8 +37,8 @@ AGENTS = {
     "hppo_sliding": ["high=none", "low=hppo", "env=sliding"],
     "hppo_lunar_lander": ["high=none", "low=hppo", "env=lunar_lander", "eval.layouts=200", "seed=101"],
     "hppo_circuit": [
-        *("high=none", "low=hppo", "env=circuit", "env.begin=known", "low.discrete_entropy=0.1"),
-        *("total_frames=60000", "low.anneal_steps=60000", "eval.every=20000", "eval.seed=7", "seed=900"),
+        *("high=none", "low=hppo", "env=circuit", "env.task=ghz"),
+        *("eval.layouts=100", "eval.seed=110", "seed=110"),
     ],
     "hppo_boatdock_unseen": [
         *("high=none", "low=hppo", SMALL, "env=boatdock_unseen", "env.frame=first_press"),

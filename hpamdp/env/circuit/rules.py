@@ -6,6 +6,7 @@ Differs from the source:
 - An action is a discrete one with an angle. There it is a box of four numbers, three of which are rounded down.
 - Every episode has a new random target, unless `target_number` says otherwise. There a run has one target.
 - A circuit of full depth terminates the episode. There it truncates it, with the same reward.
+- The rewards `progress` and `gain` are new here; the score is the source's.
 - The native gate sets are new here. Their costs take the place of the cost of depth.
 """
 
