@@ -1,7 +1,7 @@
 """Gather and tabulate what learners reach on the problems that people have, beside what others reached.
 
 python experiments/problems/study.py FOLDER...    adds the finished runs in these folders to results.csv and curves.csv,
-                                                  then tabulates
+                                                  those of traffic lights to traffic.csv, too, then tabulates
 python experiments/problems/study.py              tabulates the stored csv files
 """
 
@@ -31,6 +31,9 @@ from hpamdp.messages import exit_code
 HERE = Path(__file__).resolve().parent
 CELL = ("problem", "learner", "exploration", "frames")
 RUN = ("problem", "learner", "exploration", "seed")
+# Results of traffic lights that traffic.csv has of the agent and of the players by hand, on the same demands.
+TRAFFIC = ("delay", "queue", "stops", "throughput")
+AGENT = "agent"
 # What the mean return of a run should reach, by problem, and whose return that is. PEARL's code was run once on each
 # problem. Pinball's simple map: its first evaluation that arrives, after 800 episodes and 36 minutes. Office: its last
 # evaluation, after 2,100 episodes and 43 minutes. The published scores of circuits are means of 8 seeds, read off a
@@ -49,8 +52,9 @@ BARS = {
 def problem_of(run: Run) -> str:
     """Return the environment of a run, with the settings that make it another problem."""
     name, settings = run.summary["env"], run.config["env"]
-    if name == "pinball":
-        return f"{name} {settings['map']}"
+    setting = {"pinball": "map", "traffic": "demand"}.get(name)
+    if setting:
+        return f"{name} {settings[setting]}"
     if name != "circuit":
         return name
     others = [
@@ -62,14 +66,16 @@ def problem_of(run: Run) -> str:
 
 
 def gather(runs: Sequence[Run]) -> dict[str, Rows]:
-    """Return a row for each run and a row for each evaluation."""
+    """Return a row for each run, a row for each evaluation, and one for each player of a run on traffic lights."""
     results: Rows = []
     curves: Rows = []
+    traffic: Rows = []
     for run in runs:
         summary = run.summary
         name = {
             "problem": problem_of(run),
-            "learner": summary["low"] if summary["high"] == "none" else f"{summary['high']} over {summary['low']}",
+            # Over random play within the options, the selector is what learns.
+            "learner": summary["high"] if summary["low"] == "random" else summary["low"],
             "exploration": run.config["choices"]["exploration"],
             "seed": summary["seed"],
         }
@@ -78,7 +84,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
                 **name,
                 "frames": summary["frames"],
                 "score": round(summary["score"], 4),
-                "success": round(summary["success"], 4),
+                "success": round(summary["success"], 4) if "success" in summary else "",
                 "better_option": round(summary["oracle_agreement"], 4) if "oracle_agreement" in summary else "",
                 "cpu_s": round(summary["cpu_s"], 1),
             }
@@ -86,7 +92,14 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
         curves += [
             {**name, "frames": int(row["frames"]), "score": round(row["eval/score"], 4)} for row in run.evaluations()
         ]
-    return {"results": results, "curves": curves}
+        if summary["env"] == "traffic":
+            players = {AGENT: summary, **summary["references"]}
+            traffic += [
+                {**name, "frames": summary["frames"], "player": player}
+                | {result: round(of_player[result], 4) for result in TRAFFIC}
+                for player, of_player in players.items()
+            ]
+    return {"results": results, "curves": curves} | ({"traffic": traffic} if traffic else {})
 
 
 def merged(stored: Rows, new: Rows) -> Rows:
@@ -104,6 +117,8 @@ def table(results: Rows, curves: Rows) -> str:
     ]
     evaluations = groups(curves, *RUN)
     for (problem, learner, exploration, frames), rows in groups(with_enough_seeds(results, *CELL), *CELL).items():
+        if problem.startswith("traffic"):  # `traffic_table` compares its results
+            continue
         if problem not in BARS:
             raise SystemExit(f"{problem}: no return to reach is known; add one to BARS of {Path(__file__).name}")
         bar, whose = BARS[problem]
@@ -137,6 +152,25 @@ def percent(fractions: Sequence[float]) -> str:
     return f"{100.0 * np.mean(fractions):.1f} %" if fractions else ""
 
 
+def traffic_table(rows: Rows) -> str:
+    """Return a line for each player of a cell, and by how much the agent's delay is lower."""
+    lines = [
+        "| problem | learner | steps | n | player | delay, s | the agent's is lower by | queue | stops | throughput |",
+        "|---" * 10 + "|",
+    ]
+    for (problem, learner, _, frames), cell in groups(rows, *CELL).items():
+        players = groups(cell, "player")
+        agent = np.array([row["delay"] for row in players[AGENT,]])
+        for (player,), of_player in players.items():
+            delays = np.array([row["delay"] for row in of_player])
+            lower = "" if player == AGENT else f"{np.mean(1.0 - agent / delays):.1%}".replace("%", " %")
+            columns = [problem, learner, f"{frames:,}", len(agent), player.replace("_", " "), spread(delays, 1), lower]
+            columns += [spread([row[name] for row in of_player], 1) for name in ("queue", "stops")]
+            columns.append(spread([row["throughput"] for row in of_player], 0))
+            lines.append("| " + " | ".join(map(str, columns)) + " |")
+    return "\n".join(lines)
+
+
 def main(folders: Sequence[str]) -> None:
     """Add the runs in the folders, if any are given, and tabulate."""
     if folders:
@@ -144,6 +178,10 @@ def main(folders: Sequence[str]) -> None:
         stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in new}
         write_tables(HERE, {name: merged(stored[name], new[name]) for name in new})
     print(table(read_csv(HERE / "results.csv"), read_csv(HERE / "curves.csv")))
+    traffic = with_enough_seeds(read_csv(HERE / "traffic.csv"), *CELL)
+    if traffic:
+        print()
+        print(traffic_table(traffic))
 
 
 if __name__ == "__main__":
