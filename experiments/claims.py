@@ -813,18 +813,9 @@ def learners_on_domains() -> list[Claim]:
 def generalisation() -> list[Claim]:
     later = study("generalisation").later
 
-    def numbers_of(family: str) -> dict[str, Any]:
-        """Return what is said of the runs with one boat of a family that is new to the agent."""
-        runs = rows(
-            "generalisation/results.csv",
-            family=family,
-            boats=1,
-            frame="first_press",
-            values_end="trip",
-            fleet_size="new",
-            low="hppo",
-            memory="gru",
-        )
+    def numbers_of(family: str, low: str = "hppo") -> dict[str, Any]:
+        """Return what is said of a learner's runs with one boat of a family that is new to the agent."""
+        runs = rows("generalisation/results.csv", family=family, boats=1, values_end="trip", fleet_size="new", low=low)
         best = mean(runs, "ceiling")
         return dict(
             first=spread(column(runs, "score_1"), 2),
@@ -835,10 +826,13 @@ def generalisation() -> list[Claim]:
             millions=mean(runs, "frames") / 1e6,
             minutes=mean(runs, "cpu_s") / 60.0,
             presses=mean(runs, "presses_1"),
+            presses_made=mean(runs, "frames"),
             ceiling=best,
         )
 
-    turned, strength = numbers_of("turned"), numbers_of("strength")
+    turned, strength, any_boat, pets = (
+        numbers_of(*cell) for cell in (("turned",), ("strength",), ("any",), ("any", "pets"))
+    )
     return [
         Claim(
             page("generalisation"),
@@ -854,6 +848,18 @@ def generalisation() -> list[Claim]:
             "If boats also differ in speed and glide, it scores {first}, {second} and {later}, which is {share:.0f} % "
             "of the best plans' score.",
             strength,
+        ),
+        Claim(
+            page("generalisation"),
+            "If their keys push in any directions, H-PPO scores {first}, {second} and {later}, {share:.0f} % "
+            "of the best plans' score.",
+            any_boat,
+        ),
+        Claim(
+            page("generalisation"),
+            "PETS scores {first}, {second} and {later}, {share:.0f} %, after {presses_made:,.0f} presses "
+            "({seeds:word} seeds, {minutes:.0f} minutes of CPU time).",
+            pets,
         ),
     ]
 
