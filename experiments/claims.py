@@ -990,8 +990,9 @@ def problems() -> list[Claim]:
         Claim(
             page("problems"),
             "On circuits H-PPO beats the best published score on Hadamard ({hadamard:.3f}, published "
-            "{hadamard_published:.2f}), Bell ({bell:.3f}, {bell_published:.2f}) and GHZ ({ghz:.3f}, {ghz_published:.2f}), with "
-            "{seeds:word} seeds each",
+            "{hadamard_published:.2f}), Bell ({bell:.3f}, {bell_published:.2f}) "
+            "and GHZ ({ghz:.3f}, {ghz_published:.2f}), "
+            "with {seeds:word} seeds each",
             circuits,
             holds=all(circuits[task] > circuits[f"{task}_published"] for task in ("hadamard", "bell", "ghz")),
         ),

@@ -164,16 +164,28 @@ def summarise(results: Rows) -> Rows:
 
 
 def _above_next(results: Rows, low: str, boat: str) -> str:
-    """Return the difference of a learner to the next best one on this boat; empty for the last one."""
-    scores = {name: [run["score"] for run in _of(results, name, boat)] for name in LEARNERS}
+    """Return the difference of a learner to the next best one on this boat; empty for the last one.
+
+    Runs may have layouts of their own, so scores are compared by their distances to the ceiling of their layouts.
+    """
+    scores = {name: [run["score"] - run["ceiling"] for run in _of(results, name, boat)] for name in LEARNERS}
     ranking = sorted((name for name in LEARNERS if scores[name]), key=lambda name: -np.mean(scores[name]))
     place = ranking.index(low) + 1
     return str(difference(scores[low], scores[ranking[place]])) if place < len(ranking) else ""
 
 
-def ceilings(results: Rows) -> dict[str, float]:
-    """Return the ceiling of each boat: the mean over the runs, which may have layouts of their own."""
-    return {boat: float(np.mean([row["ceiling"] for row in results if row["boat"] == boat])) for boat in BOATS}
+def ceilings(results: Rows, boat: str) -> list[float]:
+    """Return the lowest and the highest mean ceiling of a learner's runs with this boat: layouts may differ."""
+    means = [float(np.mean([row["ceiling"] for row in rows])) for rows in groups(_on(results, boat), "low").values()]
+    return [min(means), max(means)]
+
+
+def _on(results: Rows, boat: str) -> Rows:
+    return [row for row in results if row["boat"] == boat]
+
+
+def _ceiling_text(results: Rows, boat: str) -> str:
+    return " to ".join(dict.fromkeys(f"{ceiling:.3f}" for ceiling in ceilings(results, boat)))
 
 
 def brief_table(rows: Rows, results: Rows) -> str:
@@ -191,8 +203,7 @@ def brief_table(rows: Rows, results: Rows) -> str:
         lines.append(f"| {low} | {cells} | {seeds} | {presses:,.0f} | {cpu_s:.0f} s |")
     human = " | ".join(f"{HUMAN[boat]['score']:.3f}" for boat in BOATS)
     lines.append(f"| people, mean | {human} | | {HUMAN_PRESSES} | |")
-    ceiling = ceilings(results)
-    lines.append(f"| ceiling | {ceiling['congruent']:.3f} | {ceiling['incongruent']:.3f} | | | |")
+    lines.append(f"| ceiling | {' | '.join(_ceiling_text(results, boat) for boat in BOATS)} | | | |")
     lines.append(f"| random presses | {RANDOM['score']:.3f} | {RANDOM['score']:.3f} | | | |")
     return "\n".join(lines)
 
@@ -220,10 +231,8 @@ def table(rows: Rows, results: Rows) -> str:
             f"| people | {boat} | | {human['score']:.3f} | | | 1 | {human['success']:.1%} | {HUMAN_PRESSES} | | "
             f"{paper} (*) |"
         )
-    for boat, ceiling in ceilings(results).items():
-        lines.append(
-            f"| ceiling | {boat} | | {ceiling:.3f} | | | {human_normalised(ceiling, boat):.3f} | 100.0% | | | |"
-        )
+    for boat in BOATS:
+        lines.append(f"| ceiling | {boat} | | {_ceiling_text(results, boat)} | | | | 100.0% | | | |")
     lines.append(f"| random | both | | {RANDOM['score']:.3f} | | | 0 | {RANDOM['success']:.1%} | | | |")
     return "\n".join(lines)
 
@@ -292,11 +301,10 @@ def _range(rows: Sequence[dict[str, Any] | None], column: str) -> str:
 def draw_curves(curves: Rows, results: Rows, path: Path) -> None:
     """Draw score and success against presses, a row for each controller: mean over seeds and one standard deviation."""
     figure = Figure(figsize=(11.5, 7.6), layout="constrained")
-    ceiling = ceilings(results)
     for boat, row in zip(BOATS, figure.subplots(2, 2, sharex=True), strict=True):
         for metric, axes in zip(PANELS, row, strict=True):
             _draw_learners(axes, curves, boat, metric)
-            _draw_reference(axes, "ceiling", ceiling[boat] if metric == "score" else 1.0, INK, "-")
+            _draw_reference(axes, "ceiling", max(ceilings(results, boat)) if metric == "score" else 1.0, INK, "-")
             _draw_reference(axes, "people", HUMAN[boat][metric], HUMAN_COLOUR, "--")
             _draw_reference(axes, "random", RANDOM[metric], FAINT, ":")
             axes.set_title(f"{boat} boat", loc="left", fontweight="bold", fontsize=10)
