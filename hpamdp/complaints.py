@@ -133,7 +133,7 @@ def _locate(location: tuple[int | str, ...], values: Mapping[str, Any]) -> tuple
             value = value.get(part)
         elif isinstance(value, list | tuple) and isinstance(part, int):
             path.append(str(part))
-            value = value[part]
+            value = value[part] if part < len(value) else None  # the list may be too short
     return path, value
 
 

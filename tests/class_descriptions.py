@@ -8,7 +8,7 @@ from hpamdp.config.stand_ins import quick_imports
 
 # Facts of classes that the rules of `hpamdp.run.compatibility` read.
 FACTS = ("modes", "needs", "is_bandit", "ends_options", "asks_learners", "value_setting", "guarded_settings")
-FACTS += ("needs_evaluations", "changes", "explores_with")
+FACTS += ("needs_evaluations", "changes", "explores_with", "counts_durations")
 
 
 def described(cls: type, group: str) -> dict:

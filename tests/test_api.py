@@ -581,6 +581,11 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.train("platform", num_envs=0), r"num_envs=0: .* \(conf/config.yaml, given as an argument\)"),
         (lambda: hpamdp.train("platform", progress="no"), "progress='no': must be True or False"),
         (lambda: hpamdp.load("hppo_platform", max_stps=5), r"did you mean max_steps\?"),
+        (
+            lambda: hpamdp.load("hppo_platform").evaluate(episodes=2, grouping={"x": [0]}),
+            "grouping: a trained agent keeps the options",
+        ),
+        (lambda: hpamdp.make("circuit", ion_costs=[0.03]), "env.ion_costs.1: missing"),
         (lambda: hpamdp.load("hppo_platform", low="pdqn"), "low: has no effect on a trained agent"),
         (lambda: hpamdp.report(), "name the folder of a run"),
         (lambda: hpamdp.report(3), "folders=3: must be a path"),

@@ -396,3 +396,18 @@ def test_cuda_is_refused_in_one_line_where_there_is_none(monkeypatch):
     assert make_config(["device=auto"]).run.resolve_device().type == "cuda"
     with pytest.raises(ConfigError, match="has CUDA devices 0 to 1"):
         make_config(["device=cuda:2"]).run.resolve_device()
+
+
+@pytest.mark.parametrize(
+    ("words", "blind"),
+    [
+        (["high=none", "low=pdqn"], None),
+        (["high=none", "low=hppo"], None),
+        (["high=none", "low=pets"], "low=pets"),
+        (["env.grouping=default", "high=meta_critic", "low=pdqn"], "high=meta_critic"),
+        (["env.grouping=default", "high=ucb", "low=pdqn"], None),
+    ],
+)
+def test_a_level_that_discounts_long_and_short_steps_alike_is_told_of(words, blind):
+    warning = compatibility.uncounted_durations(make_config(["env=platform", *words]))
+    assert warning is None if blind is None else warning.startswith(f"{blind}: discounts all steps alike")

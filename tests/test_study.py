@@ -310,6 +310,13 @@ def test_every_stored_run_of_the_protocol_is_planned(plan):
             assert row["seed"] in planned.get(tuple(row[name] for name in names), ()), row
 
 
+def test_a_run_that_is_found_twice_is_refused_and_nothing_is_written(tmp_path):
+    write_tables(tmp_path, {"results": [_row("pdqn", 0)]})
+    with pytest.raises(SystemExit, match="two runs of goal, pdqn, 2; nothing was written"):
+        add_to_tables(tmp_path, {"results": [_row("pdqn", 2)] * 2}, ("domain", "learner", "seed"))
+    assert len(read_csv(tmp_path / "results.csv")) == 1
+
+
 def test_runs_are_added_to_a_csv_file_in_the_place_of_repeated_ones(tmp_path):
     write_tables(tmp_path, {"results": [_row("pdqn", 0), _row("pdqn", 2)]})
     again = {**_row("pdqn", 2), "success": 0.1}
@@ -422,3 +429,29 @@ def test_all_scripts_of_studies_print_to_streams_that_may_close():
     assert len(printing) > 30
     for script, text in printing.items():
         assert "exit_code(" in text.rpartition('if __name__ == "__main__":')[2], script
+
+
+@pytest.mark.parametrize(
+    ("env", "settings", "name"),
+    [
+        ("traffic", {"demand": "rush", "network": "crossing", "strategies": False}, "traffic rush"),
+        (
+            "traffic",
+            {"demand": "rush", "network": "corridor", "strategies": True},
+            "traffic rush, corridor, strategies",
+        ),
+        ("office", {"chooses_goal": True}, "office, chooses goal"),
+        ("pinball", {"map": "hard", "start": "anywhere"}, "pinball hard, from anywhere"),
+        ("platform", {}, "platform"),
+    ],
+)
+def test_runs_on_different_problems_have_different_names(tmp_path, env, settings, name):
+    assert study("problems").problem_of(Run(tmp_path, {"env": env}, {"env": settings})) == name
+
+
+@pytest.mark.parametrize(
+    ("high", "low", "name"),
+    [("none", "pdqn", "pdqn"), ("ucb", "random", "ucb"), ("meta_critic", "planner", "meta_critic over planner")],
+)
+def test_a_learner_under_a_selector_has_another_name_than_alone(tmp_path, high, low, name):
+    assert study("problems").learner_of(Run(tmp_path, {"high": high, "low": low}, {})) == name

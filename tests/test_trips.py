@@ -476,6 +476,11 @@ def test_an_agent_that_chooses_by_the_rewards_of_a_session_does_not_act_without_
         ),
         (
             "boatdock_unseen",
+            {"agent.selector_values_end": "trip", "env.boats": 2, "high": "ucb"},
+            "agent.selector_values_end=trip: high=ucb has no values; use agent.values_end=trip",
+        ),
+        (
+            "boatdock_unseen",
             {"agent.selector_values_end": "trip"},
             "agent.selector_values_end=trip: high=none has no values; use agent.values_end=trip",
         ),

@@ -52,17 +52,33 @@ BARS = {
 def problem_of(run: Run) -> str:
     """Return the environment of a run, with the settings that make it another problem."""
     name, settings = run.summary["env"], run.config["env"]
-    setting = {"pinball": "map", "traffic": "demand"}.get(name)
-    if setting:
-        return f"{name} {settings[setting]}"
-    if name != "circuit":
-        return name
-    others = [
-        f"gate_set={settings['gate_set']}" if settings["gate_set"] != "published" else "",
-        "one target" if settings["target_number"] is not None else "",
-        f"begin={settings['begin']}" if settings["begin"] != "empty" else "",
-    ]
-    return ", ".join([f"{name} {settings['task']}", *filter(None, others)])
+    if name == "pinball":
+        others = ["from anywhere" if settings["start"] == "anywhere" else ""]
+        name = f"{name} {settings['map']}"
+    elif name == "office":
+        others = ["chooses goal" if settings["chooses_goal"] else ""]
+    elif name == "traffic":
+        others = [settings["network"] if settings["network"] != "crossing" else ""]
+        others += ["strategies" if settings["strategies"] else ""]
+        name = f"{name} {settings['demand']}"
+    elif name == "circuit":
+        others = [
+            f"gate_set={settings['gate_set']}" if settings["gate_set"] != "published" else "",
+            "one target" if settings["target_number"] is not None else "",
+            f"begin={settings['begin']}" if settings["begin"] != "empty" else "",
+        ]
+        name = f"{name} {settings['task']}"
+    else:
+        others = []
+    return ", ".join([name, *filter(None, others)])
+
+
+def learner_of(run: Run) -> str:
+    """Return the learner of a run and the selector above it; the selector alone over random play in the options."""
+    high, low = run.summary["high"], run.summary["low"]
+    if high == "none":
+        return low
+    return high if low == "random" else f"{high} over {low}"
 
 
 def gather(runs: Sequence[Run]) -> dict[str, Rows]:
@@ -74,8 +90,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
         summary = run.summary
         name = {
             "problem": problem_of(run),
-            # Over random play within the options, the selector is what learns.
-            "learner": summary["high"] if summary["low"] == "random" else summary["low"],
+            "learner": learner_of(run),
             "exploration": run.config["choices"]["exploration"],
             "seed": summary["seed"],
         }

@@ -191,9 +191,18 @@ def with_repeats_replaced(stored: Rows, new: Rows, names: Sequence[str]) -> Rows
 def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str]) -> None:
     """Add rows to csv files, in the place of those of repeated runs; sort them by these columns, which name a run.
 
+    Args:
+        folder: of the files.
+        tables: the new rows by the names of the files. The first table has one row for each run.
+        names: the columns.
+
     Raises:
-        SystemExit: a table has no rows. Then nothing is written.
+        SystemExit: a table has no rows, or the first one has a run twice. Then nothing is written.
     """
+    first, *_ = tables
+    twice = next((run for run, rows in groups(tables[first], *names).items() if len(rows) > 1), None)
+    if twice is not None:
+        raise SystemExit(f"the given folders have two runs of {', '.join(map(str, twice))}; nothing was written")
     merged = {}
     for table, new in tables.items():
         rows = with_repeats_replaced(read_csv(folder / f"{table}.csv"), new, names)

@@ -23,7 +23,7 @@ from hpamdp.config.components import TARGET, Component, component
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.config.outside_jobs import composed, word
-from hpamdp.config.schema import Config
+from hpamdp.config.schema import Config, EnvConfig
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import DecisionTracker, decision_tracker
 from hpamdp.policies.agent import HierarchicalAgent
@@ -212,7 +212,11 @@ class Agent:
             ConfigError: the problem has other sizes, or a number is wrong.
         """
         flag("per_episode", per_episode)
-        config = self._config_at(env, own_settings(settings))
+        of_problem = own_settings(settings)
+        for name in EnvConfig.model_fields:
+            if name in of_problem:
+                raise ConfigError(f"{name}: a trained agent keeps the options that it has learned with; leave it out")
+        config = self._config_at(env, of_problem)
         seed = config.run.eval.seed if seed is None else seed
         asked = {"episodes": episodes, "seed": seed}
         numbers = {name: int(value) if isinstance(value, np.integer) else value for name, value in asked.items()}

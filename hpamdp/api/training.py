@@ -234,7 +234,7 @@ def load(
     arguments = problem_arguments(env)
     bare = without(bare_names(settings), _OF_LOADING)
     if bare:
-        known = _names_of_problem(file, arguments)
+        known = _names_of_problem(file, arguments, config_dirs)
         unknown = [name for name in bare if name not in known]
         if unknown:
             raise ConfigError(f"{unknown[0]}: {no_such('setting of the problem', unknown[0], known)}")
@@ -251,12 +251,12 @@ def load(
     return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, rows)
 
 
-def _names_of_problem(file: Path, arguments: Arguments) -> list[str]:
+def _names_of_problem(file: Path, arguments: Arguments, config_dirs: Sequence[str | Path]) -> list[str]:
     """Return the names of the settings of the problem that the arguments choose, or else of a saved agent's."""
     if not arguments.words:
         saved = checkpoint.progress_of(file)["config"].get("env")
         return [*saved] if isinstance(saved, Mapping) else []
-    with composed(arguments.words) as cfg:
+    with composed([*searching(config_dirs), *arguments.words]) as cfg:
         return [name for name in cfg.env if name != TARGET]
 
 

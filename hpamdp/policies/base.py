@@ -505,6 +505,8 @@ class Learner(Level, nn.Module):
         memory_key: key of the memory's state in a step, if the policy and `value` have a memory; else None.
         remembers_directions: whether the learner remembers the directions of actions that a problem reveals, unless it
             has another memory or `augment=false`.
+        counts_durations: whether discounts are those of `step_discounts`. A run warns if the environment writes
+            durations and the learner does not count them.
         exploring_keys: those of the policy's states that only exploration reads. They do not keep it from an export.
         explores_with: what an exploration beside the learner may change (`Exploration.changes`). With `actions`, the
             learner may be `is_overruled`; with `rewards`, it may have a `bonus`. Other explorations are refused.
@@ -528,6 +530,7 @@ class Learner(Level, nn.Module):
     value_setting: ClassVar[str | None] = None
     memory_key: str | None = None
     remembers_directions: ClassVar[bool] = False
+    counts_durations: ClassVar[bool] = False
     exploring_keys: ClassVar[frozenset[str]] = frozenset()
     explores_with: ClassVar[frozenset[str]] = frozenset()
     novelty_by: ClassVar[Literal["reward", "sample", "plan"]] = "reward"

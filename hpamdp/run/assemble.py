@@ -12,6 +12,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
+from hpamdp import keys
 from hpamdp.config.components import Component, constructor_arguments
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
@@ -157,6 +158,9 @@ def check_built(config: Config, env: PAMDPEnv) -> None:
     forgotten = compatibility.forgotten_trips(config, facts, reveals_directions=reveals_directions)
     if forgotten is not None:
         warn(forgotten)
+    uncounted = compatibility.uncounted_durations(config) if keys.DURATION in env.observation_spec.keys() else None
+    if uncounted is not None:
+        warn(uncounted)
 
 
 def _facts_of_built(env: PAMDPEnv) -> ProblemFacts:

@@ -198,11 +198,11 @@ def values_end_where_there_are_trips(config: Config) -> str | None:
 
 
 def selector_values_have_a_selector(config: Config) -> str | None:
-    """Refuse `agent.selector_values_end` without a selector."""
+    """Refuse `agent.selector_values_end` without a selector that values what follows its choices."""
     values_end = config.run.agent.selector_values_end
-    if config.run.mode == "eval" or values_end is None or config.high.name != "none":
+    if config.run.mode == "eval" or values_end is None or "gamma" in config.high.settings:
         return None
-    return f"agent.selector_values_end={values_end}: high=none has no values; use agent.values_end={values_end}"
+    return f"agent.selector_values_end={values_end}: {config.high} has no values; use agent.values_end={values_end}"
 
 
 def session_rewards_need_trips(config: Config) -> str | None:
@@ -221,6 +221,18 @@ def sessions_are_played_here(config: Config) -> str | None:
     if config.run.low.freeze:
         return f"low.freeze=true: plays whole episodes, but {config.env} has sessions of trips; use low.freeze=false"
     return None
+
+
+def uncounted_durations(config: Config) -> str | None:
+    """Return a warning if a level discounts all steps alike, for a problem whose steps take different times."""
+    blind = [
+        level
+        for level in [config.high, *config.learners]
+        if "gamma" in level.settings and not getattr(level.cls, "counts_durations", False)
+    ]
+    if config.run.mode == "eval" or not blind:
+        return None
+    return f"{blind[0]}: discounts all steps alike, but those of {config.env} take different times; gamma=1 avoids that"
 
 
 def forgotten_trips(config: Config, problem: ProblemFacts, *, reveals_directions: bool) -> str | None:

@@ -35,14 +35,17 @@ class CountsOptions(Settings):
     """Settings of `Counts`."""
 
     weight: PositiveFloat = 0.01
-    """Reward of a bonus of 1, which the first visit of a cell has, in the unit of the problem's rewards."""
+    """Reward of a bonus of 1, in the unit of the problem's rewards. A bonus is n^-1/2 after n visits of a cell.
+
+    The visits of a batch count before its bonuses: ten environments that enter a cell together share its novelty.
+    """
     resolution: PositiveFloat = 10.0
     """Cells in a unit of each entry of the observation: entries are multiplied by it and rounded.
 
     With 1, an entry that is 0 or 1, such as a tile, has two cells, and an entry in [-1, 1] has three.
     """
     table_size: Annotated[int, Field(ge=1, le=10_000_000)] = 262_139
-    """Places in the table of counts; a prime. Cells that share a place share their count."""
+    """Places in the table of counts, best a prime. Cells that share a place share their count."""
 
 
 class VisitTable(nn.Module):

@@ -155,6 +155,7 @@ class HPPO(OnPolicy, Learner):
     Options = HPPOOptions
     takes = frozenset(ActionFeature)
     takes_pictures = True
+    counts_durations = True
     explores_with = frozenset({"actions", "rewards"})
 
     frames: Tensor

@@ -98,6 +98,7 @@ class ReplayLearner(Learner):
     explores_with: ClassVar[frozenset[str]] = frozenset({"actions", "rewards"})
     novelty_by: ClassVar[Literal["reward", "sample", "plan"]] = "sample"
     progress: ClassVar[frozenset[str]] = Learner.progress | {"last_rows"}
+    counts_durations: ClassVar[bool] = True
     stores_own_parameters: bool = False
     catches_up: bool = False
     reward_scale: float = 1.0

@@ -120,6 +120,7 @@ class DLPA(ReplayLearner):
     modes: ClassVar[tuple[str, ...]] = ("train",)
     value_setting = "end_values"
     catches_up = True
+    counts_durations = False  # a plan does not know how long its steps take
     novelty_by = "plan"
     export_refusal = "plans at every step"
 

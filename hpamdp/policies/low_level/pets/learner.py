@@ -96,6 +96,7 @@ class PETS(ReplayLearner):
     stores_own_parameters = True
     catches_up = True
     remembers_directions = True
+    counts_durations = False  # a plan does not know how long its steps take
     novelty_by = "plan"
     knows_disagreement = True
     export_refusal = "plans at every step"
