@@ -22,7 +22,7 @@ from hpamdp.run.train import run
 FOLDER = Path(__file__).resolve().parent.parent / "agents"
 # Those of others have none, the released rules are there for comparisons, pictures are another view of a problem, and
 # no agent of the package plays Office, Pinball, primitives or traffic lights yet.
-NOT_LEARNED = {"office", "pinball", "primitives", "traffic"}
+NOT_LEARNED = {"primitives", "traffic"}
 PROBLEMS = {*choices("env")} - NOT_LEARNED - {"gymnasium", "boatdock_released", "catch_point_picture"}
 AGENTS = sorted(folder.name for folder in FOLDER.iterdir() if folder.is_dir())
 

@@ -40,6 +40,11 @@ AGENTS = {
         *("high=none", "low=hppo", "env=circuit", "env.task=ghz"),
         *("eval.layouts=100", "eval.seed=110", "seed=110"),
     ],
+    "pdqn_pinball": ["high=none", "low=pdqn", "env=pinball", "eval.layouts=10", "eval.seed=110", "seed=110"],
+    "hppo_office": [
+        *("high=none", "low=hppo", "env=office", "env.tiles=20", "exploration=counts", "exploration.resolution=1"),
+        *("exploration.weight=50", "exploration.table_size=16381", "eval.layouts=100", "eval.seed=111", "seed=111"),
+    ],
     "hppo_boatdock_unseen": [
         *("high=none", "low=hppo", SMALL, "env=boatdock_unseen", "env.frame=first_press"),
         *("total_frames=6000000", "eval.every=1000000", "seed=911"),
