@@ -16,6 +16,7 @@ import numpy as np
 from hpamdp.analysis.study import (
     Rows,
     Run,
+    add_to_tables,
     finished,
     first_at,
     groups,
@@ -23,8 +24,6 @@ from hpamdp.analysis.study import (
     read_csv,
     spread,
     with_enough_seeds,
-    with_repeats_replaced,
-    write_tables,
 )
 from hpamdp.messages import exit_code
 
@@ -117,12 +116,6 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
     return {"results": results, "curves": curves} | ({"traffic": traffic} if traffic else {})
 
 
-def merged(stored: Rows, new: Rows) -> Rows:
-    """Return the stored rows with those of repeated runs replaced, in order."""
-    rows = with_repeats_replaced(stored, new, RUN)
-    return sorted(rows, key=lambda row: tuple(row[name] for name in (*RUN, "frames")))
-
-
 def table(results: Rows, curves: Rows) -> str:
     """Return a line for each cell with enough seeds: scores, how many runs reach the bar, and after how many steps."""
     lines = [
@@ -189,9 +182,7 @@ def traffic_table(rows: Rows) -> str:
 def main(folders: Sequence[str]) -> None:
     """Add the runs in the folders, if any are given, and tabulate."""
     if folders:
-        new = gather(finished(folders))
-        stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in new}
-        write_tables(HERE, {name: merged(stored[name], new[name]) for name in new})
+        add_to_tables(HERE, gather(finished(folders)), RUN)
     print(table(read_csv(HERE / "results.csv"), read_csv(HERE / "curves.csv")))
     traffic = with_enough_seeds(read_csv(HERE / "traffic.csv"), *CELL)
     if traffic:

@@ -23,8 +23,8 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import Bonus, Learner
-from hpamdp.policies.exploration.base import Exploration, Explored
-from hpamdp.policies.exploration.novelty import NoveltyPolicy
+from hpamdp.policies.exploration.base import Explored
+from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
 from hpamdp.settings import SettingError, Settings
 
 _HASH_SEED = 0  # of the factors of the hash, which are the same in every run
@@ -84,11 +84,10 @@ class VisitTable(nn.Module):
         self.counts.index_add_(0, places, torch.ones_like(places))
 
 
-class Counts(Exploration):
+class Counts(RewardsNewStates):
     """A bonus for states that were seldom visited, from a table of counts."""
 
     Options = CountsOptions
-    changes = "rewards"
 
     def __init__(
         self,
@@ -98,14 +97,11 @@ class Counts(Exploration):
         options: CountsOptions | None = None,
         **settings: Any,
     ) -> None:
-        super().__init__(learner)
-        self.options: CountsOptions = CountsOptions.of(options, settings)
+        options = CountsOptions.of(options, settings)
         if learner.specs.has_pictures:
             raise SettingError("no picture is seen twice; use exploration=novelty")
-        if learner.novelty_by == "sample" and getattr(learner, "symmetry", None) is not None:
-            raise SettingError("low.augment=true: maps states to others that were never visited; use low.augment=false")
-        self.adds_to_reward = learner.novelty_by == "reward"
-        self.plans = learner.novelty_by == "plan"
+        super().__init__(learner, options.weight)
+        self.options = options
         self.table = VisitTable(learner.specs.observation_dim, self.options)
         self.to(device)
         learner.take_bonus(Bonus(self.options.weight, self.table.bonus))
@@ -120,10 +116,5 @@ class Counts(Exploration):
             return Explored(None, {})
         observation = batch.get(("next", keys.OBSERVATION))[mask]
         self.table.see(observation)
-        bonus = self.table.bonus(observation)
-        scalars = {"bonus": bonus.mean().item(), "cells": float(self.table.counts.count_nonzero())}
-        if not self.adds_to_reward:
-            return Explored(None, scalars)
-        of_batch = torch.zeros(*mask.shape, 1, device=mask.device, dtype=torch.float32)
-        of_batch[mask] = self.options.weight * bonus.unsqueeze(-1)
-        return Explored(of_batch, scalars)
+        cells = float(self.table.counts.count_nonzero())
+        return self.explored(self.table.bonus(observation), mask, {"cells": cells})

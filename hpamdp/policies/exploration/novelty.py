@@ -38,7 +38,8 @@ from torchrl.objectives import RNDLoss
 from hpamdp import keys
 from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.encoders.base import JoinedEncoders
-from hpamdp.policies.exploration.base import Exploration, Explored
+from hpamdp.policies.exploration.base import Explored
+from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
 from hpamdp.policies.shared.hybrid_actor import hidden_layers
 from hpamdp.policies.shared.networks import OutputLinear
 from hpamdp.settings import LearningRate, SettingError, Settings, Widths
@@ -127,26 +128,10 @@ def _network(specs: PAMDPSpecs, options: NoveltyOptions) -> nn.Sequential:
     return nn.Sequential(*layers, hidden_layers(num_inputs, options.hidden_dims), output)
 
 
-class NoveltyPolicy(TensorDictModuleBase):
-    """A learner's policy, whose plans ask a network how new states are: so the network reaches collector processes."""
-
-    def __init__(self, policy: TensorDictModuleBase, network: nn.Module) -> None:
-        super().__init__()
-        self.in_keys = policy.in_keys
-        self.out_keys = policy.out_keys
-        self.policy = policy
-        self.network = network
-
-    def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write what the learner's policy writes."""
-        return self.policy(td)
-
-
-class Novelty(Exploration):
+class Novelty(RewardsNewStates):
     """A bonus for states that are new, by random network distillation or an ensemble's disagreement."""
 
     Options = NoveltyOptions
-    changes = "rewards"
 
     def __init__(
         self,
@@ -156,12 +141,10 @@ class Novelty(Exploration):
         options: NoveltyOptions | None = None,
         **settings: Any,
     ) -> None:
-        super().__init__(learner)
-        self.options: NoveltyOptions = NoveltyOptions.of(options, settings)
-        self.adds_to_reward = learner.novelty_by == "reward"
+        options = NoveltyOptions.of(options, settings)
+        super().__init__(learner, options.weight)
+        self.options = options
         self.network: RandomDistillation | None = None
-        if learner.novelty_by == "sample" and getattr(learner, "symmetry", None) is not None:
-            raise SettingError("low.augment=true: maps states to others that were never visited; use low.augment=false")
         if not self._asks_ensemble(learner):
             self.network = RandomDistillation(learner.specs, self.options)
             self.to(device)
@@ -181,7 +164,7 @@ class Novelty(Exploration):
 
     def acting_policy(self, learner: Learner) -> TensorDictModuleBase:
         """Return the learner's policy, with the network if its plans need it."""
-        if learner.novelty_by != "plan" or self.network is None:
+        if not self.plans or self.network is None:
             return learner.policy
         return NoveltyPolicy(learner.policy, self.network)
 
@@ -192,12 +175,7 @@ class Novelty(Exploration):
         observation = batch.get(("next", keys.OBSERVATION))[mask]
         self.network.see(observation)
         bonus = self.network.bonus(observation)
-        scalars = {"bonus": bonus.mean().item(), "novelty": self._update(observation)}
-        if not self.adds_to_reward:
-            return Explored(None, scalars)
-        of_batch = torch.zeros(*mask.shape, 1, device=mask.device, dtype=torch.float32)
-        of_batch[mask] = self.options.weight * bonus.unsqueeze(-1)
-        return Explored(of_batch, scalars)
+        return self.explored(bonus, mask, {"novelty": self._update(observation)})
 
     def _update(self, observation: Tensor) -> float:
         """Learn from observations `[N, observation_dim]` once, in random minibatches; return the mean error before."""
