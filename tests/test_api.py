@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import threading
@@ -569,12 +570,12 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make(Reach, oracle=True), "oracle=True: env=gymnasium has no planner to ask"),
         (lambda: hpamdp.make("platform", device="gpu"), "device"),
         (lambda: hpamdp.make("platform", device="cuda:9"), "device"),
-        (lambda: hpamdp.make("platform", max_steps=5, **{"env.max_steps": 5}), "env.max_steps is given, too"),
         (lambda: hpamdp.make_gymnasium(None), "must be the name of a problem"),
+        (lambda: hpamdp.make_gymnasium("platform", 2, **{"env.num_envs": 3}), "give it as the argument num_envs"),
+        (lambda: hpamdp.make_gymnasium("platform", **{"env.id": "CartPole-v1"}), "give it as the argument name"),
         (lambda: hpamdp.make_gymnasium("platfom"), "did you mean hpamdp/Platform-v0?"),
         (lambda: hpamdp.make_gymnasium("platform", seed=-1), "seed=-1: must be greater than or equal to 0"),
         (lambda: hpamdp.make_gymnasium("platform", render_mode="ansi"), "must be None or rgb_array"),
-        (lambda: hpamdp.train("platform", max_steps=5, **{"env.max_steps": 5}), "env.max_steps is given, too"),
         (lambda: hpamdp.train("platform", max_stps=5), r"did you mean env\.max_steps"),
         (lambda: hpamdp.train("platform", low="hppo", lr=1e-3), r"did you mean low\.lr\?"),
         (lambda: hpamdp.train("platfrom"), r"did you mean platform\? conf/env has "),
@@ -604,6 +605,66 @@ def test_wrong_arguments_of_constructors_are_one_line(make, message):
     with pytest.raises(ValueError, match=message) as raised:
         make()
     assert "\n" not in str(raised.value)
+
+
+FIVE_STEPS = {"name": "platform", "max_steps": 5}
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: hpamdp.make(FIVE_STEPS, max_steps=7),
+        lambda: hpamdp.make(FIVE_STEPS, **{"env.max_steps": 7}),
+        lambda: hpamdp.make({"name": FIVE_STEPS, "max_steps": 7}),
+        lambda: hpamdp.make("platform", max_steps=5, **{"env.max_steps": 7}),
+        lambda: hpamdp.make_gymnasium("platform", max_steps=5, **{"env.max_steps": 7}),
+        lambda: hpamdp.train(FIVE_STEPS, max_steps=7),
+        lambda: hpamdp.train(FIVE_STEPS, **{"env.max_steps": 7}),
+        lambda: hpamdp.train("platform", max_steps=5, **{"env.max_steps": 7}),
+        lambda: hpamdp.load("hppo_platform", env=FIVE_STEPS, max_steps=7),
+        lambda: hpamdp.load("hppo_platform", max_steps=5, **{"env.max_steps": 7}),
+        lambda: hpamdp.load("hppo_platform").evaluate(FIVE_STEPS, 2, max_steps=7),
+        lambda: hpamdp.load("hppo_platform").evaluate("platform", 2, max_steps=5, **{"env.max_steps": 7}),
+        lambda: hpamdp.load("hppo_platform").evaluate(None, 2, max_steps=5, **{"env.max_steps": 7}),
+    ],
+)
+def test_a_setting_of_the_problem_that_is_given_twice_is_refused(call):
+    with pytest.raises(hpamdp.ConfigError, match=r"^(env\.)?max_steps: given twice, as [57] and as [57]; leave"):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("settings", "refused"),
+    [
+        ({"low": {"name": "hppo", "gamma": 0.9}, "low.gamma": 0.8}, "low.gamma: given twice, as 0.9 and as 0.8"),
+        ({"low": {"name": "hppo", "gamma": 0.9}, "low.gamma": 0.9}, "low.gamma: given twice, as 0.9 and as 0.9"),
+        ({"eval": {"seed": 3}, "eval.seed": 4}, "eval.seed: given twice, as 3 and as 4"),
+        ({"agent": {"sharing": "shared"}, "agent.sharing": "none"}, "agent.sharing: given twice, as 'shared' and as"),
+        ({"low.per_option": {"a": "pets"}, "low.per_option.a.name": "hppo"}, "low.per_option.a: given twice"),
+        ({"env.grouping": None, "env.grouping.a": [0]}, "env.grouping: given twice, as None and as"),
+    ],
+)
+def test_a_setting_of_a_run_that_is_given_twice_is_refused(settings, refused):
+    with pytest.raises(hpamdp.ConfigError, match=re.escape(refused)):
+        hpamdp.train("platform", **settings)
+
+
+def test_a_gymnasium_id_that_is_given_twice_is_refused():
+    with pytest.raises(hpamdp.ConfigError, match=r"env\.id: given twice, as 'CartPole-v1' and as 'Acrobot-v1'"):
+        hpamdp.make("CartPole-v1", id="Acrobot-v1")
+
+
+def test_settings_change_those_that_a_built_problem_brings_along():
+    built = hpamdp.make("platform", max_steps=5)
+    assert hpamdp.make(built, max_steps=7).max_steps == 7
+    assert hpamdp.make({"name": built, "max_steps": 7}).max_steps == 7
+
+
+def test_different_entries_of_a_mapping_may_come_in_two_ways():
+    agent = hpamdp.train("platform", low={"name": "hppo", "gamma": 0.9}, eval={"seed": 3}, **{**TINY, "low.lr": 1e-4})
+    low = agent._config.low.settings
+    assert (low["gamma"], low["lr"]) == (0.9, 1e-4)
+    assert (agent._config.run.eval.seed, agent._config.run.eval.layouts) == (3, TINY["eval.layouts"])
 
 
 @pytest.mark.parametrize("name", ["max_steps", "env.max_steps"])

@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType
 
 from hpamdp import keys
 from hpamdp.acting import acting
-from hpamdp.api.arguments import flag, own_settings, path_argument, problem_arguments
+from hpamdp.api.arguments import flag, path_argument, problem_arguments, without_env_prefix
 from hpamdp.api.export import export_onnx
 from hpamdp.complaints import as_code
 from hpamdp.config.components import TARGET, Component, component
@@ -212,7 +212,7 @@ class Agent:
             ConfigError: the problem has other sizes, or a number is wrong.
         """
         flag("per_episode", per_episode)
-        of_problem = own_settings(settings)
+        of_problem = without_env_prefix(settings)
         for name in EnvConfig.model_fields:
             if name in of_problem:
                 raise ConfigError(f"{name}: a trained agent keeps the options that it has learned with; leave it out")
@@ -244,7 +244,7 @@ class Agent:
             changed = component("env", own.name, {TARGET: target, **own.settings, **settings})
             return self._fitting(replace(changed, objects=own.objects))
         arguments = problem_arguments(env)
-        words = [*arguments.words, *(word(f"env.{name}", value) for name, value in settings.items())]
+        words = arguments.with_words([word(f"env.{name}", value) for name, value in settings.items()])
         with composed(words) as cfg:
             other = read(cfg).with_objects(arguments.objects)
             own = self._config.env

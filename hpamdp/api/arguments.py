@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from hpamdp.complaints import as_code
 from hpamdp.config.components import GROUPS, takes_settings_model
 from hpamdp.config.compose import conf_dir
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.outside_jobs import choosing_class, word
+from hpamdp.config.outside_jobs import check_given_once, choosing_class, given_twice, word
 from hpamdp.config.schema import RunConfig
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import first_line
@@ -32,15 +32,28 @@ _ACCEPTED = (
 
 @dataclass(frozen=True)
 class Arguments:
-    """Arguments of a Python function.
+    """The argument of a Python function that chooses a problem.
 
     Attributes:
         words: the words of the command line that says the same.
         objects: arguments for the constructor of the problem, which no word can hold.
+        copied: words for the class, the settings and the number of environments of a built problem. Unlike `words`,
+            they may be given once more with other values.
     """
 
     words: list[str] = field(default_factory=list)
     objects: Mapping[str, Any] = field(default_factory=dict)
+    copied: list[str] = field(default_factory=list)
+
+    def with_words(self, others: Sequence[str] = ()) -> list[str]:
+        """Return the words of the problem, and after them those of the function's other arguments.
+
+        Raises:
+            ConfigError: a setting is given twice. On a command line the last one would count in silence.
+        """
+        given = [*self.words, *others]
+        check_given_once(given)
+        return [*self.copied, *given]
 
 
 def path_argument(name: str, value: Any) -> Path:
@@ -64,8 +77,8 @@ def flag(name: str, value: Any) -> None:
         raise ConfigError(f"{name}={as_code(value)}: must be True or False")
 
 
-def without(settings: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    """Return the settings that have none of the names."""
+def all_but(settings: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """Return the settings whose names are not among these."""
     return {name: value for name, value in settings.items() if name not in names}
 
 
@@ -85,31 +98,24 @@ def settings_words(settings: Mapping[str, Any]) -> list[str]:
     return words
 
 
-def bare_names(settings: Mapping[str, Any]) -> dict[str, Any]:
+def unprefixed(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings without a dot that are neither a value of the run nor a group, such as `max_steps`."""
     names = {*RunConfig.model_fields, *GROUPS, *(folder.name for folder in conf_dir().iterdir())}
     return {name: value for name, value in settings.items() if "." not in name and name not in names}
 
 
-def with_problem(bare: Mapping[str, Any], of_problem: Iterable[str], given: Mapping[str, Any]) -> dict[str, Any]:
+def with_env_prefix(settings: Mapping[str, Any], of_problem: Iterable[str]) -> dict[str, Any]:
     """Return settings with `env.` before the names that the problem has; other names stay, for `composed` to refuse.
 
     Args:
-        bare: what `bare_names` returned.
+        settings: what `unprefixed` returned.
         of_problem: names of the problem's settings.
-        given: all settings.
-
-    Raises:
-        ConfigError: a setting is given twice.
     """
     known = set(of_problem)
-    for name in bare:
-        if f"env.{name}" in given:
-            raise ConfigError(f"{name}: env.{name} is given, too; leave one out")
-    return {f"env.{name}" if name in known else name: value for name, value in bare.items()}
+    return {f"env.{name}" if name in known else name: value for name, value in settings.items()}
 
 
-def own_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+def without_env_prefix(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings of the problem without the `env.` that `train` writes before them.
 
     Raises:
@@ -119,7 +125,7 @@ def own_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in settings.items():
         own = name.removeprefix("env.")
         if own in plain:
-            raise ConfigError(f"{own}: env.{own} is given, too; leave one out")
+            raise ConfigError(given_twice(own, plain[own], value))
         plain[own] = value
     return plain
 
@@ -154,11 +160,11 @@ def problem_arguments(env: Any) -> Arguments:
     if isinstance(env, Mapping) and "name" in env:
         chosen = problem_arguments(env["name"])
         own = [word(f"env.{name}", value) for name, value in env.items() if name != "name"]
-        return Arguments([*chosen.words, *own], chosen.objects)
+        return replace(chosen, words=[*chosen.words, *own])
     if isinstance(env, Mapping) or _is_problem_class(env):
         return Arguments(_group_words("env", env))
     if isinstance(env, PAMDPEnv):
-        return Arguments(_words_of_built(env))
+        return Arguments(copied=_words_of_built(env))
     return _arguments_of_gymnasium(env)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 from pydantic import NonNegativeInt, PositiveInt
 
-from hpamdp.api.arguments import own_settings, plain_name, problem_arguments
+from hpamdp.api.arguments import plain_name, problem_arguments, without_env_prefix
 from hpamdp.complaints import as_code, close_names, no_such
 from hpamdp.config.components import SUPPLIED_ARGUMENTS
 from hpamdp.config.compose import read
@@ -42,7 +42,7 @@ def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **
             `oracle=True` and `human=True` add entries for players that need them.
 
     Raises:
-        ConfigError: there is no such problem, or a setting is wrong.
+        ConfigError: there is no such problem, or a setting is wrong or given twice.
 
     Example:
         >>> import hpamdp
@@ -53,8 +53,8 @@ def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **
     supplied = {each: settings.pop(each) for each in SUPPLIED_ARGUMENTS["env"] if each in settings}
     sizes = validated(_Sizes, {"num_envs": num_envs, "seed": seed, **supplied}, "", "argument", "hpamdp.make")
     arguments = problem_arguments(name)
-    words = [*arguments.words, *(word(f"env.{each}", value) for each, value in own_settings(settings).items())]
-    with composed([*words, word("device", str(device))]) as cfg:
+    own = [word(f"env.{each}", value) for each, value in without_env_prefix(settings).items()]
+    with composed(arguments.with_words([*own, word("device", str(device))])) as cfg:
         config = read(cfg).with_objects(arguments.objects)
     needs = {each: True for each in ("oracle", "human") if getattr(sizes, each)}
     for need in needs:
@@ -78,7 +78,7 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         A `gymnasium.Env`, or a `gymnasium.vector.VectorEnv` if `num_envs` is given.
 
     Raises:
-        ConfigError: there is no such id, or a setting is wrong.
+        ConfigError: there is no such id, or a setting is wrong or given twice.
 
     Example:
         >>> import hpamdp
@@ -87,14 +87,18 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         (9,)
     """
     env_id = _id_of(name)
+    own = without_env_prefix(settings)
+    for each, argument in (("id", "name"), ("num_envs", "num_envs")):
+        if each in own:
+            raise ConfigError(f"{each}: no setting of the problem; give it as the argument {argument}")
     sizes = {} if num_envs is None else {"num_envs": num_envs}
-    if "seed" in settings and env_id.startswith("hpamdp/"):
-        sizes["seed"] = settings["seed"]
+    if "seed" in own and env_id.startswith("hpamdp/"):
+        sizes["seed"] = own["seed"]
     validated(_Sizes, sizes, "", "argument", "hpamdp.make_gymnasium")
     try:
         if num_envs is None:
-            return gymnasium.make(env_id, **own_settings(settings))
-        return gymnasium.make_vec(env_id, num_envs=num_envs, **own_settings(settings))
+            return gymnasium.make(env_id, **own)
+        return gymnasium.make_vec(env_id, num_envs=num_envs, **own)
     except (gymnasium.error.Error, SettingError) as error:
         raise ConfigError(f"{env_id}: {first_line(error)}") from error
 

@@ -16,13 +16,13 @@ import torchrl
 from hpamdp.api.agent import Agent
 from hpamdp.api.arguments import (
     Arguments,
-    bare_names,
+    all_but,
     flag,
     path_argument,
     problem_arguments,
     settings_words,
-    with_problem,
-    without,
+    unprefixed,
+    with_env_prefix,
 )
 from hpamdp.complaints import as_code, no_such
 from hpamdp.config.components import TARGET
@@ -74,7 +74,8 @@ def train(
             Settings of the problem may do without `env.`, as for `make`: `max_steps=50`.
 
     Raises:
-        ConfigError: a value is wrong, values do not go together, or the folder holds another run. Nothing is written.
+        ConfigError: a value is wrong or given twice, values do not go together, or the folder holds another run. Then
+            nothing is written.
         DivergedError: a reward, a loss or a weight is not finite.
         EnvironmentFaultError: the environment's own code raised an error, which is the cause.
         RuntimeError: a worker process died, or somebody's code called `sys.exit`.
@@ -94,7 +95,7 @@ def train(
         raise ConfigError("resume=auto: goes on with the run in a folder, so give folder")
     if goes_on:
         settings = {**settings, "resume": None}
-    saved, words = _words_of(settings, [*searching(config_dirs), *arguments.words])
+    saved, words = _words_of(settings, arguments, searching(config_dirs))
     with _torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
         stack.enter_context(_counted())
         with composed([*saved, *words]) as cfg:
@@ -121,15 +122,23 @@ def train(
     return Agent(config, parts.agent, parts.env.base_env, trainer.progress(), trainer.recorder.metrics.rows())
 
 
-def _words_of(settings: Mapping[str, Any], others: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the words of the run to resume, if there is one, and the words of all settings after the others."""
-    bare = bare_names(settings)
-    words = [*others, *settings_words(without(settings, bare))]
+def _words_of(settings: Mapping[str, Any], problem: Arguments, folders: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the words of the run to resume, if there is one, and the words of all arguments.
+
+    Args:
+        settings: the settings by their names.
+        problem: the argument that chooses a problem.
+        folders: the word that adds folders of yaml files, if there are any.
+    """
+    of_problem = unprefixed(settings)
+    own = settings_words(all_but(settings, of_problem))
+    words = [*folders, *problem.with_words(own)]
     resumed = settings.get("resume")
     saved = [] if resumed is None else saved_words(str(resumed), "resume", words)
-    if bare:
+    if of_problem:
         with composed([*saved, *words]) as cfg:
-            words += settings_words(with_problem(bare, cfg.env, settings))
+            own += settings_words(with_env_prefix(of_problem, cfg.env))
+        words = [*folders, *problem.with_words(own)]
     return saved, words
 
 
@@ -232,19 +241,19 @@ def load(
     flag("trust", trust)
     file = checkpoint.find(path_argument("load", source), "load")
     arguments = problem_arguments(env)
-    bare = without(bare_names(settings), _OF_LOADING)
-    if bare:
-        known = _names_of_problem(file, arguments, config_dirs)
-        unknown = [name for name in bare if name not in known]
-        if unknown:
-            raise ConfigError(f"{unknown[0]}: {no_such('setting of the problem', unknown[0], known)}")
-        settings = {**without(settings, bare), **with_problem(bare, known, settings)}
-    for name in settings:
+    of_problem = all_but(unprefixed(settings), _OF_LOADING)
+    known = _names_of_problem(file, arguments, config_dirs) if of_problem else []
+    unknown = [name for name in of_problem if name not in known]
+    if unknown:
+        raise ConfigError(f"{unknown[0]}: {no_such('setting of the problem', unknown[0], known)}")
+    others = all_but(settings, of_problem)
+    for name in others:
         if name not in _OF_LOADING and name.partition(".")[0] not in ("env", "eval"):
             raise ConfigError(f"{name}: has no effect on a trained agent; leave it out")
-    words = [*searching(config_dirs), *arguments.words, *settings_words(settings), *(["trust=true"] if trust else [])]
+    own = [*settings_words(others), *settings_words(with_env_prefix(of_problem, known))]
+    words = [*searching(config_dirs), *arguments.with_words(own), *(["trust=true"] if trust else [])]
     if env is None:
-        _check_problem(file, settings)
+        _check_problem(file, words)
     with _torch_restored(), problems_explained():
         loaded = load_agent(str(file), words, arguments.objects)
     rows = read_rows(file.parent / METRICS_NAME)
@@ -253,22 +262,23 @@ def load(
 
 def _names_of_problem(file: Path, arguments: Arguments, config_dirs: Sequence[str | Path]) -> list[str]:
     """Return the names of the settings of the problem that the arguments choose, or else of a saved agent's."""
-    if not arguments.words:
+    words = arguments.with_words()
+    if not words:
         saved = checkpoint.progress_of(file)["config"].get("env")
         return [*saved] if isinstance(saved, Mapping) else []
-    with composed([*searching(config_dirs), *arguments.words]) as cfg:
+    with composed([*searching(config_dirs), *words]) as cfg:
         return [name for name in cfg.env if name != TARGET]
 
 
-def _check_problem(file: Path, settings: Mapping[str, Any]) -> None:
-    """Refuse an agent whose problem was an object, unless settings name the problem.
+def _check_problem(file: Path, words: Sequence[str]) -> None:
+    """Refuse an agent whose problem was an object, unless words name the problem.
 
     Raises:
         ConfigError: the problem is unknown.
     """
     saved = checkpoint.progress_of(file)["config"].get("env")
     sources = ("id", "entry_point")
-    is_named = any(f"env.{name}" in settings for name in sources)
+    is_named = any(each.startswith(f"env.{name}=") for each in words for name in sources)
     is_generic = isinstance(saved, Mapping) and {*sources} <= saved.keys()
     if is_generic and not is_named and all(saved[name] is None for name in sources):
         raise ConfigError(f"load: {file}: the agent was trained on an object from Python; pass it again as env")

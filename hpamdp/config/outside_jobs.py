@@ -14,13 +14,15 @@ import yaml
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import QuotedString
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.complaints import as_code
-from hpamdp.config.command_line import parse
+from hpamdp.config.command_line import CommandLine, parse
 from hpamdp.config.components import (
+    GROUPS,
     SUPPLIED_ARGUMENTS,
     TARGET,
     check_base_class,
@@ -84,10 +86,7 @@ def _own_hydra() -> Iterator[None]:
 
 
 def _compose(words: Sequence[str], conf: Path) -> DictConfig:
-    try:
-        line = parse(words, conf)
-    except OverrideParseException as error:
-        raise ConfigError(not_understood(error.override)) from error
+    line = _parsed(words, conf)
     try:
         with hydra.initialize_config_dir(str(conf), version_base="1.3"):
             return hydra.compose("config", line.words, return_hydra_config=True)
@@ -95,6 +94,13 @@ def _compose(words: Sequence[str], conf: Path) -> DictConfig:
         raise
     except (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError) as error:
         raise ConfigError(explained(error, line, conf)) from error
+
+
+def _parsed(words: Sequence[str], conf: Path) -> CommandLine:
+    try:
+        return parse(words, conf)
+    except OverrideParseException as error:
+        raise ConfigError(not_understood(error.override)) from error
 
 
 def word(name: str, value: Any) -> str:
@@ -120,6 +126,39 @@ def _written(name: str, value: Any) -> str:
     if isinstance(value, Mapping) and all(is_name(entry) for entry in value):
         return f"{{{','.join(f'{entry}:{_written(name, item)}' for entry, item in value.items())}}}"
     raise ConfigError(f"{name}={as_code(value)}: must be a number, a text, or a list or mapping of these")
+
+
+def check_given_once(words: Sequence[str]) -> None:
+    """Refuse a setting that two words give, also one inside a mapping, such as `eval={seed:7}` and `eval.seed=8`.
+
+    This is for the arguments of Python functions. On a command line the last word counts.
+
+    Raises:
+        ConfigError: a setting is given twice.
+    """
+    given: list[tuple[tuple[str, ...], Any]] = []
+    for override in _parsed(words, conf_dir()).overrides:
+        if override.key_or_group not in GROUPS:  # there it is a choice, such as `low=hppo` before `low.lr=0.001`
+            given += _single_values(tuple(override.key_or_group.split(".")), override.value())
+    for place, (name, value) in enumerate(given):
+        for earlier, first in given[:place]:
+            shorter = min(len(name), len(earlier))
+            if name[:shorter] == earlier[:shorter]:
+                raise ConfigError(given_twice(".".join(name[:shorter]), first, value))
+
+
+def _single_values(name: tuple[str, ...], value: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield the entries of a mapping, of the mappings in it and so on, or else the value itself."""
+    if not isinstance(value, dict) or not value:
+        yield name, value.text if isinstance(value, QuotedString) else value
+        return
+    for entry, each in value.items():
+        yield from _single_values((*name, str(entry)), each)
+
+
+def given_twice(name: str, first: Any, second: Any) -> str:
+    """Return the error for a setting that arguments give twice."""
+    return f"{name}: given twice, as {as_code(first)} and as {as_code(second)}; leave one out"
 
 
 def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list[str]:
