@@ -64,11 +64,30 @@ class RevealedDirections:
         last_action: entries of the one-hot last discrete action, all of them zero before the first one.
         moved: entries x and y of the displacement by the last action, which points where the action does.
         sums_to_zero: whether the directions of all actions sum to zero, so that all but one of them tell the last one.
+        last_option: entry with the number of the option that took the last action, if each option has directions of its
+            own; None if all have the same.
     """
 
     last_action: tuple[int, ...]
     moved: tuple[int, int]
     sums_to_zero: bool = False
+    last_option: int | None = None
+
+    @property
+    def entries(self) -> tuple[int, ...]:
+        """All these entries."""
+        return (*self.last_action, *self.moved, *(() if self.last_option is None else (self.last_option,)))
+
+    def moved_to(self, place: Mapping[int, int]) -> RevealedDirections | None:
+        """Return what shows the directions, given the new place of each entry; None if an entry has none."""
+        if any(entry not in place for entry in self.entries):
+            return None
+        return replace(
+            self,
+            last_action=tuple(place[entry] for entry in self.last_action),
+            moved=(place[self.moved[0]], place[self.moved[1]]),
+            last_option=None if self.last_option is None else place[self.last_option],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,23 +137,15 @@ class PlaneGeometry(Contexts):
             self,
             vectors=tuple((place[self.vectors[number][0]], place[self.vectors[number][1]]) for number in kept),
             origins=tuple(self.origins[number] for number in kept) if self.origins else (),
-            revealed=self._revealed_in(place),
+            revealed=None if self.revealed is None else self.revealed.moved_to(place),
             redundant=(),
             **self._entries_in(place),
         )
 
-    def _revealed_in(self, place: Mapping[int, int]) -> RevealedDirections | None:
-        """Return what shows the directions, given the new place of each entry; None if an entry has none."""
-        old = self.revealed
-        if old is None or any(entry not in place for entry in (*old.last_action, *old.moved)):
-            return None
-        moved = place[old.moved[0]], place[old.moved[1]]
-        return replace(old, last_action=tuple(place[entry] for entry in old.last_action), moved=moved)
-
     def fits(self, observation_dim: int, parameter_dims: Sequence[int]) -> str:
         """Return in words what does not fit a problem of this size, empty if all does."""
         revealed = self.revealed
-        showing = () if revealed is None else (*revealed.last_action, *revealed.moved)
+        showing, last_action = ((), ()) if revealed is None else (revealed.entries, revealed.last_action)
         entries = [entry for pair in self.vectors for entry in pair]
         expected = [self.num_contexts, len(parameter_dims), 2]
         shape = expected if self.directions is None else list(self.directions.shape)
@@ -163,8 +174,8 @@ class PlaneGeometry(Contexts):
             f"revealed by the entries {showing}, but must be different entries of {observation_dim}": (
                 any(not 0 <= entry < observation_dim for entry in showing) or len(set(showing)) < len(showing)
             ),
-            f"revealed by {len(showing) - 2} entries of the last action, but must be {len(parameter_dims)}": (
-                revealed is not None and len(revealed.last_action) != len(parameter_dims)
+            f"revealed by {len(last_action)} entries of the last action, but must be {len(parameter_dims)}": (
+                revealed is not None and len(last_action) != len(parameter_dims)
             ),
         }
         return next((text for text, is_wrong in misfits.items() if is_wrong), "")

@@ -506,7 +506,6 @@ def test_an_agent_remembers_until_its_episode_ends(memory):
         (["low=hppo", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=hppo: memory=gru"),
         (["low=hsac", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=hsac: memory=gru"),
         (["low=pdqn", "low.memory=gru", "data=human"], "low.memory=gru: .*lacks what a policy remembered"),
-        (["low=hsac", "low.memory=gru", "agent.sharing=shared", "high=value"], "agent.sharing=shared with low.memory"),
         (["low=hppo", "high=actor", "high.memory=gru"], "high.memory=gru: agent.termination=episode has one decision"),
         (["low=hppo", "high=option_critic", "high.memory=gru"], "must be 'none' or 'stack'"),
     ],

@@ -16,6 +16,8 @@ from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.env.boatdock_unseen.rules import OBSERVATION_NAMES
 from hpamdp.env.decisions import with_decisions
 from hpamdp.geometry import PlaneGeometry, RevealedDirections
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.shared.known_directions import KnownDirections
 from hpamdp.specs import PAMDPSpecs
@@ -193,7 +195,54 @@ def test_other_settings_remember_no_directions():
     for settings in ({"augment": False}, {"memory": "stack"}):
         learner = PETS(specs, **settings)
         assert not learner.model.frame.turns and STATE not in learner.policy.out_keys
-    assert UnseenBoatsEnv(1, boats=2).geometry is None
+
+
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_of_two_boats_each_has_the_directions_that_it_has_shown_itself(is_shared):
+    torch.manual_seed(0)
+    env = UnseenBoatsEnv(8, trips=4, boats=2, seed=3)
+    specs = PAMDPSpecs.from_env(env)
+    of_learners = [specs.with_option_observed()] if is_shared else [specs.of_option(boat) for boat in range(2)]
+    learners = [PETS(own, **{**SMALL, "warmup_steps": 1000}) for own in of_learners]
+    agent = HierarchicalAgent(Uniform(specs), learners, specs, is_shared=is_shared)
+    tracked = with_decisions(env)
+    td, num_of_the_other_boat = tracked.reset(), 0
+    shown: list[dict] = [{} for _ in range(8)]
+    for _ in range(40):
+        boats = env.known_boats(env.state)
+        with torch.no_grad():
+            td = agent.policy(td)
+        state = td["directions_12"].unflatten(-1, (2, 2, 3)).mT
+        option = td[keys.OPTION]
+        observed = td[keys.OBSERVATION]
+        if is_shared:
+            observed = torch.cat([observed, torch.nn.functional.one_hot(option, 2)], -1)
+        for row in range(8):
+            if td[keys.EPISODE_STEPS][row] == 0:
+                shown[row] = {}
+            expected = torch.zeros(2, 3, 2)
+            for place, direction in shown[row].items():
+                expected[place] = direction
+            torch.testing.assert_close(state[row], expected, atol=1e-4, rtol=0.0)
+            held = int(option[row])
+            memory = learners[0 if is_shared else held].perception.memory
+            known = ~memory.unknown(memory.features(observed[row], td["directions_12"][row]))
+            num_shown = sum(boat == held for boat, _ in shown[row])
+            assert known.tolist() == [num_shown >= 2 or (held, key) in shown[row] for key in range(3)]
+            num_of_the_other_boat += any(boat != held for boat, _ in shown[row])
+            key = int(td[keys.DISCRETE][row])
+            shown[row][held, key] = boats[held].directions[row, key]
+        _, td = tracked.step_and_maybe_reset(td)
+    assert num_of_the_other_boat > 50
+
+
+def test_one_model_of_both_boats_does_not_see_which_of_them_it_is():
+    specs = PAMDPSpecs.from_env(UnseenBoatsEnv(1, boats=2)).with_option_observed()
+    learner = PETS(specs, **SMALL)
+    state = torch.randn(3, 4, learner.perception.specs.observation_dim)
+    swapped = torch.cat([state[..., :-2], state[..., -2:].flip(-1)], -1)
+    discrete, own = torch.zeros(3, 4, dtype=torch.long), torch.zeros(3, 4, 1)
+    assert torch.equal(learner.model(state, discrete, own).logit, learner.model(swapped, discrete, own).logit)
 
 
 @pytest.mark.parametrize(
@@ -209,6 +258,10 @@ def test_other_settings_remember_no_directions():
             {"revealed": RevealedDirections((2, 3, 4), (0, 2))},
             r"revealed by the entries \(2, 3, 4, 0, 2\), but must be",
         ),
+        (
+            {"revealed": RevealedDirections((2, 3, 4), (0, 1), last_option=1)},
+            r"revealed by the entries \(2, 3, 4, 0, 1, 1\), but must be",
+        ),
     ],
 )
 def test_entries_that_cannot_reveal_directions_are_told_of(changes, misfit):
@@ -223,8 +276,12 @@ RUN += ["eval.layouts=4", "eval.every=192", "log_every=64", "low.updates_per_ste
 RUN += ["low.num_members=2", "low.greedy_samples=8", "low.num_samples=8", "low.horizon=2"]
 
 
-def test_a_run_that_remembers_directions_resumes_to_the_last_bit(tmp_path, monkeypatch):
-    stop_and_resume(RUN, tmp_path, monkeypatch, signal.SIGINT)
+TWO_BOATS = ["env.boats=2", "high=value", "high.untried_first=true", "agent.sharing=shared"]
+
+
+@pytest.mark.parametrize("words", [[], TWO_BOATS], ids=["one boat", "two boats"])
+def test_a_run_that_remembers_directions_resumes_to_the_last_bit(words, tmp_path, monkeypatch):
+    stop_and_resume([*RUN, *words], tmp_path, monkeypatch, signal.SIGINT)
 
 
 QUIET = {

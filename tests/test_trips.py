@@ -27,6 +27,7 @@ from hpamdp.policies.high_level.option_critic import OptionCritic
 from hpamdp.policies.high_level.thompson import Thompson
 from hpamdp.policies.high_level.ucb import UCB
 from hpamdp.policies.high_level.uniform import Uniform
+from hpamdp.policies.high_level.value import Value
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.hppo import HPPO
 from hpamdp.policies.low_level.hsac import HSAC
@@ -430,6 +431,57 @@ def test_a_run_with_a_session_bandit_resumes_to_the_last_bit(high, tmp_path, mon
     stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)
 
 
+# Values of options.
+
+
+@pytest.mark.parametrize("memory", ["gru", "stack"])
+def test_options_are_compared_by_what_the_learner_remembers_of_the_session(memory):
+    torch.manual_seed(0)
+    env = SessionsOfOptions(6, trips=3)
+    specs = PAMDPSpecs.from_env(env)
+    learner = HPPO(specs.with_option_observed(), memory=memory)
+    agent = agent_of([learner], specs, "session", Value(specs, epsilon=0.0), is_shared=True)
+    rolled = played(env, agent, 12)
+    agent.learn(rolled)
+    rolled = played(env, agent, 12)
+    held = rolled[learner.memory_key].roll(1, 1)
+    held[:, [0, 6]] = 0.0  # sessions begin here
+    values = []
+    for option in range(2):
+        seen = torch.cat([rolled[keys.OBSERVATION], torch.eye(2)[option].expand(6, 12, 2)], -1)
+        values.append(learner.value(seen.flatten(0, 1), memory=held.flatten(0, 1)).reshape(6, 12))
+    is_decision = rolled[keys.IS_DECISION].squeeze(-1)
+    assert is_decision.sum() == 6 * 6
+    assert torch.equal(rolled[keys.OPTION][is_decision], torch.stack(values, -1).argmax(-1)[is_decision])
+
+
+@pytest.mark.parametrize("mode", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
+def test_untried_options_of_a_session_come_first(mode):
+    env = HiddenOption(5, trips=4)
+    specs = PAMDPSpecs.from_env(env)
+    selector = Value(specs, epsilon=0.0, untried_first=True)
+    agent = agent_of([HPPO(specs) for _ in range(2)], specs, "session", selector)
+    agent.selector.option_values.forward = lambda observation, *_: torch.tensor([1.0, 0.0]).expand(len(observation), 2)
+    with acting(mode), torch.no_grad():
+        rolled = with_decisions(env).rollout(16, agent.policy, break_when_any_done=False)
+    assert rolled[keys.OPTION].tolist() == [[0, 0, 1, 1, 0, 0, 0, 0] * 2] * 5
+
+
+def test_the_option_after_a_batch_is_chosen_with_what_session_and_learner_remember():
+    torch.manual_seed(0)
+    env = SessionsOfOptions(6, trips=3)
+    specs = PAMDPSpecs.from_env(env)
+    learner = HPPO(specs.with_option_observed(), memory="gru")
+    selector = Value(specs, epsilon=0.0, untried_first=True)
+    agent = agent_of([learner], specs, "session", selector, is_shared=True)
+    rolled = played(env, agent, 12)
+    for last in (1, 3):  # a trip has ended: its session's first, its second
+        batch = rolled[:, : last + 1]
+        assert torch.equal(
+            agent.next_options.with_next_option(batch)[keys.NEXT_OPTION][:, -1], rolled[:, last + 1]["option"]
+        )
+
+
 # Settings.
 
 QUIET = {"total_frames": 256, "num_envs": 8, "steps_per_batch": 16, "eval.every": 0, "eval.layouts": 4}
@@ -488,6 +540,11 @@ def test_an_agent_that_chooses_by_the_rewards_of_a_session_does_not_act_without_
             "boatdock",
             {"high": "ucb", "high.memory": "session"},
             "high.memory=session: episodes of env=boatdock have no trips",
+        ),
+        (
+            "boatdock",
+            {"high": "value", "high.untried_first": True},
+            "high.untried_first=true: episodes of env=boatdock have no trips; use high.untried_first=false",
         ),
         (HiddenOption, {"high": "exp3", "high.memory": "session"}, "high.memory=.session.: must be"),
         (HiddenOption, {"low.freeze": True}, "low.freeze=true: plays whole episodes"),
@@ -561,4 +618,13 @@ def test_a_selector_with_a_memory_uses_in_later_trips_what_an_earlier_one_has_sh
     settings = {**SCORED, "steps_per_batch": 48, "total_frames": 12_288, "high.memory": memory}
     settings |= {"agent.values_end": "trip"}  # what to choose in a trip changes nothing for later ones
     agent = hpamdp.train({"name": HiddenOption, "trips": 3}, low="random", high=high, **settings)
+    assert agent.evaluate(episodes=500)["return"] == pytest.approx(best, abs=0.4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("memory", "best"), [("gru", 4.0), ("none", 2.0)])
+def test_a_learner_with_a_memory_tells_which_option_is_best_in_later_trips(memory, best):
+    settings = {**SCORED, "steps_per_batch": 48, "total_frames": 49_152, "low.memory": memory}
+    settings |= {"agent.values_end": "trip", "agent.sharing": "shared", "high.epsilon": 0.3}
+    agent = hpamdp.train({"name": HiddenOption, "trips": 3}, low="hppo", high="value", **settings)
     assert agent.evaluate(episodes=500)["return"] == pytest.approx(best, abs=0.4)

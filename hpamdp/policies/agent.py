@@ -138,15 +138,21 @@ class OptionValues(nn.Module):
     Args:
         learners: one for each option, or a single one that observes the option.
         num_options: how many options there are.
+
+    Attributes:
+        memory_key: key of what the learners remember of the episode, and value states by; None if they remember
+            nothing, or nothing from before an option.
     """
 
     def __init__(self, learners: Sequence[Learner], num_options: int) -> None:
         super().__init__()
         self.learners = nn.ModuleList(learners)
         self.num_options = num_options
+        memory_keys = {each.memory_key if each.memory_lasts_an_episode else None for each in learners}
+        self.memory_key = memory_keys.pop() if len(memory_keys) == 1 else None
 
     @torch.no_grad()
-    def forward(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+    def forward(self, observation: Tensor, action_mask: Tensor | None = None, memory: Tensor | None = None) -> Tensor:
         """Return the values `[N, num_options]` of observations `[N, observation_dim]`.
 
         While exploring, the value is infinite if its learner has made no update yet.
@@ -154,15 +160,16 @@ class OptionValues(nn.Module):
         Args:
             observation: of the states.
             action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
+            memory: what the learners remember of the steps before, `[N, size]`. If None, nothing.
         """
-        masks = () if action_mask is None else (action_mask,)
         if len(self.learners) == self.num_options:
-            return torch.stack([_exploring_value(each, observation, *masks) for each in self._learners()], -1)
+            values = [_exploring_value(each, observation, action_mask, memory) for each in self._learners()]
+            return torch.stack(values, -1)
         (learner,) = self._learners()
         values = []
         for one_hot in torch.eye(self.num_options, device=observation.device, dtype=torch.float32):
             seen = torch.cat([observation, one_hot.expand(observation.shape[0], -1)], -1)
-            values.append(_exploring_value(learner, seen, *masks))
+            values.append(_exploring_value(learner, seen, action_mask, memory))
         return torch.stack(values, -1)
 
     def _learners(self) -> Iterator[Learner]:
@@ -171,11 +178,14 @@ class OptionValues(nn.Module):
             yield learner
 
 
-def _exploring_value(learner: Learner, observation: Tensor, *masks: Tensor) -> Tensor:
+def _exploring_value(
+    learner: Learner, observation: Tensor, action_mask: Tensor | None, memory: Tensor | None
+) -> Tensor:
     """Return a learner's values `[N]` of observations `[N, *]`; infinite if exploring before its first update."""
     if not is_greedy() and learner.is_untrained():
         return torch.full_like(observation[:, 0], torch.inf, dtype=torch.float32)
-    return learner.value(observation, *masks)
+    masks = () if action_mask is None else (action_mask,)
+    return learner.value(observation, *masks, **({} if memory is None else {"memory": memory}))
 
 
 def _value(
@@ -350,8 +360,8 @@ class AgentNextOptions:
         next_option = torch.where(is_ended, option.roll(-1, -1), option)
         if is_missing.any():
             states = batch.get("next")[is_missing]
-            if self.selector.memory_key is not None:
-                states = states.copy().set(self.selector.memory_key, batch.get(self.selector.memory_key)[is_missing])
+            remembered = batch.select(*self.selector.remembered_keys)[is_missing]
+            states = states.copy().update(remembered)
             next_option[is_missing] = self.greedy(states, option[is_missing])
         return batch.copy().set(keys.NEXT_OPTION, next_option)
 
@@ -435,7 +445,7 @@ class HierarchicalAgent(nn.Module):
                 held: list[NestedKey] = [(keys.HELD, key) for key in selector.out_keys]
                 self.policy.out_keys = [*self.policy.out_keys, *held]
             if selector.asks_learners:
-                selector.option_values = OptionValues(learners, specs.num_options)
+                selector.take_option_values(OptionValues(learners, specs.num_options))
             self.next_options = AgentNextOptions(selector, learners, specs.num_options, is_shared, self.pairs)
             for learner in learners:
                 learner.next_options = self.next_options

@@ -264,8 +264,9 @@ class Selector(Level, TensorDictModuleBase):
 
     Attributes:
         asks_learners: whether the selector needs `option_values`.
-        option_values: maps observations `[N, observation_dim]` and the states' action masks, or None, to the learners'
-            values of each option, `[N, num_options]`. The agent sets it if `asks_learners`.
+        option_values: maps observations `[N, observation_dim]`, the states' action masks and what the learners remember
+            of the steps before, each or None, to the learners' values of each option, `[N, num_options]`. The agent
+            gives it if `asks_learners`.
         gamma: discount of an environment step, whatever the length of the options. It discounts `option_return` and
             the value of the next decision, see `next_discount`.
         ends_options: whether the selector can decide where options end, by `ends`.
@@ -323,6 +324,15 @@ class Selector(Level, TensorDictModuleBase):
         Override it instead of `select` if there is more to return than the option.
         """
         return {keys.OPTION: self.select(td)}
+
+    @property
+    def remembered_keys(self) -> list[str]:
+        """The keys of a step whose values, left from the step before, a decision depends on."""
+        return [] if self.memory_key is None else [self.memory_key]
+
+    def take_option_values(self, option_values: nn.Module) -> None:
+        """Compare the learners' values of the options from now on, if the selector `asks_learners`."""
+        self.option_values = option_values
 
     def option_probabilities(self, td: TensorDictBase) -> Tensor | None:
         """Return the probabilities of the options at a decision, `[*B, num_options]`; None if one is chosen for sure.
@@ -503,6 +513,7 @@ class Learner(Level, nn.Module):
             `specs.to_unit`.
         value_setting: setting that must be true for `value` to work. If None, `value` always works.
         memory_key: key of the memory's state in a step, if the policy and `value` have a memory; else None.
+        memory_lasts_an_episode: whether that memory remembers the whole episode, and not the option alone.
         remembers_directions: whether the learner remembers the directions of actions that a problem reveals, unless it
             has another memory or `augment=false`.
         counts_durations: whether discounts are those of `step_discounts`. A run warns if the environment writes
@@ -529,6 +540,7 @@ class Learner(Level, nn.Module):
     takes: ClassVar[frozenset[ActionFeature]] = frozenset()
     value_setting: ClassVar[str | None] = None
     memory_key: str | None = None
+    memory_lasts_an_episode: bool = False
     remembers_directions: ClassVar[bool] = False
     counts_durations: ClassVar[bool] = False
     exploring_keys: ClassVar[frozenset[str]] = frozenset()

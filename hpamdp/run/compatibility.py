@@ -205,11 +205,15 @@ def selector_values_have_a_selector(config: Config) -> str | None:
     return f"agent.selector_values_end={values_end}: {config.high} has no values; use agent.values_end={values_end}"
 
 
-def session_rewards_need_trips(config: Config) -> str | None:
-    """Refuse a bandit's `high.memory=session` for episodes without trips."""
-    if config.high.settings.get("memory") != "session" or has_trips(config):
+def what_counts_trips_has_trips(config: Config) -> str | None:
+    """Refuse what counts a session's trips for episodes without trips."""
+    if has_trips(config):
         return None
-    return f"high.memory=session: episodes of {config.env} have no trips; use all, discounted or sliding_window"
+    if config.high.settings.get("memory") == "session":
+        return f"high.memory=session: episodes of {config.env} have no trips; use all, discounted or sliding_window"
+    if config.high.settings.get("untried_first") is True:
+        return f"high.untried_first=true: episodes of {config.env} have no trips; use high.untried_first=false"
+    return None
 
 
 def sessions_are_played_here(config: Config) -> str | None:
@@ -365,13 +369,8 @@ def selectors_remember_several_decisions(config: Config) -> str | None:
 
 
 def memories_have_values(config: Config) -> str | None:
-    """Refuse to value options without the memory on which the value depends."""
-    low, run = config.low, config.run.agent
-    if _memory(low) is not None and run.sharing == "shared" and getattr(config.high.cls, "asks_learners", False):
-        return (
-            f"{config.high}: agent.sharing=shared with low.memory={_memory(low)} has values only of what the policy "
-            "remembers; use agent.sharing=per_option or low.memory=none"
-        )
+    """Refuse learners that value each other's states by different memories."""
+    run = config.run.agent
     settings = "memory", "memory_size", "stack_steps"
     memories = {tuple(each.settings[name] for name in settings if _memory(each)) for each in config.learners}
     if (run.termination != "episode" or has_trips(config)) and len(memories) > 1:
@@ -614,7 +613,7 @@ RULES: tuple[Rule, ...] = (
     callbacks_have_evaluations,
     values_end_where_there_are_trips,
     selector_values_have_a_selector,
-    session_rewards_need_trips,
+    what_counts_trips_has_trips,
     sessions_are_played_here,
     explorations_have_steps,
     learners_take_the_exploration,

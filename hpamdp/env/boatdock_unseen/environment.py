@@ -183,13 +183,11 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
 
     @property
     def geometry(self) -> PlaneGeometry | None:
-        """The places and displacements, and what reveals where the keys push; None with two boats.
+        """The places and displacements, and what reveals where the keys of each boat push.
 
         A mirrored boat is as likely as the boat itself, so the mirror holds for all families. Every press begins at
         rest, so the velocity does not matter. The start affects only the distance.
         """
-        if self._chooses:
-            return None  # what the last press shows holds for one of the boats
         names = ["start_x", "start_y", "velocity_x", "velocity_y", "trip", "boat", "last_boat", "last_key_1"]
         names += ["last_key_2", "last_key_3", "last_duration", "moved_x", "moved_y", "last_score"]
         if self.rules.sensor_noise == 0.0:
@@ -202,7 +200,9 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
                 last_action=tuple(entry[f"last_key_{number}"] for number in range(1, task.NUM_KEYS + 1)),
                 moved=(entry["moved_x"], entry["moved_y"]),
                 sums_to_zero=self.options.family != "any",
+                last_option=entry["last_boat"] if self._chooses else None,
             ),
+            num_contexts=self.options.boats,
             kinds=(0,) * task.NUM_KEYS,
             has_mirror=True,
             redundant=tuple(entry[name] for name in names),

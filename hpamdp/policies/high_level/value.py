@@ -1,7 +1,8 @@
 """The option with the highest value by its learner's own estimate. The selector itself learns nothing.
 
 A learner's critic, or its plan in a learned model, predicts the value of a state under each option before any option
-was chosen there. Bandits need thousands of decisions to learn as much.
+was chosen there. Bandits need thousands of decisions to learn as much. If the learners remember the episode, so do
+their values.
 
 Source: the greedy policy over option values of Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, Artificial
 Intelligence 112. While exploring, the value of PETS without `end_values` is that of a random member of its ensemble.
@@ -13,11 +14,12 @@ Differs from the source: while exploring, options whose learner has made no upda
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
@@ -26,18 +28,30 @@ from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.settings import Fraction, Settings
 from hpamdp.specs import PAMDPSpecs
 
+# Which options the session has tried before a decision, bool `[*B, num_options]`.
+SESSION_TRIED = "session_tried"
+
 
 class ValueOptions(Settings):
     """Settings of `Value`."""
 
     epsilon: Fraction = 0.05
     """Probability of a random option while exploring."""
+    untried_first: bool = False
+    """In sessions of trips: choose an option that the session has not tried yet before all others, also greedily.
+
+    What an option shows on its first trip is worth most on later ones, which the value of a trip does not count.
+    """
 
 
 class Value(Selector):
-    """Choose the option with the highest value; while exploring, some options are random."""
+    """Choose the option with the highest value; while exploring, some options are random.
+
+    With `untried_first`, which options its session has tried travels in the tensordict, as the choice does.
+    """
 
     Options = ValueOptions
+    learners_memory_key: str | None = None
     asks_learners = True
     takes_pictures = True
 
@@ -46,10 +60,56 @@ class Value(Selector):
         self.options: ValueOptions = ValueOptions.of(options, settings)
         if specs.has_action_mask:
             self.in_keys.append(keys.ACTION_MASK)
+        if self.options.untried_first:
+            self.memory_key = SESSION_TRIED
+            self.in_keys += [keys.EPISODE_STEPS, SESSION_TRIED]
+            self.out_keys.append(SESSION_TRIED)
+            self.export_refusal = f"remembers {SESSION_TRIED}"
+
+    def take_option_values(self, option_values: nn.Module) -> None:
+        """Compare these values; if they depend on what the learners remember, read that as well."""
+        super().take_option_values(option_values)
+        self.learners_memory_key = cast("str | None", option_values.memory_key)
+        if self.learners_memory_key is not None:
+            self.in_keys += [key for key in (keys.EPISODE_STEPS, self.learners_memory_key) if key not in self.in_keys]
+            self.export_refusal = f"compares values that depend on {self.learners_memory_key}"
+
+    @property
+    def remembered_keys(self) -> list[str]:
+        """The key of what the session has tried, and that of what the learners remember."""
+        of_learners = [] if self.learners_memory_key is None else [self.learners_memory_key]
+        return super().remembered_keys + of_learners
+
+    def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return the options `[*B]` and, with `untried_first`, what the session has tried before them."""
+        if not self.options.untried_first:
+            return super().choose(td)
+        tried = self._tried(td)
+        is_open = ~tried if (mask := td.get(keys.OPTION_MASK, None)) is None else mask & ~tried
+        option = torch.where(is_open.any(-1), is_open.long().argmax(-1), self._best(td, ~is_open.any(-1)))
+        return {keys.OPTION: option, SESSION_TRIED: tried}
+
+    def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return uniformly random options `[*B]` and, with `untried_first`, what the session has tried before them."""
+        chosen = super().choose_uniformly(td)
+        return {**chosen, SESSION_TRIED: self._tried(td)} if self.options.untried_first else chosen
+
+    def _tried(self, td: TensorDictBase) -> Tensor:
+        """Return which options the session has tried before a decision, the last option included."""
+        before, option = td.get(SESSION_TRIED, None), td.get(keys.OPTION, None)
+        if before is None or option is None:
+            shape = *td.batch_size, self.specs.num_options
+            return torch.zeros(shape, dtype=torch.bool, device=td.get(keys.OBSERVATION).device)
+        goes_on = td.get(keys.EPISODE_STEPS) > 0
+        return goes_on & (before | F.one_hot(option, self.specs.num_options).bool())
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return an option for every environment, int64 `[*B]`; 0 if no decision is due or the episode has ended."""
-        is_decision = td.get(keys.IS_DECISION).squeeze(-1)
+        return self._best(td, torch.ones(td.batch_size, dtype=torch.bool, device=td.get(keys.OBSERVATION).device))
+
+    def _best(self, td: TensorDictBase, is_asked: Tensor) -> Tensor:
+        """Return what `select` does where `is_asked`, bool `[*B]`, and 0 elsewhere."""
+        is_decision = is_asked & td.get(keys.IS_DECISION).squeeze(-1)
         done = td.get(keys.DONE, None)
         if done is not None:  # evaluations also step episodes that have ended, and planning for them takes time
             is_decision = is_decision & ~done.squeeze(-1)
@@ -60,7 +120,9 @@ class Value(Selector):
             None if mask is None else mask[is_decision]
             for mask in (td.get(keys.ACTION_MASK, None), td.get(keys.OPTION_MASK, None))
         )
-        value = self._values(td.get(keys.OBSERVATION)[is_decision], action_mask, option_mask)
+        memory = self._learners_memory(td)
+        memory = None if memory is None else memory[is_decision]
+        value = self._values(td.get(keys.OBSERVATION)[is_decision], action_mask, option_mask, memory)
         if is_greedy():
             best = value.argmax(-1)
         else:
@@ -77,6 +139,18 @@ class Value(Selector):
         names = keys.OBSERVATION, keys.ACTION_MASK, keys.OPTION_MASK
         return lambda td: self._values(*(td.get(name, None) for name in names)).argmax(-1)
 
-    def _values(self, observation: Tensor, action_mask: Tensor | None, option_mask: Tensor | None) -> Tensor:
+    def _learners_memory(self, td: TensorDictBase) -> Tensor | None:
+        """Return what the learners remember of the episode's steps before, `[*B, size]`; None if nothing."""
+        memory = None if self.learners_memory_key is None else td.get(self.learners_memory_key, None)
+        return None if memory is None else torch.where(td.get(keys.EPISODE_STEPS) > 0, memory, 0.0)
+
+    def _values(
+        self,
+        observation: Tensor,
+        action_mask: Tensor | None,
+        option_mask: Tensor | None,
+        memory: Tensor | None = None,
+    ) -> Tensor:
         """Return the value of each option, `[N, num_options]`, -inf where it is forbidden."""
-        return masked_values(self.option_values(observation, action_mask), option_mask)
+        remembered = () if memory is None else (memory,)
+        return masked_values(self.option_values(observation, action_mask, *remembered), option_mask)

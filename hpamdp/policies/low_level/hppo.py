@@ -173,6 +173,7 @@ class HPPO(OnPolicy, Learner):
         self.options: HPPOOptions = options
         self.perception = Perception(specs, options)
         self.memory_key = self.perception.memory_key
+        self.memory_lasts_an_episode = self.perception.lasts_an_episode
         actor = AutoregressiveActor if options.autoregressive else HybridActor
         self.actor = actor(
             self.perception.specs,

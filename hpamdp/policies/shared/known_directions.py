@@ -20,12 +20,13 @@ _SHORTEST_SUM = 1e-3  # of the known directions, if its opposite is to be the gu
 class KnownDirections(nn.Module):
     """Remembers where each of K discrete actions moved when it was last taken in the episode.
 
-    The state `[*B, 2 K]` has x of all actions, then y: unit vectors, or zeros for an action that was not taken yet.
+    The state `[*B, O 2 K]` has x of all actions, then y: unit vectors, or zeros for an action that was not taken yet.
+    If each option has directions of its own, O is the number of options, one after another; else it is 1.
 
-    The features `[*B, 3 K + entries]` begin with a table: x of all directions, y of all directions, and the certainty
-    of all. The direction of an action that was not taken yet is guessed. It is the opposite of the known directions'
-    sum, or +x if nothing is known. The certainty is 1 for a known direction. For a guess it rises from -1 with the
-    share of actions that are known. The entries of the observation that are not redundant follow.
+    The features `[*B, 3 K + entries]` begin with a table of the held option: x of all directions, y of all directions,
+    and the certainty of all. The direction of an action that was not taken yet is guessed. It is the opposite of the
+    known directions' sum, or +x if nothing is known. The certainty is 1 for a known direction. For a guess it rises
+    from -1 with the share of actions that are known. The entries of the observation that are not redundant follow.
 
     Args:
         specs: of the problem, whose geometry says what reveals the directions.
@@ -47,7 +48,11 @@ class KnownDirections(nn.Module):
         revealed = specs.geometry.revealed
         self.num_actions = specs.num_discrete
         self.sums_to_zero = revealed.sums_to_zero
-        self.size = 2 * self.num_actions
+        self.num_options = 1 if revealed.last_option is None else specs.num_options
+        self.last_option = revealed.last_option
+        self.held_option = specs.held_option
+        self.geometry = specs.geometry
+        self.size = 2 * self.num_actions * self.num_options
         self.table_size = 3 * self.num_actions
         self.num_features = self.table_size + len(specs.telling_entries)
         self.name = f"directions_{self.size}"
@@ -60,13 +65,29 @@ class KnownDirections(nn.Module):
         moved = seen[..., self.moved]
         length = moved.norm(dim=-1, keepdim=True)
         is_shown = (seen[..., self.last_action] > 0.5) & (length > _SHORTEST)
-        unit = moved / length.clamp(min=_SHORTEST)
-        parts = zip(unit.split(1, -1), held.chunk(2, -1), strict=True)
-        return torch.cat([torch.where(is_shown, new, old) for new, old in parts], -1)
+        unit = (moved / length.clamp(min=_SHORTEST)).unsqueeze(-1)
+        states = held.unflatten(-1, (self.num_options, 2, self.num_actions)).unbind(-3)
+        if self.last_option is None:
+            of_options = [is_shown]
+        else:
+            last = seen[..., [self.last_option]].round()
+            of_options = [is_shown & (last == option) for option in range(self.num_options)]
+        parts = zip(of_options, states, strict=True)
+        return torch.stack([torch.where(shown.unsqueeze(-2), unit, old) for shown, old in parts], -3).flatten(-3)
 
     def features(self, seen: Tensor, state: Tensor) -> Tensor:
         """Return the features `[*B, num_features]` of observations and the states after them."""
-        return torch.cat([self.table(state), self.telling(seen)], -1)
+        return torch.cat([self.table(self.under_held_option(seen, state)), self.telling(seen)], -1)
+
+    def under_held_option(self, seen: Tensor, state: Tensor) -> Tensor:
+        """Return the part `[*B, 2 K]` of states that belongs to the options held in observations `[*B, *]`."""
+        if self.num_options == 1:
+            return state
+        of_options = state.unflatten(-1, (self.num_options, -1))
+        if self.held_option is not None:
+            return of_options[..., self.held_option, :]
+        assert self.geometry is not None
+        return of_options.take_along_dim(self.geometry.context(seen)[..., None, None], -2).squeeze(-2)
 
     def telling(self, seen: Tensor) -> Tensor:
         """Return observations `[*B, observation_dim]` without their redundant entries."""
@@ -106,7 +127,7 @@ class KnownDirections(nn.Module):
         return torch.cat([*direction.unbind(-1), torch.ones_like(angle), others], -1)
 
     def table(self, state: Tensor) -> Tensor:
-        """Return x, y and certainty of all directions, `[*B, 3 K]`."""
+        """Return x, y and certainty of all directions `[*B, 3 K]`, given what is known of an option's, `[*B, 2 K]`."""
         x, y = state.chunk(2, -1)
         is_known = (x != 0.0) | (y != 0.0)
         num_known = is_known.sum(-1, keepdim=True)

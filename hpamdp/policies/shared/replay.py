@@ -134,6 +134,7 @@ class ReplayLearner(Learner):
         self.perception = Perception(self.specs, options, knows_directions=knows_directions)
         self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
         self.memory_key = self.perception.memory_key
+        self.memory_lasts_an_episode = self.perception.lasts_an_episode
         if self.perception.is_recurrent:
             self.links = HistoryLinks()
             self.burn_in = options.burn_in

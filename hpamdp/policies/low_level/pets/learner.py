@@ -243,7 +243,7 @@ class PETS(ReplayLearner):
             states, certainty = [stored["state"], stored["next_state"]], None
             memory = self.perception.memory
             if isinstance(memory, KnownDirections):
-                table = memory.table(self.buffer[:]["memory"])
+                table = memory.table(memory.under_held_option(stored["state"], self.buffer[:]["memory"]))
                 direction, certainty = frame.revealed_direction(table, stored["discrete"])
                 states = [memory.telling(state) for state in states]
             else:
