@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import ClassVar
 
 import gymnasium
 import numpy as np
@@ -421,20 +422,64 @@ def test_a_factory_that_returns_the_same_environment_twice_is_refused():
         hpamdp.train(lambda: same, **OWN)
 
 
-def test_environments_of_a_refused_run_are_closed():
-    open_envs = []
+class Counted(Reach):
+    """Knows which of its objects are open."""
 
-    class Counted(Reach):
-        def __init__(self):
-            open_envs.append(self)
+    open_envs: ClassVar[list[Counted]] = []
 
-        def close(self):
-            open_envs.remove(self)
+    def __init__(self):
+        self.open_envs.append(self)
 
+    def close(self):
+        self.open_envs.remove(self)
+
+
+@pytest.fixture
+def open_envs():
+    Counted.open_envs.clear()
+    yield Counted.open_envs
+    Counted.open_envs.clear()
+
+
+def test_environments_of_a_refused_run_are_closed(open_envs):
     with pytest.raises(hpamdp.ConfigError, match="first update comes after"):
         hpamdp.train(Counted, **{**OWN, "total_frames": 8, "num_envs": 4, "steps_per_batch": 2})
     agent = hpamdp.train(Counted, **OWN)
     agent.evaluate(episodes=3)
+    assert not open_envs
+
+
+WRONG_OPTION = {"max_steps": 5, "grouping": {"all": [7]}}
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda agent: hpamdp.make(Counted, 3, **WRONG_OPTION),
+        lambda agent: hpamdp.make(Counted, 3),  # without a limit of steps
+        lambda agent: hpamdp.make(Counted, 3, max_steps=5, observation_keys=["x"]),
+        lambda agent: hpamdp.make(Counted, 3, max_steps=5, raw_observations=[7]),
+        lambda agent: hpamdp.train({"name": Counted, **WRONG_OPTION}, low="hppo", **TINY),
+        lambda agent: hpamdp.train(Counted, low={"name": "hppo", "value_symmetry": True}, **TINY, max_steps=5),
+        lambda agent: hpamdp.load(agent, env=Counted),  # another problem than that of the agent
+        lambda agent: hpamdp.load(agent).evaluate({"name": Counted, "max_steps": 5}, 3),
+    ],
+)
+def test_environments_are_closed_after_an_error(call, open_envs):
+    with pytest.raises(ValueError):
+        call("hppo_platform")
+    assert not open_envs
+
+
+def test_all_environments_are_closed_if_closing_one_fails(open_envs):
+    class Fails(Counted):
+        def close(self):
+            super().close()
+            raise RuntimeError("window lost")
+
+    env = hpamdp.make(Fails, 3, max_steps=5)
+    with pytest.raises(RuntimeError, match="window lost"):
+        env.close()
     assert not open_envs
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -261,9 +262,8 @@ class Agent:
             ConfigError: the problem has other sizes.
         """
         config = self._config.with_problem(env)
-        built = make_env(config, 1, self._env.device, config.run.seed)
-        specs = PAMDPSpecs.from_env(built)
-        built.close()
+        with closing(make_env(config, 1, self._env.device, config.run.seed)) as built:
+            specs = PAMDPSpecs.from_env(built)
         if specs != self.specs:
             both = [(each.name, getattr(specs, each.name), getattr(self.specs, each.name)) for each in fields(specs)]
             name, theirs, ours = next(each for each in both if each[1] != each[2])

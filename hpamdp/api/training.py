@@ -29,6 +29,7 @@ from hpamdp.config.components import TARGET
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching
 from hpamdp.config.schema import RESUME_AUTO
+from hpamdp.env.errors import closed_on_error
 from hpamdp.messages import reason_of, say, warn
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
@@ -256,8 +257,9 @@ def load(
         _check_problem(file, words)
     with _torch_restored(), problems_explained():
         loaded = load_agent(str(file), words, arguments.objects)
-    rows = read_rows(file.parent / METRICS_NAME)
-    return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, rows)
+    with closed_on_error(loaded.env):
+        rows = read_rows(file.parent / METRICS_NAME)
+        return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, rows)
 
 
 def _names_of_problem(file: Path, arguments: Arguments, config_dirs: Sequence[str | Path]) -> list[str]:

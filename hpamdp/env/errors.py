@@ -1,10 +1,13 @@
-"""Errors of problems, and whose fault they are: the problem's contract, or the code of a third-party environment."""
+"""Errors of problems: whose fault they are, the problem's or a third-party environment's, and what they leave open."""
 
 from __future__ import annotations
 
 import os
 import sysconfig
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
 
 from hpamdp.messages import one_line
 
@@ -32,6 +35,23 @@ class EnvironmentFaultError(RuntimeError):
     def __str__(self) -> str:
         """Return the line."""
         return self.line
+
+
+class Closable(Protocol):
+    """What can be closed, such as an environment."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
+@contextmanager
+def closed_on_error(environment: Closable) -> Iterator[None]:
+    """Close an environment if the block raises an error: it may have processes, files or a window."""
+    try:
+        yield
+    except BaseException:
+        environment.close()
+        raise
 
 
 def fault_of(error: Exception, what: str) -> EnvironmentFaultError | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.errors import DataError
 from hpamdp.env.base import PAMDPEnv, checked_option_names
 from hpamdp.env.decisions import OptionLength, with_decisions
+from hpamdp.env.errors import closed_on_error
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.messages import first_line, warn
@@ -76,11 +77,8 @@ def assemble(config: Config) -> AssembledRun:
     device = run.resolve_device()
     capacity.check_run(run, device, lambda: make_env(config, 1, device, run.seed))
     env = make_env(config, run.num_envs, device, run.seed)
-    try:
+    with closed_on_error(env):
         return _assemble(config, env, device)
-    except BaseException:
-        env.close()
-        raise
 
 
 def _assemble(config: Config, env: PAMDPEnv, device: torch.device) -> AssembledRun:
@@ -97,9 +95,8 @@ def _assemble(config: Config, env: PAMDPEnv, device: torch.device) -> AssembledR
     if is_new and run.low.checkpoint is not None:
         checkpoint.load_learners(checkpoint.find(run.low.checkpoint, "low.checkpoint"), agent, device)
     capacity.check_length(config, agent, with_learners(config, agent))
-    evaluation = make_evaluation(config, env)
     tracked, policy = acting(env, agent, config)
-    return AssembledRun(tracked, policy, agent, evaluation, data, device)
+    return AssembledRun(tracked, policy, agent, make_evaluation(config, env), data, device)
 
 
 def make_env(config: Config, num_envs: int, device: torch.device, seed: int, first_env: int = 0) -> PAMDPEnv:
@@ -129,15 +126,16 @@ def grouped(env: PAMDPEnv, config: Config) -> PAMDPEnv:
     """Return the environment with the options of `env.grouping`, if it is set.
 
     Raises:
-        ConfigError: names of options are wrong, or the environment refuses the grouping.
+        ConfigError: names of options are wrong, or the environment refuses the grouping; it is closed then.
     """
-    env.option_names = checked_option_names(env.option_names)
-    grouping = config.run.env.grouping
-    if grouping is not None:
-        try:
-            env.group_actions(grouping if isinstance(grouping, dict) else env.default_options)
-        except ValueError as error:
-            raise ConfigError(f"env.grouping: {first_line(error)} ({config.env})") from error
+    with closed_on_error(env):
+        env.option_names = checked_option_names(env.option_names)
+        grouping = config.run.env.grouping
+        if grouping is not None:
+            try:
+                env.group_actions(grouping if isinstance(grouping, dict) else env.default_options)
+            except ValueError as error:
+                raise ConfigError(f"env.grouping: {first_line(error)} ({config.env})") from error
     return env
 
 
@@ -190,8 +188,8 @@ def choose_selector(config: Config, words: Sequence[str] = ()) -> Config:
     facts = compatibility.facts_of(config)
     if facts is None:
         env = make_env(config, 1, torch.device("cpu"), config.run.seed)
-        facts = _facts_of_built(env)
-        env.close()
+        with closing(env):
+            facts = _facts_of_built(env)
     return compatibility.with_selector(config, facts, words)
 
 
@@ -329,9 +327,10 @@ def make_evaluation(
     The first `filmed_steps` steps of the first `num_filmed` episodes are filmed, or none with `film=false`.
     """
     test_env = make_env(config, config.run.eval.layouts, env.device, seed=0)
-    test_env.set_scaling_from(env)
-    num_filmed = num_filmed if config.run.film else 0
-    return Evaluation(_with_decisions(test_env, config), config.run.eval.seed, num_filmed, filmed_steps)
+    with closed_on_error(test_env):
+        test_env.set_scaling_from(env)
+        num_filmed = num_filmed if config.run.film else 0
+        return Evaluation(_with_decisions(test_env, config), config.run.eval.seed, num_filmed, filmed_steps)
 
 
 def acting(env: PAMDPEnv, agent: HierarchicalAgent, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import torch
 
@@ -40,10 +40,9 @@ def check_run(run: RunConfig, device: torch.device, build_one: Callable[[], PAMD
     num_steps = 0 if run.mode != "train" else run.num_envs * run.steps_per_batch
     if max(run.num_envs, num_steps, run.eval.layouts) < _MANY:
         return
-    one = build_one()
-    step = one.fake_tensordict().bytes()
-    path = 0 if one.position is None else 8 * one.max_steps
-    one.close()
+    with closing(build_one()) as one:
+        step = one.fake_tensordict().bytes()
+        path = 0 if one.position is None else 8 * one.max_steps
     needs = {
         f"num_envs={run.num_envs}": run.num_envs * step,
         f"num_envs={run.num_envs}, steps_per_batch={run.steps_per_batch}": num_steps * step,

@@ -15,6 +15,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching, word
 from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.errors import closed_on_error
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import check_built, choose_selector, make_agent, make_env, make_evaluation
@@ -109,7 +110,8 @@ def load_player(path: str | None, settings: Sequence[str]) -> Player:
     """
     loaded = load_agent(path, settings)
     num_filmed = loaded.config.run.eval.layouts
-    evaluation = make_evaluation(loaded.config, loaded.env, num_filmed=num_filmed, filmed_steps=None)
+    with closed_on_error(loaded.env):
+        evaluation = make_evaluation(loaded.config, loaded.env, num_filmed=num_filmed, filmed_steps=None)
     return Player(loaded.config, loaded.agent, evaluation)
 
 
@@ -136,11 +138,12 @@ def load_agent(path: str | None, settings: Sequence[str], objects: Mapping[str, 
         torch.manual_seed(config.run.seed)
         device = config.run.resolve_device()
         env = make_env(config, 1, device, config.run.seed)
-        check_built(config, env)
-        agent = make_agent(config, PAMDPSpecs.from_env(env), device)
-        if source is None:
-            return LoadedAgent(config, agent, env, {})
-        check_saved_options(config, env)
-        saved = checkpoint.load(source, agent, device, with_training=False)
-        saved.set_statistics(env)
-        return LoadedAgent(config, agent, env, saved.progress)
+        with closed_on_error(env):
+            check_built(config, env)
+            agent = make_agent(config, PAMDPSpecs.from_env(env), device)
+            if source is None:
+                return LoadedAgent(config, agent, env, {})
+            check_saved_options(config, env)
+            saved = checkpoint.load(source, agent, device, with_training=False)
+            saved.set_statistics(env)
+            return LoadedAgent(config, agent, env, saved.progress)

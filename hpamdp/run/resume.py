@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -178,11 +179,11 @@ def _option_names(progress: Mapping[str, Any], where: str, source: str) -> tuple
         config = read_saved(progress["config"], {"mode": "train", "resume": None, "checkpoint": None})
         if config.env.cls is None or not config.env.cls.__module__.startswith("hpamdp."):
             raise ConfigError(f"{config.env}: not a problem of this package")
-        env = make_env(config, 1, torch.device("cpu"), 0)
+        with closing(make_env(config, 1, torch.device("cpu"), 0)) as env:
+            return env.option_names if env.has_choice else ()
     except ConfigError as error:
         warn(f"{where}={source}: its options cannot be compared with those of the environment ({error})")
         return ()
-    return env.option_names if env.has_choice else ()
 
 
 def _changes(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:

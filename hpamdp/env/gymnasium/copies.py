@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
 
-from hpamdp.env.errors import EnvironmentFaultError, ProblemError, fault_of
+from hpamdp.env.errors import EnvironmentFaultError, ProblemError, closed_on_error, fault_of
 from hpamdp.env.gymnasium.action_spaces import ActionForm, ActionSpace, OptionSpace, written
 from hpamdp.env.gymnasium.contract import ContractCheck, checked_step, refuse_step
 from hpamdp.env.gymnasium.leaves import OutOfBounds
@@ -139,7 +140,14 @@ class Copies:
     ) -> None:
         self._name = name
         self._first = first
-        self.envs = [make() for _ in range(num)]
+        self.envs: list[gymnasium.Env] = []
+        with closed_on_error(self):
+            for _ in range(num):
+                self.envs.append(make())
+            self._read(num, reading)
+
+    def _read(self, num: int, reading: Reading) -> None:
+        """Read the spaces, and set up what each step needs."""
         self._check_spaces()
         try:
             self.example = self.envs[0]
@@ -159,7 +167,7 @@ class Copies:
                 space, entries, reading.out_of_bounds, flattens_pictures=reading.flattens_pictures
             )
         except ValueError as error:
-            raise SettingError(f"{name}: {error}") from error
+            raise SettingError(f"{self._name}: {error}") from error
         self.option_names = getattr(self.envs[0].unwrapped, "option_names", ())
         self.has_pictures = self.envs[0].render_mode == "rgb_array"
         self.pictures_per_second = _rate_of(self.envs[0])
@@ -348,9 +356,10 @@ class Copies:
         raise fault from error
 
     def close(self) -> None:
-        """Close the copies."""
-        for env in self.envs:
-            env.close()
+        """Close the copies, all of them even if one raises an error."""
+        with ExitStack() as stack:
+            for env in self.envs:
+                stack.callback(env.close)
 
 
 def _rate_of(env: gymnasium.Env) -> float:

@@ -20,6 +20,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Un
 from hpamdp import keys
 from hpamdp.env.actions import check_action_values, invalid_action
 from hpamdp.env.base import PAMDPEnv, ProblemError, checked_option_names
+from hpamdp.env.errors import closed_on_error
 from hpamdp.env.gymnasium.action_spaces import ActionForm
 from hpamdp.env.gymnasium.copies import Copies, Reading
 from hpamdp.env.gymnasium.form import OwnForm, joined
@@ -165,6 +166,12 @@ class GymnasiumEnv(PAMDPEnv):
         maker = Maker(self._name, options.id, options.entry_point or make, options.kwargs, options.max_steps)
         self._copies = self._make_copies(maker)
         self.is_closed = False  # TorchRL's flag: from here on there are copies to close
+        with closed_on_error(self):
+            self._set_up(seed)
+
+    def _set_up(self, seed: int) -> None:
+        """Read from the copies what the environment is, and prepare for the first episodes."""
+        options, num_envs = self.options, self.num_envs
         self.max_steps = self._copies.max_steps
         actions = self._copies.actions
         self.parameter_dims = actions.parameter_dims

@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import logger, spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from hpamdp.env.errors import EnvironmentFaultError, ProblemError
+from hpamdp.env.errors import EnvironmentFaultError, ProblemError, closed_on_error
 from hpamdp.env.gymnasium.copies import Copies, Reading
 from hpamdp.env.registration import register
 from hpamdp.search_path import protect_children, unprotect_children
@@ -169,7 +169,8 @@ class ProcessCopies:
         self._shape_of_actions = (len(blocks), rows, columns[0])
         with _starting():
             self._vector = AsyncVectorEnv(blocks, copy=False, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
-        self.reset({})  # makes the copies, so that a fault of a constructor is raised here
+        with closed_on_error(self):
+            self.reset({})  # makes the copies, so that a fault of a constructor is raised here
 
     def reset(self, seeds: Mapping[int, int | None]) -> None:
         """Begin episodes; see `Copies.reset`."""
