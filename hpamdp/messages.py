@@ -58,6 +58,8 @@ class LenientStream:
         self.error: OSError | ValueError | None = None
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_stream":  # of a copy whose attributes are not there yet
+            raise AttributeError(name)
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:

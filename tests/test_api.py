@@ -597,6 +597,15 @@ def test_an_evaluation_elsewhere_keeps_the_agents_settings_of_the_problem():
     assert agent.evaluate({"name": Reach, "max_steps": 7}, episodes=2)["steps"] == 7.0
 
 
+def test_an_error_inside_a_property_of_an_agent_is_raised_as_it_is(monkeypatch):
+    agent = hpamdp.load("hppo_platform")
+    monkeypatch.delattr(agent, "_agent")
+    with pytest.raises(AttributeError, match="no attribute '_agent'"):
+        _ = agent.num_parameters
+    with pytest.raises(AttributeError, match=r"no attribute 'predict'; use act\(observation\)"):
+        _ = agent.predict
+
+
 def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
     assert platform_agent.evaluate(episodes=np.int64(2), seed=np.int64(3))["steps"] > 0
     for arguments in ({"episodes": 0}, {"episodes": 1.5}, {"episodes": "x"}, {"seed": -1}):

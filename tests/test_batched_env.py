@@ -23,6 +23,7 @@ from hpamdp.env.batched_env import GOING_ON, BatchedEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.circuit.environment import CircuitEnv
 from hpamdp.env.circuit.registration import CIRCUIT_IDS
+from hpamdp.env.errors import ProblemError
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.office.environment import OfficeEnv
@@ -309,6 +310,16 @@ def test_the_oracle_writes_the_scripted_players_action(problem):
     discrete, parameter = env.scripted_action(env.state)
     assert torch.equal(reading[keys.ORACLE_DISCRETE].squeeze(-1), discrete)
     assert torch.equal(reading[keys.ORACLE_PARAMETERS].squeeze(-1), parameter)
+
+
+def test_plans_of_another_shape_are_refused():
+    class Turned(OfficeEnv):
+        def scripted_action(self, state):
+            move, length = super().scripted_action(state)
+            return move.T, length.T
+
+    with pytest.raises(ProblemError, match=r"gave discrete of shape \[3, 5\], but must give \[5, 3\]"):
+        Turned(5, oracle=True, chooses_goal=True).reset()
 
 
 def test_an_oracle_is_refused_where_nobody_knows_the_best_action():

@@ -8,6 +8,7 @@ import struct
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import wandb
@@ -18,7 +19,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
 from hpamdp.run.folder import locked, moved_aside
-from hpamdp.run.loggers import TensorboardLogger
+from hpamdp.run.loggers import TensorboardLogger, WandbLogger
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 from hpamdp.run.trainer import Trainer
@@ -100,6 +101,27 @@ def test_a_move_that_fails_halfway_brings_the_earlier_run_back(tmp_path, monkeyp
     with pytest.raises(OSError, match="no space"), moved_aside(tmp_path):
         pass
     assert contents(tmp_path) == before
+
+
+def test_a_folder_that_a_list_of_figures_names_is_never_deleted(tmp_path):
+    (tmp_path / "run" / "thesis").mkdir(parents=True)
+    (tmp_path / "run" / "metrics.csv").write_text("frames\n")
+    (tmp_path / "run" / ".figures").write_text("thesis\n..\nlearning_curves.png\n")
+    with moved_aside(tmp_path / "run"):
+        pass
+    assert [*(tmp_path / "run").iterdir()] == [tmp_path / "run" / "thesis"]
+
+
+def test_a_resumed_run_of_wandb_removes_its_own_earlier_folder_alone(tmp_path):
+    ids = ["1_000000-one", "1_000000-[a-z]*", "2_000000-[a-z]*"]
+    names = [f"offline-run-2026010{each}" for each in ids]
+    for name in names:
+        (tmp_path / "wandb" / name / "files").mkdir(parents=True)
+    logger = WandbLogger.__new__(WandbLogger)
+    logger._run = SimpleNamespace(offline=True, id="[a-z]*", dir=str(tmp_path / "wandb" / names[2] / "files"))
+    logger.log = lambda row, step: None
+    logger._take_over([{"frames": 8.0}], tmp_path)
+    assert sorted(each.name for each in (tmp_path / "wandb").iterdir()) == sorted([names[0], names[2]])
 
 
 def test_files_that_no_run_has_written_are_never_replaced(tmp_path):

@@ -1,5 +1,6 @@
 """What may go wrong around a run costs no saved work, and is told in one line."""
 
+import copy
 import itertools
 import json
 import multiprocessing
@@ -10,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from io import StringIO
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import IO, Any
@@ -221,6 +223,12 @@ def test_without_stderr_nothing_is_said_on_stdout_in_its_place(monkeypatch, caps
     warn("a warning")
     LenientStream(sys.stderr).write("a progress bar")
     assert capsys.readouterr().out == ""
+
+
+def test_a_copy_of_a_lenient_stream_writes_where_it_does():
+    text = StringIO()
+    copy.copy(LenientStream(text)).write("a line")
+    assert text.getvalue() == "a line"
 
 
 @pytest.mark.parametrize("collector", ["single", pytest.param("multi", marks=pytest.mark.slow)])

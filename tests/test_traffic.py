@@ -26,6 +26,7 @@ from hpamdp.env.traffic.environment import TrafficEnv
 from hpamdp.env.traffic.lights import TrafficLights
 from hpamdp.env.traffic.network import ARMS, GREENS, PHASES, network_file, run_tool
 from hpamdp.env.traffic.players import PLAYERS
+from hpamdp.env.traffic.process import SimulationProcess
 from hpamdp.env.traffic.simulation import Simulation, Task
 from hpamdp.specs import PAMDPSpecs
 
@@ -301,6 +302,23 @@ os.kill(os.getpid(), signal.SIGKILL)
     while os.path.exists(folder) and time.monotonic() < until:
         time.sleep(0.05)
     assert not os.path.exists(folder)
+
+
+def test_a_simulation_removes_no_folder_but_its_own(tmp_path):
+    (tmp_path / "thesis.txt").write_text("years of work")
+    run, simulation = os.pipe()
+    os.close(simulation)  # the run is gone
+    program = f"from {Simulation.__module__} import serve; serve()"
+    subprocess.run([sys.executable, "-c", program, str(run)], cwd=tmp_path, pass_fds=[run], check=True)
+    os.close(run)
+    assert (tmp_path / "thesis.txt").is_file()
+
+
+def test_the_process_of_sumo_has_the_methods_of_a_simulation_alone():
+    process = SimulationProcess.__new__(SimulationProcess)
+    assert callable(process.act)
+    with pytest.raises(AttributeError, match="'SimulationProcess' object has no attribute 'acct'"):
+        process.acct(0, 1.0)
 
 
 def test_several_who_need_a_network_at_once_make_it_once(tmp_path, monkeypatch):

@@ -87,6 +87,8 @@ class Agent:
         return f"Agent({self._config.high}, {self._config.low}, {self._config.env}, {trained})"
 
     def __getattr__(self, name: str) -> Any:
+        if hasattr(type(self), name):  # a property raised an AttributeError: raise it once more, from there
+            return object.__getattribute__(self, name)
         raise no_member(self, name)
 
     @property

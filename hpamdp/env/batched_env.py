@@ -24,7 +24,7 @@ from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.base import PAMDPEnv, ProblemError
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.kernel_rows import Advance, KernelRows, Results, invalid_choice
@@ -419,7 +419,21 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         if not self._has_oracle:
             return {}
         plan = zip(("discrete", "parameters"), self.scripted_action(self._state), strict=True)
-        return {"oracle": {name: leaf.view(self._shape_of_plans) for name, leaf in plan}}
+        return {"oracle": {name: self._plans(name, leaf) for name, leaf in plan}}
+
+    def _plans(self, name: str, leaf: Tensor) -> Tensor:
+        """Return a leaf of the scripted player's actions, `[N]` or `[N, P]`, as `[N, P]`.
+
+        Raises:
+            ProblemError: it has another shape.
+        """
+        num_envs, num_plans = self._shape_of_plans
+        if leaf.shape == (num_envs,) and num_plans == 1:
+            return leaf.unsqueeze(-1)
+        if leaf.shape != (num_envs, num_plans):
+            given = f"{name} of shape {list(leaf.shape)}, but must give [{num_envs}, {num_plans}]"
+            raise ProblemError(f"{type(self).__name__}: scripted_action gave {given}")
+        return leaf
 
     @property
     def _shape_of_plans(self) -> tuple[int, int]:

@@ -182,7 +182,7 @@ def written_by_a_run(folder: Path) -> list[Path]:
     names = [*_MARKS, *_OTHERS]
     with suppress(OSError, UnicodeDecodeError):
         listed = read_regular(folder / FIGURES_NAME, MAX_TEXT_BYTES).decode().splitlines()
-        names += [name for name in listed if name and Path(name).name == name]
+        names += [name for name in listed if Path(name).name == name and not (folder / name).is_dir()]
     paths = [folder / name for name in (*names, FIGURES_NAME, CONFIG_NAME)]
     return [path for path in dict.fromkeys(paths) if path.exists() or path.is_symlink()]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import netrc
 import os
 import re
@@ -333,7 +334,7 @@ class WandbLogger:
         for row in rows:
             self.log(dict(row), int(row[FRAMES]))
         if rows and self._run.offline:
-            for folder in (output_dir / WANDB_NAME).glob(f"offline-run-*-{self._run.id}"):
+            for folder in (output_dir / WANDB_NAME).glob(f"offline-run-*-{glob.escape(self._run.id)}"):
                 if folder != Path(self._run.dir).parent:
                     shutil.rmtree(folder)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hpamdp.env.errors import ProblemError
-from hpamdp.env.traffic.simulation import Seen, Simulation, Task
+from hpamdp.env.traffic.simulation import FOLDER_PREFIX, Seen, Simulation, Task
 
 _PROGRAM = f"from {Simulation.__module__} import serve; serve()"
 _PATIENCE_S = 2.0  # until a process that has nothing more to do ends
@@ -39,7 +39,7 @@ class SimulationProcess:
     play: Callable[[str], dict[str, float]]
 
     def __init__(self, task: Task) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="hpamdp-traffic-")
+        self._folder = tempfile.TemporaryDirectory(prefix=FOLDER_PREFIX)
         self._connection, other = Pipe()
         # The folder is the working directory, so that Python imports nothing from the user's.
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
@@ -62,8 +62,8 @@ class SimulationProcess:
 
     def __getattr__(self, method: str) -> Callable[..., Any]:
         """Return a method of the simulation."""
-        if method.startswith("_"):
-            raise AttributeError(method)
+        if method.startswith("_") or not hasattr(Simulation, method):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {method!r}", name=method, obj=self)
         return lambda *arguments: self._call(method, arguments)
 
     def _call(self, method: str, arguments: tuple[Any, ...]) -> Any:

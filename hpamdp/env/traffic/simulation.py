@@ -24,6 +24,8 @@ from hpamdp.messages import one_line
 VEHICLES = 20.0
 """Queues and approaching vehicles are observed in this many vehicles."""
 HOUR_S = 3600.0
+FOLDER_PREFIX = "hpamdp-traffic-"
+"""The folder of a simulation is named so, and no other is removed."""
 _STANDING = 0.1  # m/s, below which SUMO counts a vehicle as waiting
 _TRIPS = "trips.xml"
 _MIN_GREEN_OF_ACTUATED_S = 5
@@ -354,7 +356,8 @@ def serve() -> None:
         pass
     finally:
         os.chdir(folder.parent)
-        shutil.rmtree(folder, ignore_errors=True)
+        if folder.name.startswith(FOLDER_PREFIX):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _serve(connection: Connection) -> None:
