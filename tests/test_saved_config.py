@@ -328,3 +328,16 @@ def test_old_names_are_read_in_the_learners_of_options_too():
     saved["low"]["per_option"] = {"congruent": {"name": "pdqn", "warmup_frames": 77, "twin_q": False}}
     learner = read_saved(saved).low_of["congruent"]
     assert learner.settings["warmup_steps"] == 77 and learner.settings["twin"] is False
+
+
+def test_a_word_may_need_a_setting_that_the_saved_run_has(command):
+    words = ["env=boatdock_unseen", "env.fleet_size=2", "env.frame=first_press", "high=none", "low=random"]
+    words += ["total_frames=64", "num_envs=8", "steps_per_batch=8", "eval.every=0", "eval.layouts=2", "film=false"]
+    assert command(*words, "hydra.run.dir=run")[0] == 0
+    scored = ["mode=eval", "checkpoint=run", "env.scored_boats=training", "film=false", "hydra.run.dir=scored"]
+    code, _, err = command(*scored)
+    assert code == 0, err
+    env = yaml.safe_load(Path("scored/config.yaml").read_text())["env"]
+    assert (env["fleet_size"], env["scored_boats"], env["frame"]) == (2, "training", "first_press")
+    code, _, err = command(*scored[:-1], "env.fleet_size=null", "hydra.run.dir=again")
+    assert code == 2 and err.startswith("env: scored_boats=training: needs a fleet_size")

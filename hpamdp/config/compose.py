@@ -69,7 +69,27 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     Raises:
         ConfigError: a value is wrong, or nothing is chosen for a group.
     """
-    names = chosen_names(cfg) if choices is None else choices
+    given, names, place_of, folders = _plainly(cfg, chosen_names(cfg) if choices is None else choices)
+    return replace(check(given, names, place_of), config_dirs=folders)
+
+
+def read_run(cfg: DictConfig) -> tuple[RunConfig, tuple[str, ...]]:
+    """Check the values of the run alone; return them, and the folders of yaml files besides conf/.
+
+    For a config that a saved run completes: what is chosen in the groups is then the saved run's, and settings that
+    need one another may be set by either.
+
+    Raises:
+        ConfigError: a value is wrong, or nothing is chosen for a group.
+    """
+    given, names, place_of, folders = _plainly(cfg, chosen_names(cfg))
+    return check_run(given, names, place_of), folders
+
+
+def _plainly(
+    cfg: DictConfig, names: Mapping[str, str]
+) -> tuple[dict[str, Any], Mapping[str, str], Callable[[str], str | None] | None, tuple[str, ...]]:
+    """Return the composed config as plain values, the names, where a setting was set, and the folders of yaml files."""
     for group in GROUPS:
         if cfg.get(group) is None or TARGET not in cfg[group]:
             if names.get(group) is not None:
@@ -85,7 +105,7 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
         _check_found(node, names)
         folders = searched_folders(node)
         place_of = partial(_place_of, _words_of(node), names, folders)
-    return replace(check(plain(own), names, place_of), config_dirs=folders)
+    return plain(own), names, place_of, folders
 
 
 def _place_of(words: Sequence[str], names: Mapping[str, str], folders: Sequence[str], setting: str) -> str | None:

@@ -14,7 +14,7 @@ from typing import TypeAlias
 from hpamdp.complaints import as_json
 from hpamdp.config.components import Component, constructor_arguments, is_passed
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.schema import Config
+from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.pickling import why_unsendable
 
@@ -34,19 +34,19 @@ def check(config: Config) -> None:
     Raises:
         ConfigError: a rule is broken; the message names the settings to change.
     """
-    check_rules(config, RULES)
+    _check(rule(config) for rule in RULES)
     facts = facts_of(config)
     if facts is not None:
         check_problem(config, facts)
 
 
-def check_rules(config: Config, rules: Sequence[Rule]) -> None:
-    """Check some of the rules.
+def check_saved_run(run: RunConfig) -> None:
+    """Check how a run names the saved run that it starts from, before that one completes its config.
 
     Raises:
-        ConfigError: a rule is broken; the message names the settings to change.
+        ConfigError: it does not go with the mode, or the name is empty.
     """
-    _check(rule(config) for rule in rules)
+    _check([_of_saved_run(run)])
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:
@@ -148,7 +148,10 @@ def option_lengths_go_with_chosen(config: Config) -> str | None:
 
 def saved_runs_are_named(config: Config) -> str | None:
     """Require a mode in which the saved run is used, and refuse an empty name of a saved run."""
-    run = config.run
+    return _of_saved_run(config.run)
+
+
+def _of_saved_run(run: RunConfig) -> str | None:
     for name, value in (("resume", run.resume), ("checkpoint", run.checkpoint), ("low.checkpoint", run.low.checkpoint)):
         if value == "":
             return f"{name}: empty; give the output folder of a run, or leave {name} out"

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hpamdp.complaints import as_json
 from hpamdp.config.components import GROUPS
-from hpamdp.config.compose import RECIPE, choosing, chosen_names, conf_dir, names_of, plain, read
+from hpamdp.config.compose import RECIPE, choosing, chosen_names, conf_dir, names_of, plain, read, read_run
 from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.outside_jobs import searched, searching
 from hpamdp.config.saved import choices_of, read_saved, upgraded
@@ -51,30 +51,30 @@ def resolve(
     Raises:
         ConfigError: a value is wrong, the checkpoint does not exist, or a word would change the saved agent.
     """
-    config = choose_selector(read(cfg).with_objects(objects), overrides)
-    compatibility.check_rules(config, (compatibility.saved_runs_are_named,))
-    where = "resume" if config.run.resume is not None else "checkpoint"
-    source = config.run.resume or config.run.checkpoint
+    run, folders = read_run(cfg)
+    compatibility.check_saved_run(run)
+    where = "resume" if run.resume is not None else "checkpoint"
+    source = run.resume or run.checkpoint
     if source is None:
-        return config, None
+        return choose_selector(read(cfg).with_objects(objects), overrides), None
     file = checkpoint.find(source, where)
     saved = checkpoint.progress_of(file)["config"]
-    if config.run.resume is not None and config.run.mode != saved["mode"]:
+    if run.resume is not None and run.mode != saved["mode"]:
         raise ConfigError(
             f"resume={source}: a run with mode={saved['mode']}; resume it so, or start one with "
             f"{setting('low.checkpoint', source)}"
         )
     values = {name: cfg[name] for name in _BEGIN}
-    if config.run.mode == "eval":
+    if run.mode == "eval":
         values |= {name: _plain_value(cfg, name) for name in (*_NOT_EVALUATED, *_OF_TRAINING)}
     changed = map(_name, _changes(overrides, saved, file, where))
     values |= {name: _plain_value(cfg, name) for name in changed if not name.startswith("hydra")}
     names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
     try:
-        resolved = read_saved(saved, values, names, trust=config.run.trust, file=file)
+        resolved = read_saved(saved, values, names, trust=run.trust, file=file)
     except MissingChoiceError as error:
         raise _not_there(error, file) from error
-    return replace(resolved, config_dirs=config.config_dirs).with_objects(objects), file
+    return replace(resolved, config_dirs=folders).with_objects(objects), file
 
 
 def _plain_value(cfg: DictConfig, name: str) -> Any:
