@@ -404,6 +404,7 @@ def test_cuda_is_refused_in_one_line_where_there_is_none(monkeypatch):
         (["high=none", "low=pdqn"], None),
         (["high=none", "low=hppo"], None),
         (["high=none", "low=pets"], "low=pets"),
+        (["high=none", "low=pets", "low.gamma=1"], None),
         (["env.grouping=default", "high=meta_critic", "low=pdqn"], "high=meta_critic"),
         (["env.grouping=default", "high=ucb", "low=pdqn"], None),
     ],

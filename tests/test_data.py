@@ -15,6 +15,7 @@ import torch
 from conftest import make_config
 from gymnasium import spaces
 from tensordict import TensorDict
+from torchrl.data import Binary, Unbounded
 
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
@@ -22,6 +23,8 @@ from hpamdp.data import export, memmap, minari
 from hpamdp.data.demonstrations import TRAJECTORY, Demonstrations, with_option_sums
 from hpamdp.data.errors import DataError
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.platform.environment import PlatformEnv
+from hpamdp.policies.low_level.iql import IQL
 from hpamdp.run.assemble import make_data, make_env
 from hpamdp.specs import PAMDPSpecs
 
@@ -156,6 +159,11 @@ def masked(row, name=keys.ACTION_MASK):
     return episodes(2, 3).set(name, mask)
 
 
+def timed(row=slice(None), value=2.5):
+    """Return transitions whose steps take a time of 1, but for the time of some rows."""
+    return spoilt(("next", keys.DURATION), row, value, episodes(2, 3).set(("next", keys.DURATION), torch.ones(5, 1)))
+
+
 @pytest.mark.parametrize(
     ("rows", "specs", "said"),
     [
@@ -202,6 +210,15 @@ def masked(row, name=keys.ACTION_MASK):
             spoilt(keys.DISCRETE, 3, 1, with_option(0, 0, 1, 1, 1)),
             WITH_OPTIONS,
             "row 3: action.discrete is 1, but must be an action of the row's option",
+        ),
+        (timed(0, 0.0), SPECS, "row 0: next.duration is 0, but must be finite and greater than 0"),
+        (timed(3, -2.0), SPECS, "row 3: next.duration is -2, but must be finite and greater than 0"),
+        (timed(4, np.nan), SPECS, "row 4: next.duration is nan, but must be finite and greater than 0"),
+        (timed(1, np.inf), SPECS, "row 1: next.duration is inf, but must be finite and greater than 0"),
+        (
+            episodes(2).set(("next", "duration"), torch.ones(2)),
+            SPECS,
+            "next.duration is float32 [N], but must be float32 [N, 1]",
         ),
         (masked(2), MASKED, "allowed by the row's action_mask"),
         (masked(3, ("next", keys.ACTION_MASK)), MASKED, "row 3: next.action_mask[0] is false, but must be true for"),
@@ -255,11 +272,90 @@ def test_a_run_names_the_data_set_whose_rows_are_wrong(name, said):
     assert str(refused.value).startswith(f"data=none: {said}")
 
 
+class Timed(PlatformEnv):
+    """A problem that writes how long its steps take, and forbids nothing."""
+
+    def _knowledge_specs(self):
+        return {keys.DURATION: Unbounded((self.num_envs, 1), dtype=torch.float32)}
+
+    def _knowledge(self):
+        return {keys.DURATION: torch.ones(self.num_envs, 1)}
+
+
+class Masked(PlatformEnv):
+    """A problem that writes an action mask."""
+
+    def _knowledge_specs(self):
+        return {keys.ACTION_MASK: Binary(3, (self.num_envs, 3), dtype=torch.bool)}
+
+    def _knowledge(self):
+        return {keys.ACTION_MASK: torch.ones(self.num_envs, 3, dtype=torch.bool)}
+
+
+class PlatformRows(Demonstrations):
+    """Transitions of Platform, with some entries besides."""
+
+    def __init__(self, durations: bool = False, masks: bool = False) -> None:
+        env = Masked(1)
+        rows = env.rollout(5, break_when_any_done=True, auto_reset=True).squeeze(0)
+        rows[keys.DISCRETE], rows[keys.PARAMETERS] = torch.zeros_like(rows[keys.DISCRETE]), 0 * rows[keys.PARAMETERS]
+        rows["next", keys.TRUNCATED][-1] = ~rows["next", keys.TERMINATED][-1]
+        rows["next", keys.DONE][-1] = True
+        rows[keys.IS_DECISION] = (torch.arange(len(rows)) == 0).unsqueeze(-1)
+        rows["next", keys.IS_DECISION] = rows["next", keys.DONE].clone()
+        rows[TRAJECTORY] = torch.zeros(len(rows), dtype=torch.long)
+        if durations:
+            rows["next", keys.DURATION] = torch.full((len(rows), 1), 3.0)
+        if not masks:
+            rows = rows.exclude(keys.ACTION_MASK, ("next", keys.ACTION_MASK))
+        super().__init__(rows)
+
+
+def data_of(env, *words, low="iql"):
+    given = ["env=platform", f"low={low}", "mode=offline", f"data._target_={__name__}.PlatformRows", *words]
+    return make_data(make_config(given), env, 1.0)
+
+
+def test_a_data_set_without_the_durations_that_its_problem_writes_is_said_to_lack_them(capsys):
+    data_of(Timed(1), "low.gamma=0.9")
+    assert capsys.readouterr().err == (
+        "data=none: it lacks next.duration, so low=iql discounts its steps alike, but steps of env=platform take "
+        "different times\n"
+    )
+    data_of(Timed(1), "low.gamma=1")
+    data_of(Timed(1), "low.gamma=0.9", "+data.durations=true")
+    data_of(PlatformEnv(1), "low.gamma=0.9")
+    assert capsys.readouterr().err == ""
+
+
+def test_durations_of_a_problem_whose_steps_take_the_same_time_are_refused():
+    with pytest.raises(ConfigError, match=r"it has next\.duration, but steps of env=platform do not take different"):
+        data_of(PlatformEnv(1), "+data.durations=true")
+
+
+def test_a_data_set_without_the_masks_that_its_problem_writes_is_said_to_lack_them(capsys):
+    data_of(Masked(1))
+    assert capsys.readouterr().err == (
+        "data=none: it lacks action_mask, next.action_mask, so learners take everything as allowed in its states\n"
+    )
+    data_of(Masked(1), "+data.masks=true")
+    assert capsys.readouterr().err == ""
+
+
+def test_an_offline_learner_discounts_by_the_durations_in_the_data():
+    env = Timed(1)
+    batch = data_of(env, "+data.durations=true").batch
+    learner = IQL(PAMDPSpecs.from_env(env), gamma=0.9)
+    goes_on = ~batch["next", keys.TERMINATED].squeeze(-1)
+    torch.testing.assert_close(learner.transitions(batch)["discount"], 0.9**3 * goes_on)
+
+
 def test_right_rows_pass_the_check():
     Demonstrations(episodes(2, 3, 1)).check(SPECS)
     Demonstrations(spoilt(keys.PARAMETERS, slice(None), 1.0 + 1e-6)).check(SPECS)  # rounding
     Demonstrations(with_option(0, 0, 1, 1, 1)).check(WITH_OPTIONS)
     Demonstrations(masked([])).check(MASKED)
+    Demonstrations(timed()).check(SPECS)
 
 
 def test_wrong_decisions_are_refused_with_their_row():
@@ -327,6 +423,38 @@ def test_minari_returns_the_transitions_of_a_problem_without_options(workshop_id
         assert loaded[name].dtype == value.dtype and loaded[name].equal(value), name
     with pytest.raises(DataError, match="test/tools-v0: cannot be read as transitions"):
         minari.load("test/tools-v0", minari.MinariLayout())
+
+
+def with_what_learners_read(rows):
+    """Return transitions with all that an environment may write beside the observation and learners read."""
+    num, generator = len(rows), torch.Generator().manual_seed(1)
+    is_first = rows[keys.IS_DECISION].squeeze(-1)
+    of_states = {
+        keys.ACTION_MASK: torch.rand(num, 3, generator=generator) > 0.5,
+        keys.OPTION_MASK: torch.rand(num, 2, generator=generator) > 0.5,
+        keys.PAIR_MASK: torch.rand(num, 3, 3, generator=generator) > 0.5,
+        keys.PARAMETER_LOW: -torch.rand(num, 4, generator=generator),
+        keys.PARAMETER_HIGH: torch.rand(num, 4, generator=generator),
+        keys.DURATION: torch.rand(num, 1, generator=generator) + 0.5,
+    }
+    for name, values in of_states.items():
+        rows["next", name] = values
+        rows[name] = values.roll(1, 0) * ~is_first.reshape(-1, *[1] * (values.ndim - 1))
+    return rows
+
+
+def test_minari_returns_all_that_learners_read_of_a_state(workshop_id, tmp_path, monkeypatch):
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    batch = with_what_learners_read(episodes(3, 1, 2))
+    minari.export(batch, "test/tools-v0", LAYOUT, env_id=workshop_id, env_kwargs={"size": 2})
+    loaded = minari.load("test/tools-v0", LAYOUT)
+    assert set(loaded.keys(True, True)) == set(batch.keys(True, True))
+    for name, value in batch.items(True, True):
+        assert loaded[name].dtype == value.dtype and loaded[name].equal(value), name
+    for name in (keys.ACTION_MASK, keys.PAIR_MASK, keys.PARAMETER_LOW):
+        with pytest.raises(DataError, match=f"have {name}, but lack next.{name}, which Minari keeps, too"):
+            minari.export(batch.exclude(("next", name)), "test/half-v0", LAYOUT, env_id=workshop_id)
 
 
 def exported(tmp_path, monkeypatch, workshop_id):
@@ -427,7 +555,7 @@ def test_a_full_disk_stops_every_export_in_a_line_and_leaves_nothing(workshop_id
 
 
 def test_what_is_written_as_memory_maps_is_read_back(tmp_path):
-    rows = episodes(3, 2)
+    rows = with_what_learners_read(episodes(3, 2))
     export.write_memmap(rows, tmp_path / "rows")
     for read in (memmap.load, TensorDict.load_memmap):
         found = read(tmp_path / "rows")

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _MAX_RATIO = 100  # largest size of a data set, in sizes of its file, which may be compressed
 _FEW_BYTES = 1 << 26
 _BYTES_AN_EPISODE = 40_000  # upper bound of the names and descriptions in HDF5
+# What learners read of a state beside its observation. It is kept as an info where the transitions have it.
+_OF_STATES = (keys.ACTION_MASK, keys.OPTION_MASK, keys.PAIR_MASK, keys.PARAMETER_LOW, keys.PARAMETER_HIGH)
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ class MinariLayout:
     Attributes:
         discrete, parameters, option: the parts of the environment's Dict action; transitions without an option have
             no such part.
-        infos: columns, at the root and under `next`, that are kept as infos.
+        infos: columns, at the root and under `next`, that are kept as infos. Masks, the bounds of parameters and
+            `duration` are kept besides, if the transitions have them.
     """
 
     discrete: str = "discrete"
@@ -82,8 +85,8 @@ def export(
         description: what a user should know of the data.
 
     Raises:
-        DataError: Minari is missing or refuses the data, the data set exists, there is no such environment, or an
-            option ends inside an episode.
+        DataError: Minari is missing or refuses the data, the data set exists, there is no such environment, an option
+            ends inside an episode, or a mask or bound is not given for all states.
     """
     library = _import_minari()
     from minari.data_collector import EpisodeBuffer
@@ -95,6 +98,9 @@ def export(
         raise DataError(f"{dataset_id}: Minari has this data set already; delete it first: minari delete {dataset_id}")
     if not batch["next", keys.IS_DECISION].equal(batch["next", keys.DONE]):
         raise DataError(f"{dataset_id}: Minari has no place for options that end inside an episode")
+    for name in _OF_STATES:
+        if name in batch.keys() and name not in batch["next"].keys():
+            raise DataError(f"{dataset_id}: the transitions have {name}, but lack next.{name}, which Minari keeps, too")
     try:
         env = gymnasium.make(env_id, **(env_kwargs or {}))
     except gymnasium.error.Error as error:
@@ -125,13 +131,17 @@ def _episode(rows: TensorDict, layout: MinariLayout) -> dict[str, Any]:
     actions = {layout.discrete: rows[keys.DISCRETE].numpy(), layout.parameters: rows[keys.PARAMETERS].numpy()}
     if keys.OPTION in rows.keys():
         actions[layout.option] = rows[keys.OPTION].numpy()
+    infos = {name: with_last(name) for name in (*layout.infos, *_OF_STATES) if name in rows.keys()}
+    if keys.DURATION in rows["next"].keys():
+        duration = rows["next", keys.DURATION]
+        infos[keys.DURATION] = torch.cat([torch.zeros_like(duration[:1]), duration]).numpy()
     return {
         "observations": with_last(keys.OBSERVATION),
         "actions": actions,
         "rewards": rows["next", keys.REWARD].squeeze(-1).numpy(),
         "terminations": rows["next", keys.TERMINATED].squeeze(-1).numpy(),
         "truncations": rows["next", keys.TRUNCATED].squeeze(-1).numpy(),
-        "infos": {name: with_last(name) for name in layout.infos},
+        "infos": infos,
     }
 
 
@@ -204,7 +214,8 @@ def _transitions(episode: minari.EpisodeData, number: int, layout: MinariLayout)
     num = len(episode.rewards)
     rows = TensorDict(batch_size=[num])
     following = TensorDict(batch_size=[num])
-    columns = {keys.OBSERVATION: episode.observations, **{name: episode.infos[name] for name in layout.infos}}
+    infos = [*layout.infos, *(name for name in (*_OF_STATES, keys.DURATION) if name in episode.infos)]
+    columns = {keys.OBSERVATION: episode.observations, **{name: episode.infos[name] for name in infos}}
     for name, values in columns.items():
         column = torch.as_tensor(values)
         rows[name] = column[:-1]

@@ -18,6 +18,7 @@ from hpamdp.data.errors import DataError
 from hpamdp.specs import PAMDPSpecs
 
 TRAJECTORY = ("collector", "traj_ids")  # the number of a row's episode, where TorchRL's collectors write it
+DURATION = ("next", keys.DURATION)
 
 _Key = str | tuple[str, ...]
 _FLOAT, _INT, _BOOL = torch.float32, torch.int64, torch.bool
@@ -53,6 +54,7 @@ _OPTIONAL: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
     keys.PAIR_MASK: (_BOOL, (None, None)),
     keys.PARAMETER_LOW: (_FLOAT, (None,)),
     keys.PARAMETER_HIGH: (_FLOAT, (None,)),
+    DURATION: (_FLOAT, (1,)),
 }
 _OBSERVATIONS: tuple[_Key, ...] = (
     keys.OBSERVATION,
@@ -140,6 +142,14 @@ def check_options(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
     _check_rules(what, rows, _option_rules(rows, specs))
 
 
+def missing_masks(rows: TensorDictBase, specs: PAMDPSpecs) -> list[str]:
+    """Return the names of masks that the environment gives and the transitions `[N]` lack."""
+    given = {keys.ACTION_MASK: specs.has_action_mask, keys.OPTION_MASK: specs.has_option_mask}
+    names: list[_Key] = [name for mask, is_given in given.items() if is_given for name in (mask, ("next", mask))]
+    present = rows.keys(True, True)
+    return [_dotted(name) for name in names if name not in present]
+
+
 def _check_form(what: str, rows: TensorDict, required: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]]) -> None:
     """Check the names, shapes and types of the entries."""
     if not isinstance(rows, TensorDictBase):
@@ -216,6 +226,9 @@ def _shown(value: float) -> str:
 
 def _transition_rules(rows: TensorDict) -> Iterator[_Rule]:
     yield from _finite(rows, keys.OBSERVATION, keys.PARAMETERS, ("next", keys.OBSERVATION), ("next", keys.REWARD))
+    if DURATION in rows.keys(True, True):
+        duration = rows[DURATION]
+        yield _Rule(DURATION, duration.isfinite() & (duration > 0.0), "finite and greater than 0")
     episode = rows[TRAJECTORY]
     changes = episode[1:] != episode[:-1]
     edge = changes.new_ones(1)

@@ -18,6 +18,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.errors import DataError
+from hpamdp.data.row_checks import DURATION, missing_masks
 from hpamdp.env.base import PAMDPEnv, checked_option_names
 from hpamdp.env.decisions import OptionLength, with_decisions
 from hpamdp.env.errors import closed_on_error
@@ -316,7 +317,29 @@ def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | N
         demonstrations.discount(gamma)
     except DataError as error:
         raise ConfigError(f"high.gamma={gamma}: {config.data}: {error}") from error
+    _check_completeness(config, env, demonstrations)
     return demonstrations
+
+
+def _check_completeness(config: Config, env: PAMDPEnv, data: Demonstrations) -> None:
+    """Warn if the data set lacks what the environment writes and learners would read.
+
+    Raises:
+        ConfigError: the data set has durations, but the environment's steps take no different times.
+    """
+    rows = data.batch.squeeze(0)
+    writes, has = keys.DURATION in env.observation_spec.keys(), DURATION in rows.keys(True, True)
+    if has and not writes:
+        raise ConfigError(f"{config.data}: it has next.duration, but steps of {config.env} do not take different times")
+    counting = compatibility.counting_durations(config)
+    if writes and not has and counting:
+        warn(
+            f"{config.data}: it lacks next.duration, so {counting[0]} discounts its steps alike, but steps of "
+            f"{config.env} take different times"
+        )
+    masks = missing_masks(rows, PAMDPSpecs.from_env(env))
+    if masks:
+        warn(f"{config.data}: it lacks {', '.join(masks)}, so learners take everything as allowed in its states")
 
 
 def make_evaluation(

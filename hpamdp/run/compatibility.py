@@ -232,14 +232,19 @@ def sessions_are_played_here(config: Config) -> str | None:
 
 def uncounted_durations(config: Config) -> str | None:
     """Return a warning if a level discounts all steps alike, for a problem whose steps take different times."""
-    blind = [
-        level
-        for level in [config.high, *config.learners]
-        if "gamma" in level.settings and not getattr(level.cls, "counts_durations", False)
-    ]
+    blind = [level for level in _discounting(config) if not getattr(level.cls, "counts_durations", False)]
     if config.run.mode == "eval" or not blind:
         return None
     return f"{blind[0]}: discounts all steps alike, but those of {config.env} take different times; gamma=1 avoids that"
+
+
+def counting_durations(config: Config) -> list[Component]:
+    """Return the levels whose discounts count how long steps take."""
+    return [level for level in _discounting(config) if getattr(level.cls, "counts_durations", False)]
+
+
+def _discounting(config: Config) -> list[Component]:
+    return [level for level in [config.high, *config.learners] if level.settings.get("gamma", 1.0) != 1.0]
 
 
 def forgotten_trips(config: Config, problem: ProblemFacts, *, reveals_directions: bool) -> str | None:
