@@ -471,6 +471,20 @@ def test_every_learner_that_takes_an_exploration_trains_with_it_and_is_reloaded(
     assert hpamdp.load(tmp_path).evaluate(episodes=4)["score"] is not None
 
 
+def test_a_table_of_counts_is_saved_for_training_alone(tmp_path, monkeypatch):
+    words = [*PLATFORM, "low=hppo", "exploration=counts", *SHORT.get("hppo", []), *SMALL, "film=false"]
+    assert run(compose_config(words), tmp_path, words) == 0
+    table = 8 * CountsOptions().table_size
+    policy, checkpoint = tmp_path / "policy.pt", tmp_path / "checkpoint.zip"
+    assert policy.stat().st_size < 0.5 * table < table < checkpoint.stat().st_size
+    agent = hpamdp.load(policy)
+    monkeypatch.setattr(HierarchicalAgent, "acting_state", HierarchicalAgent.state_dict)
+    agent.save(tmp_path / "old.pt")  # as earlier versions wrote it
+    assert table < (tmp_path / "old.pt").stat().st_size
+    scores = [hpamdp.load(file).evaluate(episodes=4) for file in (policy, checkpoint, tmp_path / "old.pt")]
+    assert scores[0] == scores[1] == scores[2]
+
+
 REFUSED = [
     (
         "low=random exploration=held",

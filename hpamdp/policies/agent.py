@@ -20,6 +20,9 @@ from hpamdp.policies.masks import allowed_or_first
 from hpamdp.policies.option_lengths import OptionLengths, PairSelector
 from hpamdp.specs import PAMDPSpecs
 
+FOR_TRAINING = "explorations."
+"""With this begin the names of what explorations keep. What acts of it has other names besides."""
+
 
 def with_option(rows: TensorDictBase, num_options: int) -> TensorDictBase:
     """Return a shallow copy whose observations, also those under `next`, end in the one-hot option."""
@@ -449,6 +452,10 @@ class HierarchicalAgent(nn.Module):
             self.next_options = AgentNextOptions(selector, learners, specs.num_options, is_shared, self.pairs)
             for learner in learners:
                 learner.next_options = self.next_options
+
+    def acting_state(self) -> dict[str, Any]:
+        """Return the state dict without what explorations keep for training alone, such as a table of counts."""
+        return {name: value for name, value in self.state_dict().items() if not name.startswith(FOR_TRAINING)}
 
     def policy_of(self, option: int) -> TensorDictModuleBase:
         """Return the policy that always holds one option and otherwise acts like this agent."""

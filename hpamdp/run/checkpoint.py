@@ -36,7 +36,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.files import replacing
 from hpamdp.messages import first_line, warn
-from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.agent import FOR_TRAINING, HierarchicalAgent
 from hpamdp.policies.base import Learner, Level
 from hpamdp.run.state_checks import (
     Progress,
@@ -189,7 +189,7 @@ def save(
 
 
 def save_policy(path: Path, agent: HierarchicalAgent, env: PAMDPEnv, progress: Mapping[str, Any]) -> None:
-    """Write the networks and the scale of the observations, without the parts for training.
+    """Write the networks that act and the scale of the observations, without the parts for training.
 
     `mode=eval` can load the file.
 
@@ -202,7 +202,7 @@ def save_policy(path: Path, agent: HierarchicalAgent, env: PAMDPEnv, progress: M
     Raises:
         OSError: see `save`.
     """
-    parts = {"agent": agent.state_dict(), "collection": {"env": env.statistics()}}
+    parts = {"agent": agent.acting_state(), "collection": {"env": env.statistics()}}
     with replacing(path) as partial:
         torch.save({"format": _FORMAT, "progress": json.dumps(dict(progress)), **parts}, partial)
 
@@ -275,7 +275,8 @@ def load(
         if missing:
             raise ConfigError(f"{file}: does not fit this agent: it lacks {', '.join(sorted(missing))}")
         with _explained(misfit):
-            networks = opened.state("agent", opened.part("agent"), agent, device)
+            may_lack = "" if with_training else FOR_TRAINING
+            networks = opened.state("agent", opened.part("agent"), agent, device, may_lack=may_lack)
             others = {name: opened.other(name, stateful[name], device) for name in stateful.keys() - buffers.keys()}
             for name in opened.names & {*buffers}:
                 replays[name] = opened.replay(name, buffers[name], agent, steps)
@@ -285,7 +286,7 @@ def load(
                     states[name] = _strings(opened.filled(name, device))
             generators = Generators.of(opened.filled("rng")) if with_training else None
         progress = opened.progress
-    agent.load_state_dict(networks)
+    agent.load_state_dict({**agent.state_dict(), **networks})
     for name, state in others.items():
         stateful[name].load_state_dict(state)
     for name, buffer in buffers.items():
@@ -414,7 +415,9 @@ class _Opened:
         state = self.part(name)
         return self._parts[name].filled(state, device)
 
-    def state(self, name: str, saved: Any, module: nn.Module, device: torch.device) -> dict[str, Any]:
+    def state(
+        self, name: str, saved: Any, module: nn.Module, device: torch.device, *, may_lack: str = ""
+    ) -> dict[str, Any]:
         """Return a state dict that a module can load.
 
         Args:
@@ -422,6 +425,7 @@ class _Opened:
             saved: the state dict, not yet read.
             module: the module that will load the state.
             device: the device of the returned tensors.
+            may_lack: entries whose names begin so may be missing; then the returned state lacks them, too.
 
         Raises:
             ValueError: the state is of another module, or holds invalid numbers.
@@ -430,6 +434,8 @@ class _Opened:
         archive = self._parts[name]
         own = module.state_dict(keep_vars=True)
         any_size = buffers_sized_by_data(module)
+        if may_lack and isinstance(saved, Mapping):
+            own = {key: value for key, value in own.items() if key in saved or not key.startswith(may_lack)}
         check_names(saved, own)
         for key, value in own.items():
             if isinstance(value, Tensor):

@@ -7,7 +7,7 @@ attributes of classes, so they can be checked without torch.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -86,7 +86,7 @@ def with_selector(config: Config, problem: ProblemFacts, words: Sequence[str] = 
     return replace(config, high=Component("high", "none", None, {}))
 
 
-def _check(complaints: Iterator[str | None]) -> None:
+def _check(complaints: Iterable[str | None]) -> None:
     complaint = next((complaint for complaint in complaints if complaint is not None), None)
     if complaint is not None:
         raise ConfigError(complaint)
