@@ -325,6 +325,12 @@ def test_runs_are_added_to_a_csv_file_in_the_place_of_repeated_ones(tmp_path):
     assert rows == [("hyar", 1, 0.7), ("pdqn", 0, 0.7), ("pdqn", 2, 0.1)]
 
 
+def test_numbers_come_before_texts_in_a_column_of_both(tmp_path):
+    write_tables(tmp_path, {"results": [{"fleet": "new", "seed": 1}]})
+    add_to_tables(tmp_path, {"results": [{"fleet": each, "seed": 1} for each in (16, 4)]}, ("fleet", "seed"))
+    assert [row["fleet"] for row in read_csv(tmp_path / "results.csv")] == [4, 16, "new"]
+
+
 def test_domains_says_what_each_learner_was_given_as_its_settings_say():
     domains = study("domains")
     config = {"low": {"gamma": 0.9, "greedy_samples": 40, "initial_parameters": "domain", "augment": True}}
@@ -388,11 +394,14 @@ def test_the_page_of_lengths_has_the_table_of_its_stored_runs(capsys):
     assert capsys.readouterr().out in (EXPERIMENTS / "lengths" / "README.md").read_text()
 
 
-def test_a_run_of_another_sharing_replaces_no_stored_run_with_unknown_boats():
+def test_a_run_of_another_sharing_replaces_no_stored_run_with_unknown_boats(tmp_path):
     study_of = study("generalisation")
     row = dict.fromkeys(study_of.SETTINGS, "") | {"frames": 200, "seed": 1, "sharing": "shared"}
     other = row | {"sharing": "per_option"}
-    assert len(study_of.merged([row], [other])) == 2 and len(study_of.merged([row], [row])) == 1
+    write_tables(tmp_path, {"results": [row]})
+    for new, num in ((row, 1), (other, 2)):
+        add_to_tables(tmp_path, {"results": [new]}, study_of.RUN)
+        assert len(read_csv(tmp_path / "results.csv")) == num
 
 
 def test_the_table_of_unknown_boats_has_a_column_for_each_head():

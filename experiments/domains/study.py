@@ -122,7 +122,10 @@ def learner(run: Run) -> str:
 
 
 def merged(stored: Rows, new: Rows) -> Rows:
-    """Return the stored rows, with rows of repeated runs replaced by the new rows, by domain and learner."""
+    """Return the stored rows, with rows of repeated runs replaced by the new rows, in order of `DOMAINS`.
+
+    `add_to_tables` would sort domains by their letters, and tables would follow. Earlier rows lack columns of new ones.
+    """
     merged_rows = with_repeats_replaced(stored, new, KEY)
     columns = dict.fromkeys(name for row in [*new, *merged_rows] for name in row)
     rows = [{name: row.get(name, "") for name in columns} for row in merged_rows]

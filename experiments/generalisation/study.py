@@ -19,14 +19,13 @@ from matplotlib.figure import Figure
 from hpamdp.analysis.study import (
     Rows,
     Run,
+    add_to_tables,
     finished,
     groups,
     mean_interval,
     read_csv,
     spread,
     with_enough_seeds,
-    with_repeats_replaced,
-    write_tables,
 )
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.messages import exit_code
@@ -45,6 +44,7 @@ SETTINGS = (
     "memory",
     "sharing",
 )
+RUN = (*SETTINGS, "frames", "seed")  # the columns that name a run
 FIRST_LATER, NUM_TRIPS = 3, 8
 PEOPLE_EPISODES = 60
 PLANNING = ("pets", "dlpa")  # their plans end with the trip, whatever `agent.values_end` says
@@ -89,12 +89,6 @@ def _values_end(agent: dict) -> str:
     """Return where values end, such as `trip`, or `trip, selector: session` if the two levels differ."""
     of_selector = agent.get("selector_values_end") or agent["values_end"]
     return agent["values_end"] + (f", selector: {of_selector}" if of_selector != agent["values_end"] else "")
-
-
-def merged(stored: Rows, new: Rows) -> Rows:
-    """Return the stored rows with those of repeated runs replaced, in order of the settings."""
-    names = (*SETTINGS, "frames", "seed")
-    return sorted(with_repeats_replaced(stored, new, names), key=lambda row: tuple(str(row[name]) for name in names))
 
 
 def later(row: dict, first: int = FIRST_LATER) -> float:
@@ -212,8 +206,7 @@ def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        stored = read_csv(HERE / "results.csv") if (HERE / "results.csv").exists() else []
-        write_tables(HERE, {"results": merged(stored, gather(finished(folders)))})
+        add_to_tables(HERE, {"results": gather(finished(folders))}, RUN)
     stored = {name: HERE / f"{name}.csv" for name in ("results", "players", "transfer", "people")}
     results, players, transfer, people = (read_csv(file) if file.exists() else [] for file in stored.values())
     results = with_enough_seeds(results, *SETTINGS)

@@ -191,6 +191,8 @@ def with_repeats_replaced(stored: Rows, new: Rows, names: Sequence[str]) -> Rows
 def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str]) -> None:
     """Add rows to csv files, in the place of those of repeated runs; sort them by these columns, which name a run.
 
+    In a column with numbers and texts, numbers come first.
+
     Args:
         folder: of the files.
         tables: the new rows by the names of the files. The first table has one row for each run.
@@ -206,7 +208,7 @@ def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str]
     merged = {}
     for table, new in tables.items():
         rows = with_repeats_replaced(read_csv(folder / f"{table}.csv"), new, names)
-        merged[table] = sorted(rows, key=lambda row: tuple(row[name] for name in names))
+        merged[table] = sorted(rows, key=lambda row: [(isinstance(row[name], str), row[name]) for name in names])
     write_tables(folder, merged)
 
 
