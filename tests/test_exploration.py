@@ -506,6 +506,14 @@ REFUSED = [
         "exploration: no picture is seen twice; use exploration=novelty",
     ),
     (
+        "high=value low=pets exploration=counts",
+        "exploration: low=pets does not predict whole observations here, so it cannot tell how new they are; use low.a",
+    ),
+    (
+        "high=value low=pets exploration=novelty exploration.in_plans=distillation",
+        "use low.augment=false, or exploration=novelty exploration.in_plans=disagreement",
+    ),
+    (
         "low=hppo +low.per_option={congruent:random} exploration=held",
         "exploration=held: changes actions, which low=random does not take",
     ),

@@ -171,6 +171,8 @@ def _check_groups(line: CommandLine, conf: Path) -> None:
             raise ConfigError(f"{override.input_line}: must be a folder; write {as_text(override.input_line or '')}")
         if override.key_or_group == CALLBACK:
             raise ConfigError(f"{override.input_line}: a run has a list of callbacks; write callbacks=[NAME, ...]")
+        if override.is_add() and override.key_or_group in GROUPS:
+            raise ConfigError(f"{override.input_line}: {override.key_or_group} is always chosen; leave out the +")
         folder = conf / override.key_or_group
         if not os.path.isdir(folder) or override.is_delete():  # unlike `Path.is_dir` for any text
             continue

@@ -130,6 +130,8 @@ def _no_such_setting(cfg: DictConfig, path: list[str], name: str, known: list[st
         guesses = elsewhere(name, names) or close_names(name, names) or _in_groups(cfg, name)
         return no_such(f"group or value of the run ({RUN_FILE})", name, names, guesses=guesses)
     if len(path) == 1 and path[0] in GROUPS:
-        cls = str(OmegaConf.to_container(cfg[path[0]]).get(TARGET) or "none").rpartition(".")[2]  # type: ignore[union-attr]
-        return no_such(f"setting of {cls}", name, known)
+        group, target = path[0], OmegaConf.to_container(cfg[path[0]]).get(TARGET)  # type: ignore[union-attr]
+        if target is None:
+            return f"{group}={cfg.hydra.runtime.choices[group]} has no settings; choose another {group}, too"
+        return no_such(f"setting of {str(target).rpartition('.')[2]}", name, known)
     return no_such(f"value of {'.'.join(path)}", name, known)

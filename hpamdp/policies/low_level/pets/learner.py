@@ -145,7 +145,8 @@ class PETS(ReplayLearner):
         """
         if bonus.of is not None and (self.model.frame.turns or len(self.entries) < self.num_entries):
             raise SettingError(
-                "in_plans=distillation: low=pets does not predict whole observations; use low.augment=false"
+                "low=pets does not predict whole observations here, so it cannot tell how new they are; use "
+                "low.augment=false, or exploration=novelty exploration.in_plans=disagreement"
             )
         super().take_bonus(bonus)
         self.policy.bonus = bonus
