@@ -99,6 +99,8 @@ def test_networks_alone_are_scored_but_not_resumed():
     assert checkpoint.find(folder, "low.checkpoint").name == "policy.pt"
     with pytest.raises(ConfigError, match="networks alone, which cannot be resumed"):
         checkpoint.find(folder, "resume")
+    with pytest.raises(ConfigError, match=r"policy\.pt: networks alone, which cannot be resumed; give a run's output"):
+        hpamdp.train(resume=f"{folder}/policy.pt", progress=False)
 
 
 def test_the_words_of_eval_take_the_agent_from_its_folder():

@@ -71,6 +71,7 @@ _RENAMED = {"optimiser": "optimizer"}
 STATES = ("collection", "recorder")
 # The same, missing in checkpoints of earlier versions.
 _NEWER_STATES = ("callbacks",)
+_NOT_RESUMED = "networks alone, which cannot be resumed"
 # Errors that damaged bytes of a file can raise.
 _DAMAGE = (
     zipfile.BadZipFile,
@@ -107,7 +108,7 @@ def find(path: str | Path, where: str) -> Path:
         file = path / POLICY_NAME
     if not os.path.isfile(file):
         has_policy = os.path.isfile(path / POLICY_NAME)
-        why = "networks alone, which cannot be resumed" if has_policy else "no checkpoint there"
+        why = _NOT_RESUMED if has_policy else "no checkpoint there"
         names = f", or one of {', '.join(agent_names())}" if os.sep not in str(path) and where != "resume" else ""
         raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}{names}")
     if not zipfile.is_zipfile(file):
@@ -269,6 +270,8 @@ def load(
     states: dict[str, dict[str, Any]] = {}
     replays: dict[str, _Replay] = {}
     with _Opened(file) as opened:
+        if with_training and not opened.names - {"agent", "collection"}:
+            raise ConfigError(f"{file}: {_NOT_RESUMED}; give a run's output folder or its {FILE_NAME}")
         stateful = agent.stateful() if with_training else {}
         buffers = {name: part for name, part in stateful.items() if isinstance(part, ReplayBuffer)}
         missing = ({"agent", "rng", *STATES, *stateful} if with_training else {"agent"}) - {*buffers} - opened.names
