@@ -25,43 +25,51 @@ class ScalarTable:
 
     def __init__(self, name: str) -> None:
         self.map = maps.read(name)
-        self.polygons = [np.array(polygon) for polygon in self.map.polygons]
+        # Each polygon as edges: a corner, and the vector to the following one.
+        self.polygons = []
+        for polygon in self.map.polygons:
+            following = [*polygon[1:], polygon[0]]
+            self.polygons.append(
+                [(x, y, to_x - x, to_y - y) for (x, y), (to_x, to_y) in zip(polygon, following, strict=True)]
+            )
 
     def step(self, x: float, y: float, vx: float, vy: float, action: int, strength: float) -> tuple[list[float], bool]:
         """Return place and velocity after a step, and whether the ball is in the hole."""
-        place, speed = np.array([x, y]), np.array([vx, vy])
+        radius = self.map.ball
         if action != NONE:
-            speed[action % 2] += strength / 5.0
+            vx, vy = (vx, vy + strength / 5.0) if action % 2 else (vx + strength / 5.0, vy)
         for tick in range(20):
-            place = place + speed * self.map.ball / 20.0
-            touched = [found for found in (self.touched(p, place, speed) for p in self.polygons) if found]
+            x, y = x + vx * radius / 20.0, y + vy * radius / 20.0
+            touched = [found for found in (self.touched(each, x, y, vx, vy) for each in self.polygons) if found]
             if len(touched) == 1 and len(touched[0]) == 1:
-                speed = self.mirrored(speed, touched[0][0])
+                vx, vy = self.mirrored(vx, vy, *touched[0][0])
             elif touched:
-                speed = -speed
+                vx, vy = -vx, -vy
             if len(touched) == 1 and tick == 19:
-                place = place + speed * self.map.ball / 20.0
-            if math.dist(place, self.map.target[:2]) < self.map.target[2]:
-                return [*place, *speed], True
-        place = [0.95 if each > 1.0 else 0.05 if each < 0.0 else each for each in place]
-        return [*place, *np.clip(0.995 * speed, -2.0, 2.0)], False
+                x, y = x + vx * radius / 20.0, y + vy * radius / 20.0
+            if math.dist((x, y), self.map.target[:2]) < self.map.target[2]:
+                return [x, y, vx, vy], True
+        place = [0.95 if each > 1.0 else 0.05 if each < 0.0 else each for each in (x, y)]
+        return [*place, *(min(max(0.995 * speed, -2.0), 2.0) for speed in (vx, vy))], False
 
-    def touched(self, polygon: np.ndarray, place: np.ndarray, speed: np.ndarray) -> list[np.ndarray]:
+    def touched(self, edges: list[tuple], x: float, y: float, vx: float, vy: float) -> list[tuple[float, float]]:
         """Return the edges of a polygon that the ball touches, as vectors."""
         found = []
-        for corner, following in zip(polygon, np.roll(polygon, -1, 0), strict=True):
-            edge = following - corner
-            nearest = corner + edge * min(max((place - corner) @ edge / (edge @ edge), 0.0), 1.0)
-            way = nearest - place
-            angle = abs(math.atan2(*way) - math.atan2(*speed))
-            if math.hypot(*way) <= self.map.ball and min(angle, 2.0 * math.pi - angle) <= math.pi / 1.99:
-                found.append(edge)
+        for corner_x, corner_y, edge_x, edge_y in edges:
+            along = ((x - corner_x) * edge_x + (y - corner_y) * edge_y) / (edge_x * edge_x + edge_y * edge_y)
+            along = min(max(along, 0.0), 1.0)
+            way_x, way_y = corner_x + edge_x * along - x, corner_y + edge_y * along - y
+            if math.hypot(way_x, way_y) > self.map.ball:
+                continue
+            angle = abs(math.atan2(way_x, way_y) - math.atan2(vx, vy))
+            if min(angle, 2.0 * math.pi - angle) <= math.pi / 1.99:
+                found.append((edge_x, edge_y))
         return found
 
-    def mirrored(self, speed: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    def mirrored(self, vx: float, vy: float, edge_x: float, edge_y: float) -> tuple[float, float]:
         """Return the velocity mirrored at an edge."""
-        angle = 2.0 * math.atan2(edge[1], edge[0]) - math.atan2(speed[1], speed[0])
-        return math.hypot(*speed) * np.array([math.cos(angle), math.sin(angle)])
+        angle, speed = 2.0 * math.atan2(edge_y, edge_x) - math.atan2(vy, vx), math.hypot(vx, vy)
+        return speed * math.cos(angle), speed * math.sin(angle)
 
 
 def columns(rows: object, dtype: torch.dtype = torch.float64) -> PinballState:
@@ -116,7 +124,9 @@ def test_steps_from_anywhere_follow_the_published_rules(name):
     strength = torch.where(discrete >= LEFT, -strength, strength)
     got, _ = rules.act(columns(rows), discrete, strength, table_of(name))
     scalar = ScalarTable(name)
-    played = [scalar.step(*row, a, s) for row, a, s in zip(rows.tolist(), discrete.tolist(), strength, strict=True)]
+    played = [
+        scalar.step(*row, a, s) for row, a, s in zip(rows.tolist(), discrete.tolist(), strength.tolist(), strict=True)
+    ]
     expected = columns([place for place, _ in played])
     for column, right in zip(got[:4], expected[:4], strict=True):
         torch.testing.assert_close(column, right, rtol=0.0, atol=1e-9)

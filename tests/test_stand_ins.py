@@ -47,30 +47,43 @@ def test_modules_with_stand_ins_are_not_seen_afterwards(quick):
     assert quick["left"] == []
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "low.gamma=hi",
-        "low.gama=1",
-        "total_frames=-1",
-        "high=none",
-        "env=goal high=ucb",
-        "num_envs=3 collector=multi",
-        "env=circuit env.task=bell env.target_number=1 high=none",
-    ],
+MISTAKES = (
+    "low.gamma=hi",
+    "low.gama=1",
+    "total_frames=-1",
+    "high=none",
+    "env=goal high=ucb",
+    "num_envs=3 collector=multi",
+    "env=circuit env.task=bell env.target_number=1 high=none",
 )
-def test_a_wrong_setting_is_refused_before_torch_is_imported(words, tmp_path):
+
+
+@pytest.fixture(scope="module")
+def refusals(tmp_path_factory) -> dict[str, list]:
+    """The exit code and stderr of each mistake, and whether torch or tensordict was imported by then."""
     program = f"""
-import sys
-sys.argv = ["hpamdp", *{words.split()!r}]
+import contextlib, io, json, sys
 from hpamdp.cli import main
-try:
-    main()
-except SystemExit as end:
-    print(end.code, "torch" in sys.modules, "tensordict" in sys.modules)
+refusals = {{}}
+for words in {MISTAKES!r}:
+    sys.argv, code = ["hpamdp", *words.split()], 0
+    with contextlib.redirect_stderr(io.StringIO()) as err:
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+    refusals[words] = code, err.getvalue(), bool({{"torch", "tensordict"}} & {{*sys.modules}})
+print(json.dumps(refusals))
 """
-    done = python("-c", program, cwd=tmp_path)
-    assert done.stdout == "2 False False\n" and done.stderr.count("\n") == 1, done.stderr
+    done = python("-c", program, cwd=tmp_path_factory.mktemp("refusals"))
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_a_wrong_setting_is_refused_before_torch_is_imported(words, refusals):
+    code, err, is_imported = refusals[words]
+    assert (code, err.count("\n"), is_imported) == (2, 1, False), err
 
 
 def test_classes_of_a_user_that_groups_and_values_name_are_imported_without_stand_ins(tmp_path):
