@@ -2,6 +2,7 @@
 
 import copy
 import gc
+import math
 import multiprocessing
 import os
 import pickle
@@ -33,6 +34,7 @@ from hpamdp.config.schema import Config
 from hpamdp.data.human import released_file
 from hpamdp.data.human.released_file import HumanData
 from hpamdp.env.boatdock import harbour
+from hpamdp.run import assemble
 from hpamdp.run.assemble import choose_selector
 
 # Tests that are started in the background or under nohup inherit ignored signals, and so would what they start.
@@ -197,6 +199,22 @@ def global_generators_unmoved() -> Iterator[None]:
     before = states()
     yield
     assert states() == before
+
+
+# The number of updates from which a run compiles them by default.
+UPDATES_THAT_PAY = assemble._UPDATES_THAT_PAY
+
+
+@pytest.fixture(autouse=True)
+def nothing_compiled_by_default(request) -> Iterator[None]:
+    """Have quick tests compile updates only if they say so.
+
+    Some tests make a few updates of a run with its usual length, for which compilation would pay.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if request.node.get_closest_marker("slow") is None:
+            patch.setattr(assemble, "_UPDATES_THAT_PAY", math.inf)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from conftest import compose_config, make_config
+from conftest import UPDATES_THAT_PAY, compose_config, make_config
 from test_grid import SHORT
 
 from hpamdp.config.errors import ConfigError
@@ -86,6 +86,7 @@ def test_the_closing_table_names_learners_that_look_far_less_ahead_than_episodes
 def test_updates_are_compiled_by_default_if_the_run_makes_many(monkeypatch):
     asked = []
     monkeypatch.setattr(PDQN, "compile_updates", lambda self: asked.append(self))
+    monkeypatch.setattr("hpamdp.run.assemble._UPDATES_THAT_PAY", UPDATES_THAT_PAY)
     few, many = (f"total_frames={steps}" for steps in (20_000, 400_000))
     for words, is_compiled in (([few], False), ([many], True), ([many, "compile_updates=false"], False)):
         asked.clear()
