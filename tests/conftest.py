@@ -33,7 +33,7 @@ from hpamdp.config.compose import read
 from hpamdp.config.schema import Config
 from hpamdp.data.human import released_file
 from hpamdp.data.human.released_file import HumanData
-from hpamdp.env.boatdock import harbour
+from hpamdp.env.boatdock import harbour, planner
 from hpamdp.run import assemble
 from hpamdp.run.assemble import choose_selector
 
@@ -226,6 +226,23 @@ def draw_all() -> Iterator[Callable[..., object]]:
         drawing = figures.draw_all
         patch.setattr(figures, "draw_all", lambda folder, env: [])
         yield drawing
+
+
+@pytest.fixture(scope="session", autouse=True)
+def best_scores_planned_once() -> Iterator[None]:
+    """Have boats plan the best scores of the same layouts once; nearly all evaluations of the tests have the same."""
+    plan, planned = planner.best_scores, {}
+
+    def plan_once(rules, layout, keymap):
+        places = [column.numpy(force=True).tobytes() for column in (*layout, keymap)]
+        given = repr(rules), torch.get_default_dtype(), *places
+        if given not in planned:
+            planned[given] = plan(rules, layout, keymap)
+        return planned[given].to(keymap.device, copy=True)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planner, "best_scores", plan_once)
+        yield
 
 
 @pytest.fixture
