@@ -35,6 +35,7 @@ from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP
 from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 EXPLORING = ["hppo", "pdqn", "paddpg", "hsac", "hyar", "qpamdp", "dlpa", "pets"]
@@ -363,6 +364,20 @@ def test_cells_have_places_of_their_own_in_the_table_of_counts():
     assert len(table.places(cells).unique()) > 0.97 * len(cells), "few of 9,261 cells share one of 262,139 places"
     table.see(cells)
     assert table.counts.sum() == len(cells)
+
+
+def test_cells_leave_out_the_entries_whose_resolution_is_0():
+    table = VisitTable(4, CountsOptions(resolution=[10.0, 10.0, 0.0, 0.0]))
+    place, other = torch.tensor([0.3, -0.6]), torch.tensor([0.3, -0.4])
+    speeds = torch.tensor([[0.0, 0.0], [-1.0, 0.7], [0.5, -0.2]])
+    table.see(torch.cat([place.expand(3, 2), speeds], -1))
+    assert table.bonus(torch.cat([place, -speeds[1]])) == pytest.approx(3.0**-0.5)
+    assert table.bonus(torch.cat([other, speeds[1]])) == 1.0
+
+
+def test_counts_refuse_a_list_of_resolutions_of_another_length():
+    with pytest.raises(SettingError, match=r"resolution=\[1\.0, 2\.0\]: must have a number for each of 4 entries"):
+        Counts(HPPO(SPECS), resolution=[1.0, 2.0])
 
 
 @pytest.mark.parametrize("kind", [DLPA, PETS])

@@ -16,7 +16,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import torch
-from pydantic import Field, PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -25,7 +25,7 @@ from hpamdp import keys
 from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.exploration.base import Explored
 from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
-from hpamdp.settings import SettingError, Settings
+from hpamdp.settings import FromList, SettingError, Settings
 
 _HASH_SEED = 0  # of the factors of the hash, which are the same in every run
 _LARGEST_FACTOR = 2**40
@@ -39,10 +39,11 @@ class CountsOptions(Settings):
 
     The visits of a batch count before its bonuses: ten environments that enter a cell together share its novelty.
     """
-    resolution: PositiveFloat = 10.0
+    resolution: PositiveFloat | Annotated[tuple[NonNegativeFloat, ...], FromList, Field(min_length=1)] = 10.0
     """Cells in a unit of each entry of the observation: entries are multiplied by it and rounded.
 
-    With 1, an entry that is 0 or 1, such as a tile, has two cells, and an entry in [-1, 1] has three.
+    With 1, an entry that is 0 or 1, such as a tile, has two cells, and an entry in [-1, 1] has three. A list has a
+    number for each entry, and 0 leaves an entry out: `[10,10,0,0]` counts the places of a ball at any speed.
     """
     table_size: Annotated[int, Field(ge=1, le=10_000_000)] = 262_139
     """Places in the table of counts, best a prime. Cells that share a place share their count."""
@@ -58,13 +59,15 @@ class VisitTable(nn.Module):
 
     counts: Tensor
     factors: Tensor
+    resolution: Tensor
 
     def __init__(self, observation_dim: int, options: CountsOptions) -> None:
         super().__init__()
-        self.resolution = options.resolution
         generator = torch.Generator().manual_seed(_HASH_SEED)
         factors = torch.randint(_LARGEST_FACTOR, (observation_dim,), generator=generator)
         self.register_buffer("factors", factors, persistent=False)
+        resolution = torch.tensor(options.resolution, dtype=torch.float32)
+        self.register_buffer("resolution", resolution, persistent=False)
         self.register_buffer("counts", torch.zeros(options.table_size, dtype=torch.long))
 
     def places(self, observation: Tensor) -> Tensor:
@@ -100,6 +103,10 @@ class Counts(RewardsNewStates):
         options = CountsOptions.of(options, settings)
         if learner.specs.has_pictures:
             raise SettingError("no picture is seen twice; use exploration=novelty")
+        num_entries = learner.specs.observation_dim
+        if isinstance(options.resolution, tuple) and len(options.resolution) != num_entries:
+            given = list(options.resolution)
+            raise SettingError(f"resolution={given}: must have a number for each of {num_entries} entries")
         super().__init__(learner, options.weight)
         self.options = options
         self.table = VisitTable(learner.specs.observation_dim, self.options)
