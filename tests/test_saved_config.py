@@ -219,6 +219,26 @@ def test_play_accepts_a_guarded_setting_if_repeated_or_if_the_file_is_trusted(co
     assert permissions(str(tmp_path), make_config([]), ["env.recording=null", "env.slip=0"]) == ["env.recording=null"]
 
 
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["env.slip=abc"], 'env.slip="abc": must be a valid number (BoatDockEnv, given as an argument)'),
+        (
+            ["logger=wandb", "logger.name=3"],
+            "logger.name=3: must be a valid string (WandbLogger, given as an argument)",
+        ),
+        (
+            ["env=platform"],
+            "high=linucb: env=platform has no options to choose; use high=none. "
+            "But checkpoint=linucb_hppo gives the agent, so change other settings",
+        ),
+    ],
+)
+def test_a_wrong_word_for_a_saved_agent_is_told_with_its_place_and_what_can_be_changed(words, line, command):
+    code, _, err = command("mode=eval", "checkpoint=linucb_hppo", *words)
+    assert (code, err) == (2, f"{line}\n")
+
+
 def test_no_file_gives_itself_trust(of_toy, command, tmp_path):
     folder = forged(of_toy, tmp_path / "forged", lambda config: config.update(trust=True))
     code, _, err = command("mode=eval", f"checkpoint={folder}")

@@ -10,7 +10,7 @@ import importlib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, get_type_hints
+from typing import Any, TypeAlias, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, PydanticUserError, create_model
 
@@ -43,6 +43,8 @@ RUN_VALUES: dict[str, tuple[str, ...]] = {
     "env": ("grouping",),
     CALLBACK: ("name",),
 }
+# Returns where a setting with this name in messages, such as `low.lr`, was set; None if that is not known.
+PlaceOf: TypeAlias = Callable[[str], "str | None"]
 # The base class that a group's classes must have. If it is a protocol, a class only needs its methods.
 _BASE_CLASSES = {
     "env": "hpamdp.env.base.PAMDPEnv",
@@ -138,7 +140,7 @@ def component(
     name: str,
     given: Mapping[str, Any],
     prefix: str = "",
-    place_of: Callable[[str], str | None] | None = None,
+    place_of: PlaceOf | None = None,
 ) -> Component:
     """Check the class and the settings of a group without building the object.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.complaints import as_json, no_such
-from hpamdp.config.components import CALLBACK, GROUPS, TARGET, file_of
+from hpamdp.config.components import CALLBACK, GROUPS, TARGET, PlaceOf, file_of
 from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.schema import Config, RunConfig, check_run, checked_config
 from hpamdp.config.yaml_files import complete_yaml_files
@@ -73,8 +73,8 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     return replace(check(given, names, place_of), config_dirs=folders)
 
 
-def read_run(cfg: DictConfig) -> tuple[RunConfig, tuple[str, ...]]:
-    """Check the values of the run alone; return them, and the folders of yaml files besides conf/.
+def read_run(cfg: DictConfig) -> tuple[RunConfig, PlaceOf | None, tuple[str, ...]]:
+    """Check the values of the run alone; return them, where settings were set, and the folders besides conf/.
 
     For a config that a saved run completes: what is chosen in the groups is then the saved run's, and settings that
     need one another may be set by either.
@@ -83,12 +83,12 @@ def read_run(cfg: DictConfig) -> tuple[RunConfig, tuple[str, ...]]:
         ConfigError: a value is wrong, or nothing is chosen for a group.
     """
     given, names, place_of, folders = _plainly(cfg, chosen_names(cfg))
-    return check_run(given, names, place_of), folders
+    return check_run(given, names, place_of), place_of, folders
 
 
 def _plainly(
     cfg: DictConfig, names: Mapping[str, str]
-) -> tuple[dict[str, Any], Mapping[str, str], Callable[[str], str | None] | None, tuple[str, ...]]:
+) -> tuple[dict[str, Any], Mapping[str, str], PlaceOf | None, tuple[str, ...]]:
     """Return the composed config as plain values, the names, where a setting was set, and the folders of yaml files."""
     for group in GROUPS:
         if cfg.get(group) is None or TARGET not in cfg[group]:
@@ -99,7 +99,7 @@ def _plainly(
     OmegaConf.set_struct(own, False)
     own.pop("hydra", None)
     folders: tuple[str, ...] = ()
-    place_of: Callable[[str], str | None] | None = None
+    place_of: PlaceOf | None = None
     if "hydra" in cfg or HydraConfig.initialized():
         node = cfg.hydra if "hydra" in cfg else HydraConfig.get()
         _check_found(node, names)
@@ -165,9 +165,7 @@ def _check_found(node: Any, names: Mapping[str, str]) -> None:
             raise ConfigError(f"{group}={recipe}: {no_such(f'file in conf/{group}', recipe, names_of(group))}")
 
 
-def check(
-    given: Mapping[str, Any], names: Mapping[str, str], place_of: Callable[[str], str | None] | None = None
-) -> Config:
+def check(given: Mapping[str, Any], names: Mapping[str, str], place_of: PlaceOf | None = None) -> Config:
     """Check the config as plain values, without resolving text.
 
     Args:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hpamdp.complaints import as_json
-from hpamdp.config.components import GROUPS, RUN_VALUES, TARGET
+from hpamdp.config.components import GROUPS, RUN_VALUES, TARGET, PlaceOf
 from hpamdp.config.compose import check, choosing, compose, is_name, names_of, plain_groups
 from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.schema import AgentConfig, Config, EnvConfig
@@ -41,6 +41,7 @@ def read_saved(
     *,
     trust: bool = False,
     file: object = "the saved run",
+    place_of: PlaceOf | None = None,
 ) -> Config:
     """Return a saved config, changed by the given values and checked.
 
@@ -51,6 +52,7 @@ def read_saved(
         names: the names of the groups in `given`.
         trust: whether the saved config may set the `guarded_settings` of a class.
         file: the file of the config.
+        place_of: returns where a setting in `given` was set, for errors; None if that is not known.
 
     Raises:
         ConfigError: a value is wrong, a name has no yaml file in the searched folders, or only `saved` sets a
@@ -70,7 +72,12 @@ def read_saved(
         values["low"]["per_option"] = {option: _with_new_names(choice) for option, choice in per_option.items()}
     for name, value in given.items():
         _set(values, name.split("."), value)
-    config = check(values, {**choices, **names})
+
+    def place_of_given(setting: str) -> str | None:
+        is_given = any(setting == name or setting.startswith(f"{name}.") for name in given)
+        return place_of(setting) if is_given and place_of is not None else None
+
+    config = check(values, {**choices, **names}, place_of_given)
     found = {} if trust else _guarded(config, saved, today, given)
     if found:
         settings = ", ".join(f"{setting}={as_json(value)}" for setting, value in found.items())

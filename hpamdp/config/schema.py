@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -13,7 +13,7 @@ import yaml
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
 
 from hpamdp.complaints import as_json
-from hpamdp.config.components import CALLBACK, GROUPS, TARGET, Component, check_base_class, component, file_of
+from hpamdp.config.components import CALLBACK, GROUPS, TARGET, Component, PlaceOf, check_base_class, component, file_of
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.settings import FromList, Settings
 
@@ -251,9 +251,7 @@ class Config:
         return yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True)
 
 
-def check_run(
-    given: Mapping[str, Any], names: Mapping[str, str], place_of: Callable[[str], str | None] | None = None
-) -> RunConfig:
+def check_run(given: Mapping[str, Any], names: Mapping[str, str], place_of: PlaceOf | None = None) -> RunConfig:
     """Check the values of the run.
 
     Args:
@@ -288,7 +286,7 @@ def checked_config(
     names: Mapping[str, str],
     learners: Mapping[str, tuple[str, Any]],
     callbacks: Sequence[tuple[str, Any]],
-    place_of: Callable[[str], str | None] | None = None,
+    place_of: PlaceOf | None = None,
 ) -> Config:
     """Check the classes and the settings of all groups.
 

@@ -7,12 +7,14 @@ attributes of classes, so they can be checked without torch.
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
 from hpamdp.complaints import as_json
 from hpamdp.config.components import Component, constructor_arguments, is_passed
+from hpamdp.config.compose import RECIPE
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.facts import ProblemFacts
@@ -24,6 +26,9 @@ AUTO_SELECTOR, DEFAULT_SELECTOR = "auto", "ucb"
 # The encoder that encodes pictures if there are any.
 AUTO_ENCODER = "auto"
 
+# Parts of the config that define the agent.
+GROUPS_OF_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment", "search", RECIPE)
+
 Rule: TypeAlias = Callable[[Config], "str | None"]
 ProblemRule: TypeAlias = Callable[[Config, ProblemFacts], "str | None"]
 
@@ -34,7 +39,7 @@ def check(config: Config) -> None:
     Raises:
         ConfigError: a rule is broken; the message names the settings to change.
     """
-    _check(rule(config) for rule in RULES)
+    _check((rule(config) for rule in RULES), config.run)
     facts = facts_of(config)
     if facts is not None:
         check_problem(config, facts)
@@ -46,7 +51,7 @@ def check_saved_run(run: RunConfig) -> None:
     Raises:
         ConfigError: it does not go with the mode, or the name is empty.
     """
-    _check([_of_saved_run(run)])
+    _check([_of_saved_run(run)], run)
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:
@@ -55,7 +60,7 @@ def check_problem(config: Config, facts: ProblemFacts) -> None:
     Raises:
         ConfigError: a rule is broken; the message names the settings to change.
     """
-    _check(rule(config, facts) for rule in PROBLEM_RULES)
+    _check((rule(config, facts) for rule in PROBLEM_RULES), config.run)
 
 
 def facts_of(config: Config) -> ProblemFacts | None:
@@ -86,10 +91,15 @@ def with_selector(config: Config, problem: ProblemFacts, words: Sequence[str] = 
     return replace(config, high=Component("high", "none", None, {}))
 
 
-def _check(complaints: Iterable[str | None]) -> None:
+def _check(complaints: Iterable[str | None], run: RunConfig) -> None:
     complaint = next((complaint for complaint in complaints if complaint is not None), None)
-    if complaint is not None:
-        raise ConfigError(complaint)
+    if complaint is None:
+        return
+    source = run.resume or run.checkpoint
+    if source and re.split("[.=:]", complaint)[0] in GROUPS_OF_AGENT:
+        where = "resume" if run.resume else "checkpoint"
+        complaint += f". But {where}={source} gives the agent, so change other settings"
+    raise ConfigError(complaint)
 
 
 def _levels(config: Config) -> list[Component]:

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hpamdp.complaints import as_json
 from hpamdp.config.components import GROUPS
-from hpamdp.config.compose import RECIPE, choosing, chosen_names, conf_dir, names_of, plain, read, read_run
+from hpamdp.config.compose import choosing, chosen_names, conf_dir, names_of, plain, read, read_run
 from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.outside_jobs import searched, searching
 from hpamdp.config.saved import choices_of, read_saved, upgraded
@@ -26,8 +26,6 @@ from hpamdp.run import checkpoint, compatibility
 from hpamdp.run.assemble import choose_selector, make_env
 from hpamdp.shell import setting
 
-# Parts of the config that define the agent.
-_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment", "search", RECIPE)
 # Settings that a run does not take over from the saved run.
 _BEGIN = ("mode", "resume", "checkpoint", "overwrite", "trust")
 # Groups that an evaluation does not take from the saved run: it collects no steps and logs where the command line says.
@@ -51,7 +49,7 @@ def resolve(
     Raises:
         ConfigError: a value is wrong, the checkpoint does not exist, or a word would change the saved agent.
     """
-    run, folders = read_run(cfg)
+    run, place_of, folders = read_run(cfg)
     compatibility.check_saved_run(run)
     where = "resume" if run.resume is not None else "checkpoint"
     source = run.resume or run.checkpoint
@@ -71,7 +69,7 @@ def resolve(
     values |= {name: _plain_value(cfg, name) for name in changed if not name.startswith("hydra")}
     names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
     try:
-        resolved = read_saved(saved, values, names, trust=run.trust, file=file)
+        resolved = read_saved(saved, values, names, trust=run.trust, file=file, place_of=place_of)
     except MissingChoiceError as error:
         raise _not_there(error, file) from error
     return replace(resolved, config_dirs=folders).with_objects(objects), file
@@ -191,7 +189,7 @@ def _changes(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, whe
     choices = choices_of(saved)
     changes = [word for word in overrides if _name(word) not in GROUPS or _choice(word) != choices[_name(word)]]
     for word in changes:
-        if re.split(r"[./]", _name(word))[0] in _AGENT:
+        if re.split(r"[./]", _name(word))[0] in compatibility.GROUPS_OF_AGENT:
             raise ConfigError(f"{word}: {where} takes the agent from {file}; leave this out")
     return changes
 
