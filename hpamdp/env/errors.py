@@ -1,4 +1,4 @@
-"""Errors of problems: whose fault they are, the problem's or a third-party environment's, and what they leave open."""
+"""Errors of problems: whether the problem or a third-party environment is at fault; closing environments after one."""
 
 from __future__ import annotations
 

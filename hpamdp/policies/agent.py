@@ -21,7 +21,10 @@ from hpamdp.policies.option_lengths import OptionLengths, PairSelector
 from hpamdp.specs import PAMDPSpecs
 
 FOR_TRAINING = "explorations."
-"""With this begin the names of what explorations keep. What acts of it has other names besides."""
+"""Prefix of an agent's parameters and buffers that are parts of explorations.
+
+A part that also acts, such as a wrapped policy, is part of `router`, too, and has a second name there.
+"""
 
 
 def with_option(rows: TensorDictBase, num_options: int) -> TensorDictBase:
@@ -397,10 +400,10 @@ class HierarchicalAgent(nn.Module):
         values_end_with_trips: whether the learners' values end with a trip, if episodes are sessions of trips. The run
             sets it, and the next one.
         selector_values_end_with_trips: whether the selector's values do.
+        frames: how many steps (decisions) the agent has learned from.
 
     Raises:
         ValueError: the selector's `specs` list other options than the pairs.
-        frames: how many steps (decisions) the agent has learned from.
     """
 
     frames: Tensor

@@ -327,7 +327,7 @@ class Selector(Level, TensorDictModuleBase):
 
     @property
     def remembered_keys(self) -> list[str]:
-        """The keys of a step whose values, left from the step before, a decision depends on."""
+        """The keys that the step before has written and that a decision depends on."""
         return [] if self.memory_key is None else [self.memory_key]
 
     def take_option_values(self, option_values: nn.Module) -> None:

@@ -38,9 +38,9 @@ class ValueOptions(Settings):
     epsilon: Fraction = 0.05
     """Probability of a random option while exploring."""
     untried_first: bool = False
-    """In sessions of trips: choose an option that the session has not tried yet before all others, also greedily.
+    """In sessions of trips: try each option once, in their order, before values are compared; also greedily.
 
-    What an option shows on its first trip is worth most on later ones, which the value of a trip does not count.
+    What an option shows on its first trip helps most on later trips, which the value of a trip does not count.
     """
 
 

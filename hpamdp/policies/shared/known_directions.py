@@ -20,13 +20,13 @@ _SHORTEST_SUM = 1e-3  # of the known directions, if its opposite is to be the gu
 class KnownDirections(nn.Module):
     """Remembers where each of K discrete actions moved when it was last taken in the episode.
 
-    The state `[*B, O 2 K]` has x of all actions, then y: unit vectors, or zeros for an action that was not taken yet.
-    If each option has directions of its own, O is the number of options, one after another; else it is 1.
+    The state `[*B, 2 K]` has x of all actions, then y: unit vectors, or zeros for an action that was not taken yet.
+    If each option has directions of its own, the state `[*B, O * 2 K]` has these entries for each of the O options.
 
     The features `[*B, 3 K + entries]` begin with a table of the held option: x of all directions, y of all directions,
     and the certainty of all. The direction of an action that was not taken yet is guessed. It is the opposite of the
     known directions' sum, or +x if nothing is known. The certainty is 1 for a known direction. For a guess it rises
-    from -1 with the share of actions that are known. The entries of the observation that are not redundant follow.
+    from -1 with the fraction of known actions. The entries of the observation that are not redundant follow.
 
     Args:
         specs: of the problem, whose geometry says what reveals the directions.
