@@ -483,6 +483,15 @@ def test_all_environments_are_closed_if_closing_one_fails(open_envs):
     assert not open_envs
 
 
+def test_an_error_is_told_even_if_closing_the_environment_fails_after_it():
+    class Fails(Reach):
+        def close(self):
+            raise RuntimeError("window lost")
+
+    with pytest.raises(hpamdp.ConfigError, match="grouping"):
+        hpamdp.make(Fails, 3, **WRONG_OPTION)
+
+
 def test_a_run_whose_end_failed_goes_on_with_the_same_call(tmp_path):
     class Fails(hpamdp.Callback):
         def on_end(self, trainer):

@@ -6,7 +6,7 @@ import os
 import sysconfig
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Protocol
 
 from hpamdp.messages import one_line
@@ -46,11 +46,15 @@ class Closable(Protocol):
 
 @contextmanager
 def closed_on_error(environment: Closable) -> Iterator[None]:
-    """Close an environment if the block raises an error: it may have processes, files or a window."""
+    """Close an environment if the block raises an error: it may have processes, files or a window.
+
+    If closing fails, too, the block's error is raised all the same.
+    """
     try:
         yield
     except BaseException:
-        environment.close()
+        with suppress(Exception):
+            environment.close()
         raise
 
 
