@@ -12,6 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import hpamdp
 from hpamdp import keys
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.env.boatdock_unseen.rules import OBSERVATION_NAMES
 from hpamdp.env.decisions import with_decisions
@@ -294,6 +295,15 @@ QUIET = {
     "progress": False,
 }
 QUICK = {"low.updates_per_step": 0.5, "low.num_iterations": 1, "low.horizon": 1, "low.greedy_samples": 8}
+
+
+@pytest.mark.parametrize("second", [{"name": "pets", "augment": False}, {"name": "hppo", "memory": "none"}])
+def test_learners_of_which_only_some_remember_directions_are_refused(second):
+    more = {**QUIET, **QUICK, "env.boats": 2, "high": "value", "low.per_option": {"boat_2": second}}
+    with pytest.raises(
+        ConfigError, match=r"low\.per_option: env=boatdock_unseen reveals directions, which all learners"
+    ):
+        hpamdp.train("boatdock_unseen", low="pets", **more)
 
 
 @pytest.mark.parametrize("augment", ["auto", False])

@@ -154,6 +154,8 @@ def check_built(config: Config, env: PAMDPEnv) -> None:
             "use agent.termination=steps agent.option_length=1 to change them"
         )
     reveals_directions = env.geometry is not None and env.geometry.revealed is not None
+    if reveals_directions:
+        compatibility.check_directions(config, env.option_names)
     forgotten = compatibility.forgotten_trips(config, facts, reveals_directions=reveals_directions)
     if forgotten is not None:
         warn(forgotten)

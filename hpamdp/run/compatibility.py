@@ -283,6 +283,22 @@ def forgotten_trips(config: Config, problem: ProblemFacts, *, reveals_directions
     )
 
 
+def check_directions(config: Config, option_names: Sequence[str]) -> None:
+    """Refuse learners of single options of which only some remember the directions that the problem reveals.
+
+    That memory would be reset, and see an action, only while an option of these learners is held.
+
+    Raises:
+        ConfigError: some remember them, and others do not.
+    """
+    learners = [config.low_of.get(name, config.low) for name in option_names]
+    if len({*map(_remembers_directions, learners)}) > 1:
+        raise ConfigError(
+            f"low.per_option: {config.env} reveals directions, which all learners must remember or none; "
+            "use pets with the same augment and memory for all options, or augment=false"
+        )
+
+
 # Rules about exploration beside the learners.
 
 
