@@ -829,6 +829,13 @@ def generalisation() -> list[Claim]:
             ceiling=best,
         )
 
+    def last_trips(**cell: Any) -> list[float]:
+        """Return the scores of PETS from the fourth trip on, with turned boats."""
+        runs = rows("generalisation/results.csv", family="turned", low="pets", fleet_size="new", **cell)
+        return [later(row, first=4) for row in runs]
+
+    by_value, by_ucb, one_boat = last_trips(high="value"), last_trips(high="ucb"), last_trips(boats=1)
+    two_boats = rows("generalisation/results.csv", family="turned", high="value", low="pets")
     turned, strength, any_boat, pets = (
         numbers_of(*cell) for cell in (("turned",), ("strength",), ("any",), ("any", "pets"))
     )
@@ -865,6 +872,21 @@ def generalisation() -> list[Claim]:
             "PETS scores {first}, {second} and {later}, {share:.0f} %, after {presses_made:,.0f} presses "
             "({seeds:word} seeds, {minutes:.0f} minutes of CPU time).",
             pets,
+        ),
+        Claim(
+            page("generalisation"),
+            "With two turned boats to choose from, PETS under `high=value` scores {value} from the fourth trip on "
+            "(ceiling {ceiling:.2f}), with one boat {one}. Under UCB within the session it scores {ucb}. These are "
+            "means of {seeds:word} seeds, {presses:,.0f} presses each.",
+            dict(
+                value=spread(by_value, 2),
+                one=spread(one_boat, 2),
+                ucb=spread(by_ucb, 2),
+                ceiling=mean(two_boats, "ceiling"),
+                seeds=seeds(two_boats),
+                presses=mean(two_boats, "frames"),
+            ),
+            holds=min(by_value) > max(float(np.mean(one_boat)), float(np.mean(by_ucb))),
         ),
     ]
 

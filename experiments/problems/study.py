@@ -48,6 +48,10 @@ BARS = {
 }
 
 
+# The smallest standard deviation of H-PPO on circuits in the recipe's earlier form.
+EARLIER_NOISE = 0.003
+
+
 def problem_of(run: Run) -> str:
     """Return the environment of a run, with the settings that make it another problem."""
     name, settings = run.summary["env"], run.config["env"]
@@ -75,6 +79,8 @@ def problem_of(run: Run) -> str:
 def learner_of(run: Run) -> str:
     """Return the learner of a run and the selector above it; the selector alone over random play in the options."""
     high, low = run.summary["high"], run.summary["low"]
+    if run.summary["env"] == "circuit" and run.config["low"].get("min_scale_final") == EARLIER_NOISE:
+        low = f"{low}, noise to {EARLIER_NOISE}"
     if high == "none":
         return low
     return high if low == "random" else f"{high} over {low}"
