@@ -1568,6 +1568,7 @@ GIVEN = {
     "on 1,000 layouts": "the episodes of an evaluation",
     "5 \u00d7 the remaining fuel on success and \u22121 otherwise": "the rule of the score",
     "95 % intervals": "the level of the intervals",
+    "than under UCB within the session (95 % interval": "the level of the interval",
     "interval includes 0": "the meaning of unclear",
     "Table 1": "a table of the paper",
     "| 100 % | 100 % |": "the ceiling's controllers are the planner's",
