@@ -463,4 +463,10 @@ def test_runs_on_different_problems_have_different_names(tmp_path, env, settings
     [("none", "pdqn", "pdqn"), ("ucb", "random", "ucb"), ("meta_critic", "planner", "meta_critic over planner")],
 )
 def test_a_learner_under_a_selector_has_another_name_than_alone(tmp_path, high, low, name):
-    assert study("problems").learner_of(Run(tmp_path, {"high": high, "low": low}, {})) == name
+    assert study("problems").learner_of(Run(tmp_path, {"env": "office", "high": high, "low": low}, {"low": {}})) == name
+
+
+@pytest.mark.parametrize(("least", "name"), [(0.003, "hppo, noise to 0.003"), (0.015, "hppo")])
+def test_circuits_of_the_earlier_recipe_are_told_apart(tmp_path, least, name):
+    run = Run(tmp_path, {"env": "circuit", "high": "none", "low": "hppo"}, {"low": {"min_scale_final": least}})
+    assert study("problems").learner_of(run) == name

@@ -69,7 +69,7 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     Raises:
         ConfigError: a value is wrong, or nothing is chosen for a group.
     """
-    given, names, place_of, folders = _plainly(cfg, chosen_names(cfg) if choices is None else choices)
+    given, names, place_of, folders = _as_plain_values(cfg, chosen_names(cfg) if choices is None else choices)
     return replace(check(given, names, place_of), config_dirs=folders)
 
 
@@ -82,11 +82,11 @@ def read_run(cfg: DictConfig) -> tuple[RunConfig, PlaceOf | None, tuple[str, ...
     Raises:
         ConfigError: a value is wrong, or nothing is chosen for a group.
     """
-    given, names, place_of, folders = _plainly(cfg, chosen_names(cfg))
+    given, names, place_of, folders = _as_plain_values(cfg, chosen_names(cfg))
     return check_run(given, names, place_of), place_of, folders
 
 
-def _plainly(
+def _as_plain_values(
     cfg: DictConfig, names: Mapping[str, str]
 ) -> tuple[dict[str, Any], Mapping[str, str], PlaceOf | None, tuple[str, ...]]:
     """Return the composed config as plain values, the names, where a setting was set, and the folders of yaml files."""
