@@ -563,6 +563,13 @@ def test_what_does_not_go_with_trips_is_refused_in_one_line(env, settings, messa
     assert "\n" not in str(error.value)
 
 
+def test_a_learner_that_no_option_uses_is_not_compared_with_the_others():
+    own = {name: {"name": "hppo", "memory": "none", "minibatch_size": 64} for name in ("boat_1", "boat_2")}
+    more = {"low.memory": "gru", "low.per_option": own, "env.boats": 2, "env.trips": 2}
+    agent = hpamdp.train("boatdock_unseen", high="ucb", low="hppo", **{**SMALL, **more})
+    assert not any("gru" in key for key in agent._kept)
+
+
 def test_an_evaluation_learns_nothing_and_so_ignores_where_values_end(command):
     words = ["mode=eval", "checkpoint=hppo_boatdock_unseen", "env=platform"]
     code, _, err = command(*words)

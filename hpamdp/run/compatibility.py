@@ -39,8 +39,9 @@ def check(config: Config) -> None:
     Raises:
         ConfigError: a rule is broken; the message names the settings to change.
     """
-    _check((rule(config) for rule in RULES), config.run)
     facts = facts_of(config)
+    acting = config if facts is None else _with_acting_learners(config, facts)
+    _check((rule(acting) for rule in RULES), config.run)
     if facts is not None:
         check_problem(config, facts)
 
@@ -60,7 +61,16 @@ def check_problem(config: Config, facts: ProblemFacts) -> None:
     Raises:
         ConfigError: a rule is broken; the message names the settings to change.
     """
-    _check((rule(config, facts) for rule in PROBLEM_RULES), config.run)
+    acting = _with_acting_learners(config, facts)
+    _check((rule(acting, facts) for rule in PROBLEM_RULES), config.run)
+
+
+def _with_acting_learners(config: Config, facts: ProblemFacts) -> Config:
+    """Return the config without `low` if `low.per_option` names a learner for every option, so that it never acts."""
+    names = _option_names(config, facts)
+    if not names or any(name not in config.low_of for name in names):
+        return config
+    return replace(config, low=config.low_of[names[0]])
 
 
 def facts_of(config: Config) -> ProblemFacts | None:
