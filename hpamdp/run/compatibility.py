@@ -67,6 +67,8 @@ def check_problem(config: Config, facts: ProblemFacts) -> None:
 
 def _with_acting_learners(config: Config, facts: ProblemFacts) -> Config:
     """Return the config without `low` if `low.per_option` names a learner for every option, so that it never acts."""
+    if not config.low_of:
+        return config
     names = _option_names(config, facts)
     if not names or any(name not in config.low_of for name in names):
         return config
