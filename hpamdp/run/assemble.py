@@ -153,13 +153,14 @@ def check_built(config: Config, env: PAMDPEnv) -> None:
             f"{config.env}: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; "
             "use agent.termination=steps agent.option_length=1 to change them"
         )
+    acting = compatibility.with_acting_learners(config, facts)
     reveals_directions = env.geometry is not None and env.geometry.revealed is not None
     if reveals_directions:
-        compatibility.check_directions(config, env.option_names)
-    forgotten = compatibility.forgotten_trips(config, facts, reveals_directions=reveals_directions)
+        compatibility.check_directions(acting)
+    forgotten = compatibility.forgotten_trips(acting, facts, reveals_directions=reveals_directions)
     if forgotten is not None:
         warn(forgotten)
-    uncounted = compatibility.uncounted_durations(config) if keys.DURATION in env.observation_spec.keys() else None
+    uncounted = compatibility.uncounted_durations(acting) if keys.DURATION in env.observation_spec.keys() else None
     if uncounted is not None:
         warn(uncounted)
 

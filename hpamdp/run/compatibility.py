@@ -40,7 +40,7 @@ def check(config: Config) -> None:
         ConfigError: a rule is broken; the message names the settings to change.
     """
     facts = facts_of(config)
-    acting = config if facts is None else _with_acting_learners(config, facts)
+    acting = config if facts is None else with_acting_learners(config, facts)
     _check((rule(acting) for rule in RULES), config.run)
     if facts is not None:
         check_problem(config, facts)
@@ -61,11 +61,11 @@ def check_problem(config: Config, facts: ProblemFacts) -> None:
     Raises:
         ConfigError: a rule is broken; the message names the settings to change.
     """
-    acting = _with_acting_learners(config, facts)
+    acting = with_acting_learners(config, facts)
     _check((rule(acting, facts) for rule in PROBLEM_RULES), config.run)
 
 
-def _with_acting_learners(config: Config, facts: ProblemFacts) -> Config:
+def with_acting_learners(config: Config, facts: ProblemFacts) -> Config:
     """Return the config without `low` if `low.per_option` names a learner for every option, so that it never acts."""
     if not config.low_of:
         return config
@@ -295,7 +295,7 @@ def forgotten_trips(config: Config, problem: ProblemFacts, *, reveals_directions
     )
 
 
-def check_directions(config: Config, option_names: Sequence[str]) -> None:
+def check_directions(config: Config) -> None:
     """Refuse learners of single options of which only some remember the directions that the problem reveals.
 
     That memory would be reset, and see an action, only while an option of these learners is held.
@@ -303,8 +303,7 @@ def check_directions(config: Config, option_names: Sequence[str]) -> None:
     Raises:
         ConfigError: some remember them, and others do not.
     """
-    learners = [config.low_of.get(name, config.low) for name in option_names]
-    if len({*map(_remembers_directions, learners)}) > 1:
+    if len({*map(_remembers_directions, config.learners)}) > 1:
         raise ConfigError(
             f"low.per_option: {config.env} reveals directions, which all learners must remember or none; "
             "use pets with the same augment and memory for all options, or augment=false"
