@@ -16,7 +16,8 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.run import capacity
 from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.checkpoint import progress_of
-from hpamdp.run.resume import check_saved_options
+from hpamdp.run.players import load_player, split_words
+from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "eval.every=0"]
@@ -273,6 +274,43 @@ def test_all_commands_tell_when_the_options_of_a_saved_agent_are_others(command)
     assert code == 0 and "take their places" not in err
     code, _, err = command("watch", "saved", "env.boats=[incongruent1,congruent]")
     assert code == 2 and "keep the order" in err
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        *("total_frames=5", "num_envs=2", "steps_per_batch=2", "log_every=1", "eval.every=1", "eval.stop_score=1.0"),
+        *("data=human", "collector=multi", "callbacks=[]", "save_best=true"),
+        *("offline.updates=2", "checkpoint_minutes=1", "checkpoint_replay=false", "compile_updates=false"),
+    ],
+)
+def test_settings_of_training_are_refused_where_nothing_is_trained(saved, word):
+    line = rf"^{re.escape(word)}: has no effect without training; leave it out$"
+    words = ["mode=eval", f"checkpoint={saved}", word]
+    with pytest.raises(ConfigError, match=line):
+        resolve(compose_config(words), words)
+    for player in (["low=random", "high=uniform"], [f"{saved}"]):
+        path, settings = split_words([*player, word])
+        with pytest.raises(ConfigError, match=line):
+            load_player(path, settings)
+
+
+def test_exploration_is_refused_for_a_player_who_is_not_trained():
+    with pytest.raises(ConfigError, match=r"^exploration=held: has no effect without training; leave it out$"):
+        load_player(None, ["low=random", "high=uniform", "exploration=held"])
+
+
+@pytest.mark.parametrize(
+    ("mode", "word"),
+    [
+        *(("offline", word) for word in ("total_frames=5", "steps_per_batch=2", "eval.every=5", "collector=multi")),
+        *(("train", word) for word in ("offline.updates=2", "offline.eval_every=1")),
+    ],
+)
+def test_the_length_of_another_mode_is_refused(mode, word):
+    words = [f"mode={mode}", "low=random", word]
+    with pytest.raises(ConfigError, match=rf"^{re.escape(word)}: has no effect with mode={mode}; leave it out$"):
+        resolve(compose_config(words), words)
 
 
 def test_a_resumed_run_keeps_the_saved_options_of_the_choices_that_it_does_not_change(saved, command, tmp_path):

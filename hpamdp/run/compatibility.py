@@ -29,6 +29,16 @@ AUTO_ENCODER = "auto"
 # Parts of the config that define the agent.
 GROUPS_OF_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment", "search", RECIPE)
 
+# Words of a command line that change nothing, by the mode of the run: settings, groups, and mappings of settings.
+_OF_COLLECTION = ("total_frames", "steps_per_batch", "collector", "eval.every", "agent.uniform_option_steps")
+_OF_LEARNING = ("offline", "data", "log_every", "callbacks", "save_best", "compile_updates", "update_precision")
+_OF_CHECKPOINTS = ("checkpoint_every", "checkpoint_minutes", "checkpoint_replay")
+_WITHOUT_EFFECT = {
+    "train": ("offline",),
+    "offline": _OF_COLLECTION,
+    "eval": (*_OF_COLLECTION, *_OF_LEARNING, *_OF_CHECKPOINTS, "num_envs", "eval.stop_score", "exploration"),
+}
+
 Rule: TypeAlias = Callable[[Config], "str | None"]
 ProblemRule: TypeAlias = Callable[[Config, ProblemFacts], "str | None"]
 
@@ -53,6 +63,19 @@ def check_saved_run(run: RunConfig) -> None:
         ConfigError: it does not go with the mode, or the name is empty.
     """
     _check([_of_saved_run(run)], run)
+
+
+def check_effects(mode: str, words: Sequence[str]) -> None:
+    """Refuse words of a command line that would change nothing in a mode.
+
+    Raises:
+        ConfigError: there is such a word.
+    """
+    for word in words:
+        name = word.partition("=")[0].lstrip("+~")
+        if any(name == each or name.startswith(f"{each}.") for each in _WITHOUT_EFFECT[mode]):
+            where = "without training" if mode == "eval" else f"with mode={mode}"
+            raise ConfigError(f"{word}: has no effect {where}; leave it out")
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:

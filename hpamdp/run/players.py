@@ -19,6 +19,7 @@ from hpamdp.env.errors import closed_on_error
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import check_built, choose_selector, make_agent, make_env, make_evaluation
+from hpamdp.run.compatibility import check_effects
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.resume import check_saved_options, resolve, saved_words
 from hpamdp.specs import PAMDPSpecs
@@ -124,13 +125,14 @@ def load_agent(path: str | None, settings: Sequence[str], objects: Mapping[str, 
         objects: arguments for the problem's constructor from Python code.
 
     Raises:
-        ConfigError: the agent does not exist, or a setting is wrong.
+        ConfigError: the agent does not exist, or a setting is wrong or has no effect.
     """
     words = list(settings)
     if path is not None:
         words = [*saved_words(path, "checkpoint", settings), *settings, "mode=eval", word("checkpoint", path)]
     with composed(words) as cfg:
         if path is None:
+            check_effects("eval", settings)
             config, source = choose_selector(read(cfg).with_objects(objects), settings), None
         else:
             config, source = resolve(cfg, settings, objects)

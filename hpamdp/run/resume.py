@@ -47,13 +47,14 @@ def resolve(
         objects: arguments for the problem's constructor from Python code, if there are any.
 
     Raises:
-        ConfigError: a value is wrong, the checkpoint does not exist, or a word would change the saved agent.
+        ConfigError: a value is wrong, the checkpoint does not exist, or a word would change the saved agent or nothing.
     """
     run, place_of, folders = read_run(cfg)
     compatibility.check_saved_run(run)
     where = "resume" if run.resume is not None else "checkpoint"
     source = run.resume or run.checkpoint
     if source is None:
+        compatibility.check_effects(run.mode, overrides)
         return choose_selector(read(cfg).with_objects(objects), overrides), None
     file = checkpoint.find(source, where)
     saved = checkpoint.progress_of(file)["config"]
@@ -65,7 +66,9 @@ def resolve(
     values = {name: cfg[name] for name in _BEGIN}
     if run.mode == "eval":
         values |= {name: _plain_value(cfg, name) for name in (*_NOT_EVALUATED, *_OF_TRAINING)}
-    changed = map(_name, _changes(overrides, saved, file, where))
+    changes = _changes(overrides, saved, file, where)
+    compatibility.check_effects(run.mode, changes)
+    changed = map(_name, changes)
     values |= {name: _plain_value(cfg, name) for name in changed if not name.startswith("hydra")}
     names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
     try:
