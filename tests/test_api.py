@@ -723,6 +723,20 @@ def test_settings_change_those_that_a_built_problem_brings_along():
     assert hpamdp.make({"name": built, "max_steps": 7}).max_steps == 7
 
 
+def test_training_has_as_many_environments_as_a_built_problem_unless_told_otherwise():
+    built = hpamdp.make("platform", num_envs=3)
+    short = {"low": "random", "steps_per_batch": 2, "total_frames": 12, "progress": False, "eval.layouts": 4}
+    assert hpamdp.train(built, **short)._config.run.num_envs == 3
+    assert hpamdp.train({"name": built, "max_steps": 7}, **short)._config.run.num_envs == 3
+    assert hpamdp.train(built, **short, num_envs=2)._config.run.num_envs == 2
+    assert hpamdp.load("hppo_platform", env=built).evaluate(episodes=3)["steps"] > 0.0
+
+
+def test_an_empty_mapping_gives_nothing_that_could_be_given_twice():
+    agent = hpamdp.train("platform", **{**TINY, "low": "random", "eval": {}})
+    assert agent._config.run.eval.layouts == TINY["eval.layouts"]
+
+
 def test_different_entries_of_a_mapping_may_come_in_two_ways():
     agent = hpamdp.train("platform", low={"name": "hppo", "gamma": 0.9}, eval={"seed": 3}, **{**TINY, "low.lr": 1e-4})
     low = agent._config.low.settings

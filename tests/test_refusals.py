@@ -50,6 +50,7 @@ REFUSED = [
     ("low=pdqn low.actor_lr=5", "low.actor_lr=5: must be above 0 and at most 1"),
     ("low=hsac low.temperature_lr=0", "low.temperature_lr=0: must be above 0 and at most 1"),
     ("high=actor high.lr=-1", "high.lr=-1: must be above 0 and at most 1"),
+    ("exploration=held exploration.epsilon_final=0.5", "exploration: epsilon_final=0.5: must be at most epsilon=0.05"),
     ("low=hppo low.lr_final=0.5", "low: lr_final=0.5: must be at most lr=0.001"),
     ("low=hppo low.min_scale_final=2", "low: min_scale_final=2.0: must be less than max_scale=1.0"),
     ("low.kl_weight=1e30", "low.kl_weight=1e+30: must lie between -1000000000000.0 and 1000000000000.0 (HyAR"),

@@ -37,13 +37,15 @@ class Arguments:
     Attributes:
         words: the words of the command line that says the same.
         objects: arguments for the constructor of the problem, which no word can hold.
-        copied: words for the class, the settings and the number of environments of a built problem. Unlike `words`,
-            they may be given once more with other values.
+        copied: words for the class and the settings of a built problem. Unlike `words`, they may be given once more
+            with other values.
+        num_envs: number of environments of a built problem; else None.
     """
 
     words: list[str] = field(default_factory=list)
     objects: Mapping[str, Any] = field(default_factory=dict)
     copied: list[str] = field(default_factory=list)
+    num_envs: int | None = None
 
     def with_words(self, others: Sequence[str] = ()) -> list[str]:
         """Return the words of the problem, and after them those of the function's other arguments.
@@ -164,7 +166,7 @@ def problem_arguments(env: Any) -> Arguments:
     if isinstance(env, Mapping) or _is_problem_class(env):
         return Arguments(_group_words("env", env))
     if isinstance(env, PAMDPEnv):
-        return Arguments(copied=_words_of_built(env))
+        return Arguments(copied=_words_of_built(env), num_envs=env.num_envs)
     return _arguments_of_gymnasium(env)
 
 
@@ -200,12 +202,12 @@ def plain_name(name: str) -> str:
 
 
 def _words_of_built(env: PAMDPEnv) -> list[str]:
-    """Return the words for a problem like a built one, with as many environments."""
+    """Return the words for a problem like a built one."""
     cls = type(env)
     if not takes_settings_model(cls):
         raise ConfigError(f"env={as_code(env)}: its settings are unknown; pass the class {cls.__name__}")
     settings = [word(f"env.{name}", value) for name, value in env.options.model_dump(mode="json").items()]
-    return [choosing_class("env", cls), *settings, word("num_envs", env.num_envs)]
+    return [choosing_class("env", cls), *settings]
 
 
 def _copier(env: gymnasium.Env) -> Callable[[], gymnasium.Env]:

@@ -131,6 +131,8 @@ def _words_of(settings: Mapping[str, Any], problem: Arguments, folders: Sequence
         problem: the argument that chooses a problem.
         folders: the word that adds folders of yaml files, if there are any.
     """
+    if problem.num_envs is not None:
+        settings = {"num_envs": problem.num_envs, **settings}
     of_problem = unprefixed(settings)
     own = settings_words(all_but(settings, of_problem))
     words = [*folders, *problem.with_words(own)]

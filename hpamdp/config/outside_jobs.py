@@ -148,8 +148,8 @@ def check_given_once(words: Sequence[str]) -> None:
 
 
 def _single_values(name: tuple[str, ...], value: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield the entries of a mapping, of the mappings in it and so on, or else the value itself."""
-    if not isinstance(value, dict) or not value:
+    """Yield the entries of a mapping, of the mappings in it and so on, or else the value itself; nothing if empty."""
+    if not isinstance(value, dict):
         yield name, value.text if isinstance(value, QuotedString) else value
         return
     for entry, each in value.items():

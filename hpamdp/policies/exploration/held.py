@@ -18,10 +18,11 @@ from __future__ import annotations
 from typing import Annotated, Any, ClassVar
 
 import torch
-from pydantic import Field, PositiveInt
+from pydantic import Field, PositiveInt, model_validator
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
@@ -49,6 +50,12 @@ class HeldOptions(Settings):
     """Exponent of the lengths: the probability of n steps is proportional to n^-mu. Less gives longer holds."""
     longest: Annotated[int, Field(ge=1, le=1_000_000)] = 10_000
     """Largest number of steps of a hold."""
+
+    @model_validator(mode="after")
+    def _check_schedule(self) -> Self:
+        if self.epsilon_final is not None and self.epsilon_final > self.epsilon:
+            raise ValueError(f"epsilon_final={self.epsilon_final}: must be at most epsilon={self.epsilon}")
+        return self
 
 
 def zeta_distribution(mu: float, longest: int) -> Tensor:
