@@ -121,7 +121,7 @@ def test_the_h_step_loss_equals_a_hand_computation_with_an_episodes_end_inside_t
             expected["reward"] += weight * ((reward - row["reward"]) ** 2).mean()
             label = torch.full((2, 1), float(ends))
             expected["termination"] += weight * F.binary_cross_entropy_with_logits(predicted.logit, label)
-    losses = learner.losses(windows)
+    losses = learner.losses(windows, windows["state"][:, 0])
     for name, value in expected.items():
         torch.testing.assert_close(losses[name], value)
 

@@ -436,7 +436,7 @@ def test_a_run_of_a_selector_with_a_recurrent_memory_resumes_to_the_last_bit(hig
 # In runs.
 
 
-@pytest.mark.parametrize("low", LEARNERS)
+@pytest.mark.parametrize("low", [*LEARNERS, "dlpa"])
 def test_a_run_with_a_recurrent_memory_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
     words = [*words_of("ucb", low), "low.memory=gru", "low.memory_size=8", "low.sequence_length=3"]
     stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)
@@ -444,7 +444,7 @@ def test_a_run_with_a_recurrent_memory_resumes_to_the_last_bit(low, tmp_path, mo
 
 @pytest.mark.slow
 @pytest.mark.parametrize("more", [["collector=multi"], ["agent.sharing=shared"], ["low.memory=stack"]])
-@pytest.mark.parametrize("low", LEARNERS)
+@pytest.mark.parametrize("low", [*LEARNERS, "dlpa"])
 def test_other_runs_with_a_memory_resume_to_the_last_bit(low, more, tmp_path, monkeypatch):
     stop_and_resume([*words_of("ucb", low), "low.memory=gru", *more], tmp_path, monkeypatch, signal.SIGTERM)
 
@@ -503,6 +503,8 @@ def test_an_agent_remembers_until_its_episode_ends(memory):
         (["low=pets", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=pets: memory=gru"),
         (["low=pdqn", "low.memory=gru", "low.n_step=2"], "n_step=2: does not go with memory=gru"),
         (["low=pdqn", "low.memory=gru", "low.double_q=true"], "double_q=true: does not go with memory=gru"),
+        (["low=dlpa", "low.memory=stack", "low.augment=true"], "augment=true: does not go with memory=stack"),
+        (["low=dlpa", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=dlpa: memory=gru"),
         (["low=hppo", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=hppo: memory=gru"),
         (["low=hsac", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=hsac: memory=gru"),
         (["low=pdqn", "low.memory=gru", "data=human"], "low.memory=gru: .*lacks what a policy remembered"),

@@ -597,6 +597,7 @@ BUDGETS = {
     "hppo": {"total_frames": 16_384, "low.minibatch_size": 128},
     "pdqn": {"total_frames": 4000, "low.warmup_steps": 500, "low.epsilon_steps": 2000},
     "hsac": {"total_frames": 3000, "low.warmup_steps": 500},
+    "dlpa": {"total_frames": 3000, "low.warmup_steps": 500, "low.horizon": 1, "low.batch_size": 64},
 }
 SCORED = {"eval.every": 0, "eval.layouts": 4, "progress": False, "num_envs": 16}
 

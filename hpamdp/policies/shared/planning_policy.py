@@ -14,6 +14,7 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.masks import random_discrete
 from hpamdp.policies.shared.end_values import EndValueOptions
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.planning import SearchOptions
 from hpamdp.policies.shared.replay import ReplayOptions
 from hpamdp.settings import LearningRate
@@ -51,24 +52,26 @@ class PlanningPolicy(TensorDictModuleBase):
     """Takes the first action of a plan; a random one until `is_trained`, and with probability `epsilon` if it explores.
 
     Nothing is planned for finished episodes, nor where an exploration holds an action: the random action there is
-    ignored. A subclass implements `first_action`.
+    ignored. The memory, if there is any, sees every step. A subclass implements `first_action`.
     """
 
     is_trained: Tensor
     in_keys: list[NestedKey]
     out_keys: list[NestedKey]
 
-    def __init__(self, specs: PAMDPSpecs, epsilon: float) -> None:
+    def __init__(self, specs: PAMDPSpecs, epsilon: float, perception: Perception) -> None:
         super().__init__()
-        self.in_keys = [keys.OBSERVATION, keys.DONE]
-        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
+        self.in_keys = [keys.DONE, *perception.in_keys]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, *perception.out_keys]
+        self.perception = perception
         self.specs = specs
         self.epsilon = epsilon
         self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
+        """Write the discrete action `[*B]`, the parameters `[*B, num_parameters]` and the memory's state, if any."""
+        self.perception.see(td)
         observation = td.get(keys.OBSERVATION).flatten(0, -2)
         num, device = len(observation), observation.device
         mask = td.get(keys.ACTION_MASK, None)
@@ -92,6 +95,11 @@ class PlanningPolicy(TensorDictModuleBase):
         parameters = self.specs.from_unit(unit_parameters.reshape(*shape, self.specs.num_parameters), td)
         discrete = discrete.reshape((*shape, *discrete.shape[1:]))
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
+
+    def remembered(self, td: TensorDictBase, is_planned: Tensor) -> Tensor | None:
+        """Return the memory's states `[N, size]` where plans begin, see `first_action`; None without a memory."""
+        key = self.perception.memory_key
+        return None if key is None else td.get(key).flatten(0, -2)[is_planned]
 
     def first_action(
         self, td: TensorDictBase, observation: Tensor, is_planned: Tensor, mask: Tensor | None

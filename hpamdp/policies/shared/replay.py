@@ -240,15 +240,21 @@ class ReplayLearner(Learner):
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Add the transitions in `mask` bool `[*B, T]` of a batch `[*B, T]` to the buffer."""
-        rows = self.transitions(batch)
+        rows = packed_states(self.linked(self.transitions(batch), batch, mask)[mask], self.specs)
+        if self.stores_own_parameters:
+            rows["unit"] = rows["unit"].gather(-1, self.slots[rows["discrete"]])
+        self.buffer.extend(rows)
+
+    def linked(self, rows: TensorDict, batch: TensorDictBase, mask: Tensor) -> TensorDict:
+        """Return the rows `[*B, T]` of a batch with their links, which a recurrent memory follows backwards.
+
+        Call it once for each batch, before those of its rows that are in `mask` are stored in their order.
+        """
         if self.links is not None:
             begins = self.perception.begins(batch)
             rows["begins"] = begins
             rows["previous"] = self.links(begins, mask, self.buffer.write_count)
-        rows = packed_states(rows[mask], self.specs)
-        if self.stores_own_parameters:
-            rows["unit"] = rows["unit"].gather(-1, self.slots[rows["discrete"]])
-        self.buffer.extend(rows)
+        return rows
 
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
         """Return the rows that the buffer would store of a batch `[*B, T]`."""

@@ -24,6 +24,12 @@ Differs from the source:
 - elites are weighted relative to the spread of returns, by the standard deviation over the plan's first samples. The
   source's weights depend on the scale of the rewards;
 - with `end_values` a plan also counts the value of its last state (`policies.shared.end_values`);
+- with `memory` the model also sees what is remembered of the session's earlier observations, for problems in which
+  something hidden stays the same. The H-step loss trains the memory. Imagined steps go into it, in plans and in the
+  windows. Models that are told a learned context: Rakelly et al. 2019, *PEARL*, arXiv 1903.08254; Zintgraf et al. 2020,
+  *VariBAD*, arXiv 1910.08348. There the context is a distribution over a latent variable, with a prior: VariBAD's
+  decoder of rewards and transitions trains it, PEARL's critic does. Both give it to a model-free policy. Here it is the
+  state of a GRU, and a plan does not count what could be done better after finding out;
 - windows and plans end where a trip ends, because the start of the next trip is random.
 
 TorchRL's SliceSampler (`fragmented`, padded) does not fit: it samples trajectories instead of steps uniformly, and none
@@ -34,7 +40,7 @@ predicted states only. On this project's benchmark the score after 8,000 steps w
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import torch
 from pydantic import PositiveFloat, PositiveInt
@@ -47,16 +53,24 @@ from hpamdp.policies.base import ActionFeature, Bonus, option_ends
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
 from hpamdp.policies.low_level.dlpa.planner import Planner, PlannerOptions
 from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.memory import ReplayMemoryOptions, Stack
+from hpamdp.policies.shared.networks import polyak_update
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.planning_policy import PlanningPolicy, plan_ends
 from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.sequences import past_of
 from hpamdp.settings import PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
+Tensors: TypeAlias = Mapping[str, Tensor] | TensorDictBase
+
 # What the model learns from; beside it, where a step's window goes on.
 _STORED = ("state", "discrete", "unit", "reward", "next_state")
+# What a memory's state is computed from: the stored state of a stack, and the steps that a GRU saw.
+_REMEMBERED = ("memory", "past", "num_past", "first_memory", "first_begins")
 
 
-class DLPAOptions(PlannerOptions):
+class DLPAOptions(ReplayMemoryOptions, PlannerOptions):
     """Settings of `DLPA`."""
 
     form: Literal["parallel", "masking", "sequential"] = "masking"
@@ -86,8 +100,8 @@ class DLPAOptions(PlannerOptions):
 class DLPAPolicy(PlanningPolicy):
     """The plan's first action: the likeliest discrete action with mean parameters or, when exploring, a sample."""
 
-    def __init__(self, planner: Planner, specs: PAMDPSpecs, epsilon: float) -> None:
-        super().__init__(specs, epsilon)
+    def __init__(self, planner: Planner, specs: PAMDPSpecs, epsilon: float, perception: Perception) -> None:
+        super().__init__(specs, epsilon, perception)
         self.model = planner.model  # makes the model's weights part of the policy's state
         self.end_value = planner.end_value  # and those of the values
         self.planner = planner
@@ -97,7 +111,8 @@ class DLPAPolicy(PlanningPolicy):
         self, td: TensorDictBase, observation: Tensor, is_planned: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Return the first action of each plan, see `PlanningPolicy.first_action`."""
-        plan = self.planner.plan(observation[is_planned], mask, None if is_greedy() else self.bonus)
+        features = self.perception(observation[is_planned], self.remembered(td, is_planned), has_seen=True)
+        plan = self.planner.plan(features, mask, None if is_greedy() else self.bonus)
         probability, mean, deviation = (part[:, 0] for part in plan)
         components = self.specs.components
         if is_greedy():
@@ -137,12 +152,16 @@ class DLPA(ReplayLearner):
     ) -> None:
         options = DLPAOptions.of(options, settings)
         super().__init__(specs, device, options)
-        dims = options.hidden_dims
-        self.model = PAMDPModel(specs, options.form, dims, options.num_members)
-        self.end_values = EndValues(specs.observation_dim, dims, options) if options.end_values else None
-        self.policy = DLPAPolicy(Planner(self.model, specs, options, self.end_values), specs, options.epsilon)
+        self.set_perception(options)
+        seen, dims = self.perception.specs, options.hidden_dims
+        context_dim = seen.observation_dim - specs.observation_dim
+        self.model = PAMDPModel(seen, options.form, dims, options.num_members, context_dim)
+        self.end_values = EndValues(seen.observation_dim, dims, options) if options.end_values else None
+        planner = Planner(self.model, specs, options, self.end_values, self.perception.imagined)
+        self.policy = DLPAPolicy(planner, specs, options.epsilon, self.perception)
         self.to(device)
-        self.optimizers = {"model": torch.optim.Adam(self.model.parameters(), lr=options.lr, fused=True)}
+        learned = [*self.model.parameters(), *self.perception.parameters()]
+        self.optimizers = {"model": torch.optim.Adam(learned, lr=options.lr, fused=True)}
         if self.end_values is not None:
             self.optimizers["end_values"] = self.end_values.optimizer()
 
@@ -153,29 +172,48 @@ class DLPA(ReplayLearner):
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the model from windows `[batch_size, horizon]`, and the values from the first step of each."""
-        scalars = self.gradient_step("model", self.loss, sample.select(*_STORED, "terminated", "valid"))
+        first = sample[:, 0]
+        if self.links is not None:
+            first.update(past_of(self.buffer, first["place"], self.num_past))
+        windows = sample.select(*_STORED, "terminated", "valid")
+        scalars = self.gradient_step("model", self.loss, windows, first.select("state", *_REMEMBERED, strict=False))
         if self.end_values is not None:
-            first = sample[:, 0]
-            scalars |= self.end_values.update(self, first, first["state"], first["next_state"])
+            with torch.no_grad():
+                memory = self.memory_of(first, self.perception)
+                state = self.perception(first["state"], memory, has_seen=True)
+                next_state = self.perception(first["next_state"], memory)
+            scalars |= self.end_values.update(self, first, state, next_state)
+            polyak_update(self.target_perception, self.perception, self.options.end_value_tau)
         return scalars
 
-    def loss(self, windows: Mapping[str, Tensor] | TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the weighted sum of the parts of the H-step loss, and the parts."""
-        parts = self.losses(windows)
+    def loss(self, windows: Tensors, first: Tensors) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the weighted sum of the parts of the H-step loss, and the parts.
+
+        Args:
+            windows: of consecutive steps, `[B, horizon]`.
+            first: the first step of each window, `[B]`, with what the memory saw before it.
+        """
+        parts = self.losses(windows, self.features(first))
         loss = torch.zeros((), device=self.frames.device, dtype=torch.float32)
         for name, part in parts.items():
             loss = loss + getattr(self.options, f"{name}_weight") * part
         return loss, parts
 
-    def losses(self, windows: Mapping[str, Tensor] | TensorDictBase) -> dict[str, Tensor]:
-        """Return the parts of the H-step loss, each summed over a window with weight rho^h, averaged over windows."""
+    def losses(self, windows: Tensors, features: Tensor) -> dict[str, Tensor]:
+        """Return the parts of the H-step loss, each summed over a window with weight rho^h, averaged over windows.
+
+        Args:
+            windows: of consecutive steps, `[B, horizon]`.
+            features: what the networks see of the first step of each window, `[B, F]`.
+        """
         zero = torch.zeros((), device=self.frames.device, dtype=torch.float32)
         parts = dict.fromkeys(("state", "reward", "termination"), zero)
-        state = windows["state"][:, 0]
         for h in range(self.options.horizon):
             step = {name: column[:, h] for name, column in windows.items()}
-            predicted = self.model(state, step["discrete"], step["unit"])
+            predicted = self.model(features, step["discrete"], step["unit"])
             state = predicted.next_state
+            if h < self.options.horizon - 1:
+                features = self.perception.imagined(features, state)
             terminated = step["terminated"]
             change = ((state - step["next_state"]) / self.model.change_scale).square().mean(-1) * ~terminated
             reward = torch.where(terminated, predicted.terminating, predicted.continuing)
@@ -189,13 +227,24 @@ class DLPA(ReplayLearner):
                 parts[name] = parts[name] + self.options.rho**h * (error * step["valid"]).mean()
         return parts
 
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+    def value(
+        self,
+        observation: Tensor,
+        action_mask: Tensor | None = None,
+        *,
+        memory: Tensor | None = None,
+        has_seen: bool = False,
+    ) -> Tensor:
         """Return the values `[N]` of states `[N, observation_dim]` that `end_values` has learned, whatever is allowed.
+
+        `Learner.value` explains `memory` and `has_seen`.
 
         Raises:
             NotImplementedError: there are none.
         """
-        return super().value(observation) if self.end_values is None else self.end_values.of_own(observation)
+        if self.end_values is None:
+            return super().value(observation)
+        return self.end_values.of_own(self.target_perception(observation, memory, has_seen=has_seen))
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the model's inputs and targets in a batch `[*B, T]`, and those of the values, if they are learned.
@@ -205,7 +254,7 @@ class DLPA(ReplayLearner):
         rows = super().transitions(batch)
         ends = plan_ends(batch)
         if self.end_values is None:
-            rows = rows.select(*_STORED)
+            rows = rows.select(*_STORED, "memory", strict=False)
         else:
             rows.set("discount", torch.where(ends, 0.0, rows["discount"]))
         return rows.set("terminated", ends)
@@ -218,7 +267,7 @@ class DLPA(ReplayLearner):
         holds the same environments in the same order.
         """
         num_steps = mask.shape[-1]
-        rows = self.transitions(batch).reshape(-1, num_steps)
+        rows = self.linked(self.transitions(batch), batch, mask).reshape(-1, num_steps)
         mask = mask.reshape(-1, num_steps)
         ends = option_ends(batch).reshape(-1, num_steps) | rows["terminated"]
         # A step follows the one before it, which may be the last step of an earlier batch.
@@ -284,7 +333,8 @@ class DLPA(ReplayLearner):
         of places far from the start, would else be in the hundreds once the policy gets there.
         """
         stored = self.buffer[:]
-        self.model.fit_scales(stored["state"], stored["next_state"])
+        context = stored["memory"][:, : self.model.context_dim] if isinstance(self.perception.memory, Stack) else None
+        self.model.fit_scales(stored["state"], stored["next_state"], context)
         starts = torch.randint(len(self.buffer), (num_batches, self.options.batch_size), device=self.frames.device)
         for start in starts:
             yield self.augmented(self.windows(start))
@@ -292,7 +342,7 @@ class DLPA(ReplayLearner):
     def windows(self, start: Tensor) -> TensorDictBase:
         """Return the windows `[N, horizon]` of consecutive steps that start at places `[N]`.
 
-        `valid` is true until the trajectory's end; the steps after it are arbitrary.
+        `valid` is true until the trajectory's end; the steps after it are arbitrary. `place` says where each step is.
         """
         stored = self.buffer[:]
         trajectory = stored["trajectory"][start]
@@ -303,4 +353,5 @@ class DLPA(ReplayLearner):
             place = successor.clamp(min=0)
             valid.append(valid[-1] & (successor >= 0) & (stored["trajectory"][place] == trajectory))
             places.append(place)
-        return stored[torch.stack(places, 1)].set("valid", torch.stack(valid, 1))
+        place = torch.stack(places, 1)
+        return stored[place].update({"valid": torch.stack(valid, 1), "place": place})

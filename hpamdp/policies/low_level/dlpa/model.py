@@ -70,29 +70,60 @@ class Predictor(nn.Module):
 
 
 class PAMDPModel(nn.Module):
-    """One transition predictor, and an ensemble of `num_members` predictors of reward and termination."""
+    """One transition predictor, and an ensemble of `num_members` predictors of reward and termination.
+
+    With a memory, the networks see features, which are a context and the observation: what is remembered, and the
+    state. The context is not predicted.
+
+    Args:
+        specs: of the problem, with the features as observation.
+        form: how the networks take an action, see `Predictor`.
+        hidden_dims: of the networks.
+        num_members: of the ensemble.
+        context_dim: entries of the context; 0 without a memory.
+    """
 
     state_mean: Tensor
     state_scale: Tensor
     change_scale: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, form: str, hidden_dims: Sequence[int], num_members: int) -> None:
+    def __init__(
+        self, specs: PAMDPSpecs, form: str, hidden_dims: Sequence[int], num_members: int, context_dim: int = 0
+    ) -> None:
         super().__init__()
-        self.transition = Predictor(specs, form, 1, hidden_dims, specs.observation_dim)
+        self.context_dim = context_dim
+        predicted_dim = specs.observation_dim - context_dim
+        self.transition = Predictor(specs, form, 1, hidden_dims, predicted_dim)
         self.outcome = Predictor(specs, form, num_members, hidden_dims, 3)
         self.register_buffer("state_mean", torch.zeros(specs.observation_dim, dtype=torch.float32))
         self.register_buffer("state_scale", torch.ones(specs.observation_dim, dtype=torch.float32))
-        self.register_buffer("change_scale", torch.ones(specs.observation_dim, dtype=torch.float32))
+        self.register_buffer("change_scale", torch.ones(predicted_dim, dtype=torch.float32))
 
-    def fit_scales(self, state: Tensor, next_state: Tensor) -> None:
-        """Set the scales of inputs and targets from transitions `[B, observation_dim]`."""
-        self.state_mean.copy_(state.mean(0))
-        self.state_scale.copy_(scale_of(state))
+    def fit_scales(self, state: Tensor, next_state: Tensor, context: Tensor | None = None) -> None:
+        """Set the scales of inputs and targets from transitions `[B, *]`.
+
+        Args:
+            state: observations.
+            next_state: those that follow.
+            context: what was remembered, `[B, context_dim]`. If None, contexts are not scaled: the state of a GRU lies
+                in [-1, 1] by itself.
+        """
+        self.state_mean[self.context_dim :] = state.mean(0)
+        self.state_scale[self.context_dim :] = scale_of(state)
         self.change_scale.copy_(scale_of(next_state - state))
+        if context is not None:
+            self.state_mean[: self.context_dim] = context.mean(0)
+            self.state_scale[: self.context_dim] = scale_of(context)
 
-    def forward(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Prediction:
-        """Predict one step from states `[B, observation_dim]`, discrete actions `[B]`, parameters in [-1, 1]."""
-        scaled = (state - self.state_mean) / self.state_scale
+    def forward(self, features: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Prediction:
+        """Predict one step.
+
+        Args:
+            features: the context and then the observation, `[B, context_dim + observation_dim]`.
+            discrete: discrete actions, `[B]` or `[B, num_components]`.
+            unit_parameters: `[B, num_parameters]` in [-1, 1].
+        """
+        scaled = (features - self.state_mean) / self.state_scale
         change = self.transition(scaled, discrete, unit_parameters)[0] * self.change_scale
         continuing, terminating, logit = self.outcome(scaled, discrete, unit_parameters).unbind(-1)
-        return Prediction(state + change, continuing, terminating, logit)
+        return Prediction(features[..., self.context_dim :] + change, continuing, terminating, logit)

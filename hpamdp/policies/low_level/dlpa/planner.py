@@ -52,10 +52,12 @@ class Planner:
     """Find good action sequences in a model by iterated sampling, weighting the best more.
 
     Args:
-        model: maps states, discrete actions and parameters in [-1, 1] to a `Prediction`.
+        model: maps features, discrete actions and parameters in [-1, 1] to a `Prediction`.
         specs: of the problem.
         options: the settings; single ones may be given by their names.
-        end_value: maps the last state of a plan `[B, observation_dim]` to its value, `[B]`. If None, the value is 0.
+        end_value: maps the features of a plan's last state `[B, F]` to its value, `[B]`. If None, the value is 0.
+        imagined: maps the features of a step `[B, F]` and the predicted next observations `[B, observation_dim]` to the
+            features of these. If None, features are the observations.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class Planner:
         specs: PAMDPSpecs,
         options: PlannerOptions | None = None,
         end_value: Callable[[Tensor], Tensor] | None = None,
+        imagined: Callable[[Tensor, Tensor], Tensor] | None = None,
         **settings: Any,
     ) -> None:
         self.options: PlannerOptions = PlannerOptions.of(options, settings)
@@ -71,14 +74,15 @@ class Planner:
         self.specs = specs
         self.components = specs.components
         self.end_value = end_value
+        self.imagined = imagined
         self.precision: torch.dtype = getattr(torch, self.options.planning_precision)
 
     @torch.no_grad()
     def plan(self, state: Tensor, action_mask: Tensor | None = None, bonus: Bonus | None = None) -> Plan:
-        """Return the final distributions for states `[N, observation_dim]`.
+        """Return the final distributions for N states.
 
         Args:
-            state: where the plans begin.
+            state: the features of where the plans begin, `[N, F]`. Without a memory they are the observations.
             action_mask: what the environment allows there, bool `[N, num_discrete]`. If None, everything. What it will
                 allow in predicted states is unknown, and taken to be everything.
             bonus: a reward for predicted states that are new; None for none.
@@ -125,7 +129,7 @@ class Planner:
         return discrete, unit_parameters.clamp(-1.0, 1.0)
 
     def returns(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor, bonus: Bonus | None = None) -> Tensor:
-        """Return the predicted returns `[N, S]` of action sequences from states `[N, observation_dim]`.
+        """Return the predicted returns `[N, S]` of action sequences from the features of states `[N, F]`.
 
         With a bonus they include that of the predicted states.
         """
@@ -133,12 +137,18 @@ class Planner:
 
         def steps() -> Iterator[Prediction]:
             nonlocal rows
-            for h in range(discrete.shape[2]):
+            horizon = discrete.shape[2]
+            for h in range(horizon):
+                before = rows
                 with lower_products(rows.device, self.precision):
                     chosen = discrete[:, :, h].flatten(0, 1)
-                    predicted = self.model(rows, chosen, unit_parameters[:, :, h].flatten(0, 1))
+                    predicted = self.model(before, chosen, unit_parameters[:, :, h].flatten(0, 1))
+                if bonus is not None:
+                    predicted = with_bonus(predicted, bonus)
                 rows = predicted.next_state
-                yield predicted if bonus is None else with_bonus(predicted, bonus)
+                if self.imagined is not None and (h < horizon - 1 or self.end_value is not None):
+                    rows = self.imagined(before, rows)
+                yield predicted._replace(next_state=rows)
 
         total = discounted_return(steps(), self.options.gamma, self.end_value)
         value = total.mean(0)

@@ -90,11 +90,10 @@ class PETSPolicy(PlanningPolicy):
         perception: Perception,
         end_value: EndValues | None,
     ) -> None:
-        super().__init__(specs, options.epsilon)
-        own_keys: list[NestedKey] = [*self.in_keys, keys.IS_DECISION, MEMBER]
-        self.in_keys = own_keys + [key for key in perception.in_keys if key not in own_keys]
-        self.out_keys = [*self.out_keys, MEMBER, *perception.out_keys]
-        self.perception = perception
+        super().__init__(specs, options.epsilon, perception)
+        own_keys: list[NestedKey] = [keys.IS_DECISION, MEMBER]
+        self.in_keys += [key for key in own_keys if key not in self.in_keys]
+        self.out_keys += [MEMBER]
         self.options = options
         self.entries = entries
         self.model = model
@@ -111,7 +110,6 @@ class PETSPolicy(PlanningPolicy):
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action, the member `[*B]` and the parameters `[*B, num_parameters]`."""
-        self.perception.see(td)
         return super().forward(td.set(MEMBER, self._members(td)))
 
     def _members(self, td: TensorDictBase) -> Tensor:
@@ -129,10 +127,7 @@ class PETSPolicy(PlanningPolicy):
         """Return the first action of each plan, see `PlanningPolicy.first_action`."""
         observation = observation[is_planned]
         member = td.get(MEMBER).flatten()[is_planned] if self._follows_member else None
-        memory = None
-        if self.perception.memory_key is not None:
-            memory = td.get(self.perception.memory_key).flatten(0, -2)[is_planned]
-        state = self.perception(observation[:, self.entries], memory, has_seen=True)
+        state = self.perception(observation[:, self.entries], self.remembered(td, is_planned), has_seen=True)
         planned = self.plan(state, member, self._allowed(observation, mask))
         own = planned.own if is_greedy() else with_exploring_noise(planned.own, self.options.parameter_noise)
         return self.joint.choice(planned.discrete), self.joint.spread(planned.discrete, own)
