@@ -295,6 +295,7 @@ def _refuse_early(cfg: DictConfig) -> None:
             config = read(cfg)
     except RealImportsNeededError:
         return
+    compatibility.check_saved_run(config.run)
     problem = compatibility.facts_of(config)
     if problem is not None:
         config = compatibility.with_selector(config, problem, job_overrides())

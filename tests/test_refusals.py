@@ -301,6 +301,53 @@ def test_exploration_is_refused_for_a_player_who_is_not_trained():
         load_player(None, ["low=random", "high=uniform", "exploration=held"])
 
 
+@pytest.mark.parametrize("word", ["agent.values_end=trip", "agent.selector_values_end=trip", "low.freeze=true"])
+def test_how_the_parts_of_an_agent_learn_is_refused_for_a_player_who_is_not_trained(word):
+    with pytest.raises(ConfigError, match=rf"^{re.escape(word)}: has no effect without training; leave it out$"):
+        load_player(None, ["env=boatdock_unseen", "env.boats=2", "low=random", "high=uniform", word])
+
+
+@pytest.mark.parametrize("name", ["checkpoint", "resume", "low.checkpoint"])
+def test_a_player_of_settings_takes_no_weights_from_a_saved_run_and_says_so(saved, name):
+    for player in (["low=random", "high=uniform"], [f"{saved}"]):
+        path, settings = split_words([*player, f"{name}={saved}"])
+        with pytest.raises(ConfigError, match=rf"^{name}=.*: give the folder or the name of a saved agent alone"):
+            load_player(path, settings)
+
+
+@pytest.mark.parametrize("word", ["mode=train", "overwrite=true", "logger=tensorboard"])
+def test_what_only_a_run_uses_is_refused_for_a_player(saved, word):
+    for player in (["low=random", "high=uniform"], [f"{saved}"]):
+        path, settings = split_words([*player, word])
+        with pytest.raises(ConfigError, match=rf"^{word}: has no effect on a player; leave it out$"):
+            load_player(path, settings)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["high=uniform", "agent.option_length=3"], "agent.option_length=3: goes with agent.termination=steps only"),
+        (["high=value"], "high=value: low=random has no value to compare"),
+        (["high=ucb", "high.memory=session"], "high.memory=session: episodes of env=boatdock have no trips"),
+    ],
+)
+def test_the_settings_of_a_player_have_to_go_together_as_those_of_a_run(words, message):
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        load_player(None, ["low=random", *words])
+
+
+@pytest.mark.parametrize(("word", "instead"), [("eval.layouts=3", "--episodes"), ("eval.seed=7", "--seed")])
+def test_settings_that_watch_has_flags_for_are_refused(command, word, instead):
+    code, _, err = command("watch", "low=random", "high=uniform", word)
+    assert (code, err) == (2, f"{word}: the command has a flag for it; use {instead}\n")
+
+
+@pytest.mark.parametrize("word", ["total_frames=5", "low=hppo", "low.lr=0.1", "high=ucb", "callbacks=[]", "seed=3"])
+def test_settings_that_change_nothing_about_a_page_are_refused(command, word):
+    code, _, err = command("play", word, "--export", "site")
+    assert (code, err) == (2, f"{word}: has no effect on the page; give settings of the problem\n")
+
+
 @pytest.mark.parametrize(
     ("mode", "word"),
     [

@@ -30,13 +30,25 @@ AUTO_ENCODER = "auto"
 GROUPS_OF_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment", "search", RECIPE)
 
 # Words of a command line that change nothing, by the mode of the run: settings, groups, and mappings of settings.
+# A player is no run: somebody who is watched or played with.
 _OF_COLLECTION = ("total_frames", "steps_per_batch", "collector", "eval.every", "agent.uniform_option_steps")
 _OF_LEARNING = ("offline", "data", "log_every", "callbacks", "save_best", "compile_updates", "update_precision")
+_OF_AGENTS_LEARNING = ("agent.values_end", "agent.selector_values_end", "low.freeze", "exploration")
 _OF_CHECKPOINTS = ("checkpoint_every", "checkpoint_minutes", "checkpoint_replay")
 _WITHOUT_EFFECT = {
     "train": ("offline",),
     "offline": _OF_COLLECTION,
-    "eval": (*_OF_COLLECTION, *_OF_LEARNING, *_OF_CHECKPOINTS, "num_envs", "eval.stop_score", "exploration"),
+    "eval": (
+        *(*_OF_COLLECTION, *_OF_LEARNING, *_OF_AGENTS_LEARNING, *_OF_CHECKPOINTS),
+        *("num_envs", "eval.stop_score"),
+    ),
+    "player": ("mode", "overwrite", "logger"),
+}
+_WHERE = {
+    "train": "with mode=train",
+    "offline": "with mode=offline",
+    "eval": "without training",
+    "player": "on a player",
 }
 
 Rule: TypeAlias = Callable[[Config], "str | None"]
@@ -62,11 +74,23 @@ def check_saved_run(run: RunConfig) -> None:
     Raises:
         ConfigError: it does not go with the mode, or the name is empty.
     """
-    _check([_of_saved_run(run)], run)
+    for name, value in (("resume", run.resume), ("checkpoint", run.checkpoint), ("low.checkpoint", run.low.checkpoint)):
+        if value == "":
+            raise ConfigError(f"{name}: empty; give the output folder of a run, or leave {name} out")
+    if run.mode == "eval" and run.checkpoint is None:
+        raise ConfigError("checkpoint: missing; mode=eval needs the output folder of a run")
+    if run.mode != "eval" and run.checkpoint is not None:
+        raise ConfigError("checkpoint: goes with mode=eval only; to go on with a run, set resume")
+    if run.mode == "eval" and run.resume is not None:
+        raise ConfigError("resume: goes with mode=train and mode=offline; to score an agent, set checkpoint")
 
 
 def check_effects(mode: str, words: Sequence[str]) -> None:
-    """Refuse words of a command line that would change nothing in a mode.
+    """Refuse words of a command line that would change nothing.
+
+    Args:
+        mode: mode of the run, or `player`.
+        words: the words.
 
     Raises:
         ConfigError: there is such a word.
@@ -74,8 +98,7 @@ def check_effects(mode: str, words: Sequence[str]) -> None:
     for word in words:
         name = word.partition("=")[0].lstrip("+~")
         if any(name == each or name.startswith(f"{each}.") for each in _WITHOUT_EFFECT[mode]):
-            where = "without training" if mode == "eval" else f"with mode={mode}"
-            raise ConfigError(f"{word}: has no effect {where}; leave it out")
+            raise ConfigError(f"{word}: has no effect {_WHERE[mode]}; leave it out")
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:
@@ -188,24 +211,6 @@ def option_lengths_go_with_chosen(config: Config) -> str | None:
             f"agent.termination=chosen: the decisions of {config.data} have no lengths to learn from; use data=none or "
             "another agent.termination"
         )
-    return None
-
-
-def saved_runs_are_named(config: Config) -> str | None:
-    """Require a mode in which the saved run is used, and refuse an empty name of a saved run."""
-    return _of_saved_run(config.run)
-
-
-def _of_saved_run(run: RunConfig) -> str | None:
-    for name, value in (("resume", run.resume), ("checkpoint", run.checkpoint), ("low.checkpoint", run.low.checkpoint)):
-        if value == "":
-            return f"{name}: empty; give the output folder of a run, or leave {name} out"
-    if run.mode == "eval" and run.checkpoint is None:
-        return "checkpoint: missing; mode=eval needs the output folder of a run"
-    if run.mode != "eval" and run.checkpoint is not None:
-        return "checkpoint: goes with mode=eval only; to go on with a run, set resume"
-    if run.mode == "eval" and run.resume is not None:
-        return "resume: goes with mode=train and mode=offline; to score an agent, set checkpoint"
     return None
 
 
@@ -676,7 +681,6 @@ def _option_names(config: Config, problem: ProblemFacts) -> tuple[str, ...]:
 RULES: tuple[Rule, ...] = (
     option_length_goes_with_steps,
     option_lengths_go_with_chosen,
-    saved_runs_are_named,
     stop_score_needs_evaluations,
     callbacks_have_evaluations,
     values_end_where_there_are_trips,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import shutil
 import threading
 import webbrowser
@@ -38,6 +39,8 @@ Play a problem yourself, beside agents.
 """
 _LOOPBACK = "127.0.0.1"
 _ONE_EPISODE = ("eval.layouts=1", "film=false")
+# What a page takes from the command line: the problem, which an experiment may set too, and how it is built.
+_OF_A_PAGE = ("env", "experiment", "recipe", "device", "threads", "trust", "hydra")
 
 
 def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
@@ -67,6 +70,9 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     path, settings = split_words(options.settings)
     if path is not None:
         raise ConfigError(f"{path}: not SETTING=VALUE; give an agent as --agent {path}")
+    for each in settings:
+        if re.split("[.=/@]", each.lstrip("+~"))[0] not in _OF_A_PAGE:
+            raise ConfigError(f"{each}: has no effect on the page; give settings of the problem")
     settings = with_config_dirs(settings, options.config_dir)
     with composed(settings) as cfg:
         config = read(cfg)

@@ -19,10 +19,13 @@ from hpamdp.env.errors import closed_on_error
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import check_built, choose_selector, make_agent, make_env, make_evaluation
-from hpamdp.run.compatibility import check_effects
+from hpamdp.run.compatibility import check, check_effects
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.resume import check_saved_options, resolve, saved_words
 from hpamdp.specs import PAMDPSpecs
+
+# Settings that name a saved run, which a player has without a setting.
+_SAVED = ("checkpoint", "resume", "low.checkpoint")
 
 
 @dataclass(frozen=True)
@@ -127,13 +130,18 @@ def load_agent(path: str | None, settings: Sequence[str], objects: Mapping[str, 
     Raises:
         ConfigError: the agent does not exist, or a setting is wrong or has no effect.
     """
+    for each in settings:
+        if each.partition("=")[0].lstrip("+~") in _SAVED:
+            raise ConfigError(f"{each}: give the folder or the name of a saved agent alone, without a setting")
+    check_effects("player", settings)
     words = list(settings)
     if path is not None:
         words = [*saved_words(path, "checkpoint", settings), *settings, "mode=eval", word("checkpoint", path)]
     with composed(words) as cfg:
         if path is None:
             check_effects("eval", settings)
-            config, source = choose_selector(read(cfg).with_objects(objects), settings), None
+            config, source = choose_selector(read(cfg).with_objects(objects).with_run(mode="eval"), settings), None
+            check(config)
         else:
             config, source = resolve(cfg, settings, objects)
         torch.set_num_threads(config.run.threads)

@@ -23,6 +23,8 @@ Film an agent at its problem.
   hpamdp watch low=planner high=oracle                     the best plan
   hpamdp watch low=random high=none env=platform           random actions on another problem
 """
+# Settings that the command sets itself, and its flags in their place.
+_FLAGS = {"eval.layouts": "--episodes", "eval.seed": "--seed"}
 
 
 def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
@@ -47,6 +49,10 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     if options.to.suffix == ".gif" and options.fps > film.GIF_FPS:
         raise ConfigError(f"--fps {options.fps}: a GIF shows at most {film.GIF_FPS} pictures a second; write an .mp4")
     path, settings = split_words(options.player)
+    for each in settings:
+        flag = _FLAGS.get(each.partition("=")[0].lstrip("+~"))
+        if flag is not None:
+            raise ConfigError(f"{each}: the command has a flag for it; use {flag}")
     if path is None and not settings:
         raise ConfigError("watch: nobody to watch; give a run's folder, or a player such as low=planner high=oracle")
     episodes = [f"eval.layouts={options.episodes}", f"eval.seed={options.seed}", "film=true"]
