@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+import yaml
 from gymnasium import spaces
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
@@ -336,6 +337,13 @@ def test_a_wrong_argument_is_one_config_error_and_nothing_is_written(tmp_path, a
     assert not folder.exists()
 
 
+@pytest.mark.parametrize("word", ["checkpoint_every=64", "checkpoint_minutes=1.0", "film=true"])
+def test_a_run_without_a_folder_is_not_asked_for_files(word):
+    name, _, value = word.partition("=")
+    with pytest.raises(hpamdp.ConfigError, match=f"^{word}: writes files, so give the run a folder$"):
+        hpamdp.train("platform", low="random", total_frames=64, **{name: yaml.safe_load(value)})
+
+
 def test_a_folder_with_another_run_is_refused_and_stays(tmp_path):
     hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **TINY)
     before = {path.name: path.read_bytes() for path in Path(tmp_path, "run").iterdir()}
@@ -530,7 +538,13 @@ def test_trust_is_true_or_false_and_nothing_like_it(trust):
         hpamdp.load("hppo_platform", trust=trust)
 
 
-@pytest.mark.parametrize("settings", [{"mode": "train"}, {"total_frames": 5}, {"checkpoint": "x"}, {"low": "hppo"}])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        *({"mode": "train"}, {"total_frames": 5}, {"checkpoint": "x"}, {"low": "hppo"}),
+        *({"eval.layouts": 3}, {"eval": {"seed": 1, "layouts": 3}}),
+    ],
+)
 def test_settings_without_effect_on_a_loaded_agent_are_refused(settings):
     with pytest.raises(hpamdp.ConfigError, match="has no effect on a trained agent"):
         hpamdp.load("hppo_platform", **settings)

@@ -281,7 +281,7 @@ def test_all_commands_tell_when_the_options_of_a_saved_agent_are_others(command)
     "word",
     [
         *("total_frames=5", "num_envs=2", "steps_per_batch=2", "log_every=1", "eval.every=1", "eval.stop_score=1.0"),
-        *("data=human", "collector=multi", "callbacks=[]", "save_best=true"),
+        *("data=human", "collector=multi", "eval={seed:1,every:5}", "callbacks=[]", "save_best=true"),
         *("offline.updates=2", "checkpoint_minutes=1", "checkpoint_replay=false", "compile_updates=false"),
     ],
 )

@@ -28,13 +28,14 @@ from hpamdp.complaints import as_code, no_such
 from hpamdp.config.components import TARGET
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching
-from hpamdp.config.schema import RESUME_AUTO
+from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.env.errors import closed_on_error
 from hpamdp.messages import reason_of, say, warn
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import Callback
 from hpamdp.run.capacity import memory_errors_explained
+from hpamdp.run.compatibility import check_effects
 from hpamdp.run.continuation import rest_of
 from hpamdp.run.folder import locked
 from hpamdp.run.players import load_agent
@@ -45,6 +46,8 @@ from hpamdp.run_files import METRICS_NAME
 
 # Values of the run that count for a trained agent, too.
 _OF_LOADING = ("device", "threads")
+# Values of the run that are of use only if the run writes files.
+_OF_FILES = ("checkpoint_every", "checkpoint_minutes", "film")
 
 
 def train(
@@ -101,8 +104,8 @@ def train(
         stack.enter_context(_counted())
         with composed([*saved, *words]) as cfg:
             config, source = resolve(cfg, words, arguments.objects)
-            if output_dir is None and config.logger.name != "csv":
-                raise ConfigError(f"{config.logger}: writes files, so give the run a folder")
+            if output_dir is None:
+                _check_no_files(config, words)
             stack.enter_context(memory_errors_explained(config))
             if output_dir is not None:
                 stack.enter_context(_own_folder(output_dir))
@@ -121,6 +124,20 @@ def train(
             say(f"Stopped at {trainer.frames:,}{trainer.unit}")
     parts = trainer.parts
     return Agent(config, parts.agent, parts.env.base_env, trainer.progress(), trainer.recorder.metrics.rows())
+
+
+def _check_no_files(config: Config, words: Sequence[str]) -> None:
+    """Refuse settings that ask for files, for a run without a folder.
+
+    Raises:
+        ConfigError: there is such a setting.
+    """
+    if config.logger.name != "csv":
+        raise ConfigError(f"{config.logger}: writes files, so give the run a folder")
+    for each in words:
+        name = each.partition("=")[0]
+        if name in _OF_FILES and getattr(config.run, name):
+            raise ConfigError(f"{each}: writes files, so give the run a folder")
 
 
 def _words_of(settings: Mapping[str, Any], problem: Arguments, folders: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -254,6 +271,7 @@ def load(
         if name not in _OF_LOADING and name.partition(".")[0] not in ("env", "eval"):
             raise ConfigError(f"{name}: has no effect on a trained agent; leave it out")
     own = [*settings_words(others), *settings_words(with_env_prefix(of_problem, known))]
+    check_effects("agent", own)
     words = [*searching(config_dirs), *arguments.with_words(own), *(["trust=true"] if trust else [])]
     if env is None:
         _check_problem(file, words)

@@ -30,7 +30,7 @@ AUTO_ENCODER = "auto"
 GROUPS_OF_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment", "search", RECIPE)
 
 # Words of a command line that change nothing, by the mode of the run: settings, groups, and mappings of settings.
-# A player is no run: somebody who is watched or played with.
+# There is no run for a `player`, who is watched or played with, and for an `agent` that Python code loads.
 _OF_COLLECTION = ("total_frames", "steps_per_batch", "collector", "eval.every", "agent.uniform_option_steps")
 _OF_LEARNING = ("offline", "data", "log_every", "callbacks", "save_best", "compile_updates", "update_precision")
 _OF_AGENTS_LEARNING = ("agent.values_end", "agent.selector_values_end", "low.freeze", "exploration")
@@ -43,12 +43,14 @@ _WITHOUT_EFFECT = {
         *("num_envs", "eval.stop_score"),
     ),
     "player": ("mode", "overwrite", "logger"),
+    "agent": ("eval.layouts",),  # its method `evaluate` is told the number of episodes
 }
 _WHERE = {
     "train": "with mode=train",
     "offline": "with mode=offline",
     "eval": "without training",
     "player": "on a player",
+    "agent": "on a trained agent",
 }
 
 Rule: TypeAlias = Callable[[Config], "str | None"]
@@ -89,16 +91,24 @@ def check_effects(mode: str, words: Sequence[str]) -> None:
     """Refuse words of a command line that would change nothing.
 
     Args:
-        mode: mode of the run, or `player`.
+        mode: mode of the run, or `player` or `agent`.
         words: the words.
 
     Raises:
         ConfigError: there is such a word.
     """
     for word in words:
-        name = word.partition("=")[0].lstrip("+~")
-        if any(name == each or name.startswith(f"{each}.") for each in _WITHOUT_EFFECT[mode]):
+        if any(_sets(word, each) for each in _WITHOUT_EFFECT[mode]):
             raise ConfigError(f"{word}: has no effect {_WHERE[mode]}; leave it out")
+
+
+def _sets(word: str, name: str) -> bool:
+    """Return whether a word of a command line sets something, as in `eval.every=5` and `eval={every:5}`."""
+    given, _, value = word.partition("=")
+    given = given.lstrip("+~")
+    if given == name or given.startswith(f"{name}."):
+        return True
+    return name.startswith(f"{given}.") and re.search(rf"[{{,]\s*{name[len(given) + 1 :]}\s*:", value) is not None
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:
