@@ -351,7 +351,10 @@ def test_settings_that_change_nothing_about_a_page_are_refused(command, word):
 @pytest.mark.parametrize(
     ("mode", "word"),
     [
-        *(("offline", word) for word in ("total_frames=5", "steps_per_batch=2", "eval.every=5", "collector=multi")),
+        *(
+            ("offline", word)
+            for word in ("total_frames=5", "num_envs=2", "steps_per_batch=2", "eval.every=5", "collector=multi")
+        ),
         *(("train", word) for word in ("offline.updates=2", "offline.eval_every=1")),
     ],
 )

@@ -31,7 +31,10 @@ GROUPS_OF_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment
 
 # Words of a command line that change nothing, by the mode of the run: settings, groups, and mappings of settings.
 # There is no run for a `player`, who is watched or played with, and for an `agent` that Python code loads.
-_OF_COLLECTION = ("total_frames", "steps_per_batch", "collector", "eval.every", "agent.uniform_option_steps")
+_OF_COLLECTION = (
+    *("total_frames", "num_envs", "steps_per_batch", "collector", "eval.every"),
+    "agent.uniform_option_steps",
+)
 _OF_LEARNING = ("offline", "data", "log_every", "callbacks", "save_best", "compile_updates", "update_precision")
 _OF_AGENTS_LEARNING = ("agent.values_end", "agent.selector_values_end", "low.freeze", "exploration")
 _OF_CHECKPOINTS = ("checkpoint_every", "checkpoint_minutes", "checkpoint_replay")
@@ -40,7 +43,7 @@ _WITHOUT_EFFECT = {
     "offline": _OF_COLLECTION,
     "eval": (
         *(*_OF_COLLECTION, *_OF_LEARNING, *_OF_AGENTS_LEARNING, *_OF_CHECKPOINTS),
-        *("num_envs", "eval.stop_score"),
+        "eval.stop_score",
     ),
     "player": ("mode", "overwrite", "logger"),
     "agent": ("eval.layouts",),  # its method `evaluate` is told the number of episodes
