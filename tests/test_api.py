@@ -337,6 +337,15 @@ def test_a_wrong_argument_is_one_config_error_and_nothing_is_written(tmp_path, a
     assert not folder.exists()
 
 
+def test_an_agent_whose_selector_alone_was_trained_comes_back_whole(tmp_path):
+    agent = hpamdp.train("boatdock", low="random", high="ucb", **TINY, **{"low.freeze": True})
+    observation = agent.observation_space.sample()
+    assert agent.action_space.contains(agent.act(observation))
+    scores = agent.evaluate(episodes=3, seed=1, per_episode=True)["score"]
+    agent.save(tmp_path / "policy.pt")
+    assert np.array_equal(hpamdp.load(tmp_path).evaluate(episodes=3, seed=1, per_episode=True)["score"], scores)
+
+
 @pytest.mark.parametrize("word", ["checkpoint_every=64", "checkpoint_minutes=1.0", "film=true"])
 def test_a_run_without_a_folder_is_not_asked_for_files(word):
     name, _, value = word.partition("=")

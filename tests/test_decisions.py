@@ -207,3 +207,9 @@ def test_meta_critic_chooses_options_of_a_fixed_length_optimally_and_better_than
 
 def test_actor_chooses_options_of_a_fixed_length_optimally():
     assert trained(make_actor(), 2, 60) >= 0.95 * best_value(GAMMA, 2)
+
+
+def test_an_environment_of_choices_closes_the_one_that_it_wraps():
+    inner = BoatDockEnv(2)
+    OptionChoiceEnv(Random(PAMDPSpecs.from_env(inner)).policy, inner).close()
+    assert inner.is_closed

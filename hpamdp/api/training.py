@@ -123,7 +123,7 @@ def train(
         if is_interrupted:
             say(f"Stopped at {trainer.frames:,}{trainer.unit}")
     parts = trainer.parts
-    return Agent(config, parts.agent, parts.env.base_env, trainer.progress(), trainer.recorder.metrics.rows())
+    return Agent(config, parts.agent, parts.problem, trainer.progress(), trainer.recorder.metrics.rows())
 
 
 def _check_no_files(config: Config, words: Sequence[str]) -> None:

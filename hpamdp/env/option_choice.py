@@ -52,59 +52,66 @@ class OptionChoiceEnv(PAMDPEnv):
         return self._wrapped[0]
 
     @property
-    def _inner_env(self) -> PAMDPEnv:
+    def inner_env(self) -> PAMDPEnv:
+        """The wrapped environment."""
         return self._wrapped[1]
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the wrapped environment, too."""
+        if not self.inner_env.is_closed:
+            self.inner_env.close()
+        super().close(raise_if_closed=raise_if_closed)
 
     def fixed_episodes(self, seed: int) -> TensorDict | None:
         """Return the fixed episodes of the wrapped environment."""
-        return self._inner_env.fixed_episodes(seed)
+        return self.inner_env.fixed_episodes(seed)
 
     def seed_evaluation(self, seed: int) -> None:
         """Seed the evaluation episodes of the wrapped environment."""
-        self._inner_env.seed_evaluation(seed)
+        self.inner_env.seed_evaluation(seed)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return the results of the wrapped environment."""
-        return self._inner_env.results(last)
+        return self.inner_env.results(last)
 
     @property
     def keeps_episodes(self) -> bool:
         """Whether the environment's `env_state` holds its episodes."""
-        return self._inner_env.keeps_episodes
+        return self.inner_env.keeps_episodes
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the state of the wrapped environment."""
-        return self._inner_env.env_state()
+        return self.inner_env.env_state()
 
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Check the state of the wrapped environment."""
-        self._inner_env.check_env_state(columns)
+        self.inner_env.check_env_state(columns)
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Set the state of the wrapped environment."""
-        self._inner_env.set_env_state(columns)
+        self.inner_env.set_env_state(columns)
 
     def statistics(self) -> dict[str, Tensor]:
         """Return the statistics of the wrapped environment."""
-        return self._inner_env.statistics()
+        return self.inner_env.statistics()
 
     def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
         """Set the statistics of the wrapped environment."""
-        self._inner_env.set_statistics(columns)
+        self.inner_env.set_statistics(columns)
 
     def take_new_statistics(self) -> dict[str, Tensor]:
         """Return the new statistics of the wrapped environment."""
-        return self._inner_env.take_new_statistics()
+        return self.inner_env.take_new_statistics()
 
     def add_statistics(self, columns: Mapping[str, Tensor]) -> None:
         """Add statistics to the wrapped environment."""
-        self._inner_env.add_statistics(columns)
+        self.inner_env.add_statistics(columns)
 
     def _set_seed(self, seed: int | None) -> None:
-        self._inner_env.set_seed(seed)
+        self.inner_env.set_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        return self._observed(self._inner_env._reset(tensordict))
+        return self._observed(self.inner_env._reset(tensordict))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         option = tensordict.get(keys.OPTION)
@@ -114,9 +121,9 @@ class OptionChoiceEnv(PAMDPEnv):
         state_keys = getattr(self._low_policy, "state_keys", [])
         # Episodes that a partial reset did not start again are over: they stay as they are and earn 0.
         with acting(ExplorationType.DETERMINISTIC), torch.no_grad():
-            for step in range(self._inner_env.max_steps):
+            for step in range(self.inner_env.max_steps):
                 acted = self._low_policy(td.set(keys.OPTION, option))
-                td = self._inner_env._step(acted)
+                td = self.inner_env._step(acted)
                 td.update(acted.select(*state_keys))
                 total = total + self.gamma**step * td.get(keys.REWARD)
                 if td.get(keys.DONE).all():

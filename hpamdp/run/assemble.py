@@ -60,6 +60,12 @@ class AssembledRun:
     data: Demonstrations | None
     device: torch.device
 
+    @property
+    def problem(self) -> PAMDPEnv:
+        """The environments in which the whole agent acts; with `low.freeze=true`, `env` wraps them."""
+        env = self.env.base_env
+        return env.inner_env if isinstance(env, OptionChoiceEnv) else env
+
     def close(self) -> None:
         """Close the environments."""
         for env in (self.env, self.evaluation.env):
