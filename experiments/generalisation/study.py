@@ -145,6 +145,36 @@ def _mean(rows: Rows, column: str) -> float:
     return sum(row[column] for row in rows) / len(rows)
 
 
+def of_new_boats(results: Rows) -> Rows:
+    """Return the rows of agents that never sailed a boat twice in training."""
+    return [row for row in results if row["fleet_size"] == "new"]
+
+
+def by_fleet(results: Rows) -> dict[int, dict[str, list[float]]]:
+    """Return the scores of later trips by the number of boats in training, then by which boats are scored.
+
+    Agents are in the order of their seeds, which are the same for both.
+    """
+    found: dict[int, dict[str, list[float]]] = {}
+    rows = [row for row in results if row["fleet_size"] != "new"]
+    for row in sorted(rows, key=lambda row: (int(row["fleet_size"]), row["seed"])):
+        found.setdefault(int(row["fleet_size"]), {}).setdefault(row["scored_boats"], []).append(later(row))
+    return {size: scores for size, scores in found.items() if len(scores["training"]) == len(scores["new"])}
+
+
+def fleet_table(results: Rows) -> str:
+    """Return a line for each number of boats in training: the score of later trips on these boats and on new ones."""
+    lines = ["| training boats | n | on these boats | on new boats | difference | 95 % |", "|---|---|---|---|---|---|"]
+    for size, scores in by_fleet(results).items():
+        lost = [own - new for own, new in zip(scores["training"], scores["new"], strict=True)]
+        low, high = mean_interval(lost)
+        lines.append(
+            f"| {size} | {len(lost)} | {spread(scores['training'])} | {spread(scores['new'])} | {spread(lost)} "
+            f"| {low:.3f} to {high:.3f} |"
+        )
+    return "\n".join(lines)
+
+
 def players_table(players: Rows) -> str:
     """Return a line for each family, number of boats and player: the score by number of the trip."""
     heads = ("family", "boats", "player", *(f"trip {trip}" for trip in range(1, NUM_TRIPS + 1)), "trips 3 to 8")
@@ -169,8 +199,8 @@ def transfer_table(rows: Rows) -> str:
 
 def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
     """Draw the score by number of the trip with one boat, and people's over their first episodes beside it."""
-    figure = Figure(figsize=(11.0, 4.2), layout="constrained")
-    sessions, episodes = figure.subplots(1, 2, sharey=True, width_ratios=[3, 2])
+    figure = Figure(figsize=(14.0, 4.2), layout="constrained")
+    sessions, fleets, episodes = figure.subplots(1, 3, sharey=True, width_ratios=[3, 2, 2])
     trips = range(1, NUM_TRIPS + 1)
     for family, colour in COLOURS.items():
         shown = {"family": family, "boats": 1, "frame": "first_press", "fleet_size": "new", **DRAWN}
@@ -185,18 +215,26 @@ def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
                 sessions.plot(trips, [row["score"] for row in found], color=colour, linestyle=line, label=label)
     sessions.set(xlabel="trip with a new boat", ylim=(-0.2, 3.8))
     sessions.set_ylabel("mean score of a trip")
+    sizes = by_fleet(results)
+    for scored, line, name in (("training", "o--", "these boats"), ("new", "o-", "new boats")):
+        means = [sum(scores[scored]) / len(scores[scored]) for scores in sizes.values()]
+        fleets.plot([*sizes], means, line, color=COLOURS["turned"], label=f"scored on {name}")
+    fleets.set(xscale="log", xlabel="boats in training")
+    fleets.set_xticks([*sizes], labels=[*map(str, sizes)])
+    fleets.legend(loc="lower right", fontsize=7, frameon=False)
     scores = [row["score"] for row in people]
     episodes.plot(range(1, len(scores) + 1), scores, ".", color="#D98200", alpha=0.4, label="mean of 40 people")
     tens = [sum(scores[first : first + 10]) / 10 for first in range(0, len(scores), 10)]
     episodes.plot([10 * i + 5.5 for i in range(len(tens))], tens, "s-", color="#D98200", label="over ten episodes")
     episodes.legend(loc="lower right", fontsize=7, frameon=False)
-    for axes in (sessions, episodes):
+    for axes in (sessions, fleets, episodes):
         axes.axhline(HUMAN["chosen"]["score"], color="#8c8c8c", linestyle=":", linewidth=1.0)
         axes.spines[["top", "right"]].set_visible(False)
     sessions.annotate(
         f"people's mean {HUMAN['chosen']['score']:.2f}", (NUM_TRIPS, HUMAN["chosen"]["score"]), ha="right"
     )
     episodes.set(xlabel="a person's episode, two boats", xlim=(0, PEOPLE_EPISODES))
+    fleets.set_title("trips 3 to 8", loc="left", fontweight="bold", fontsize=10)
     episodes.set_title("people", loc="left", fontweight="bold", fontsize=10)
     sessions.set_title("agents", loc="left", fontweight="bold", fontsize=10)
     sessions.legend(loc="lower right", fontsize=7, frameon=False)
@@ -212,7 +250,8 @@ def main(folders: Sequence[str]) -> None:
     results = with_enough_seeds(results, *SETTINGS)
     transfer = with_enough_seeds(transfer, "learner", "trained_on", "controller")
     draw(results, players, people, HERE / "trips.png")
-    print(table(results), players_table(players), transfer_table(transfer), sep="\n\n")
+    tables = table(of_new_boats(results)), fleet_table(results), players_table(players), transfer_table(transfer)
+    print(*tables, sep="\n\n")
 
 
 if __name__ == "__main__":
