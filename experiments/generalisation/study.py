@@ -4,8 +4,8 @@ python experiments/generalisation/study.py FOLDER...    adds the runs of experim
                                                         results.csv, then draws and tabulates
 python experiments/generalisation/study.py              draws and tabulates the stored csv files
 
-`players.py` and `transfer.py` write the other csv files. people.csv has the recording's mean score by number of the
-episode.
+`players.py`, `from_nothing.py` and `transfer.py` write the other csv files. people.csv has the recording's mean score
+by number of the episode.
 """
 
 from __future__ import annotations
@@ -48,7 +48,11 @@ RUN = (*SETTINGS, "frames", "seed")  # the columns that name a run
 FIRST_LATER, NUM_TRIPS = 3, 8
 PEOPLE_EPISODES = 60
 PLANNING = ("pets", "dlpa")  # their plans end with the trip, whatever `agent.values_end` says
-PLAYERS = {"knows": "best plans, which know the boat", "finds_out": "player who finds out"}
+PLAYERS = {
+    "knows": "best plans, which know the boat",
+    "finds_out": "player who finds out",
+    "from_nothing": "PETS, untrained when the session begins",
+}
 DRAWN = {"low": "hppo", "memory": "gru", "values_end": "trip"}  # the learner of the figure
 COLOURS = {"turned": "#0072B2", "strength": "#009E73", "any": "#CC79A7"}
 
@@ -245,13 +249,14 @@ def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
         add_to_tables(HERE, {"results": gather(finished(folders))}, RUN)
-    stored = {name: HERE / f"{name}.csv" for name in ("results", "players", "transfer", "people")}
-    results, players, transfer, people = (read_csv(file) if file.exists() else [] for file in stored.values())
+    names = ("results", "players", "from_nothing", "transfer", "people")
+    stored = [HERE / f"{name}.csv" for name in names]
+    results, players, untrained, transfer, people = (read_csv(file) if file.exists() else [] for file in stored)
     results = with_enough_seeds(results, *SETTINGS)
     transfer = with_enough_seeds(transfer, "learner", "trained_on", "controller")
     draw(results, players, people, HERE / "trips.png")
-    tables = table(of_new_boats(results)), fleet_table(results), players_table(players), transfer_table(transfer)
-    print(*tables, sep="\n\n")
+    of_agents = table(of_new_boats(results)), fleet_table(results)
+    print(*of_agents, players_table(players + untrained), transfer_table(transfer), sep="\n\n")
 
 
 if __name__ == "__main__":
