@@ -28,6 +28,7 @@ from hpamdp.analysis.study import (
     with_enough_seeds,
 )
 from hpamdp.env.boatdock.reference import HUMAN
+from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -44,9 +45,10 @@ SETTINGS = (
     "memory",
     "sharing",
 )
-RUN = (*SETTINGS, "frames", "seed")  # the columns that name a run
+RUN = (*SETTINGS, "fleet_seed", "frames", "seed")  # the columns that name a run
 FIRST_LATER, NUM_TRIPS = 3, 8
 PEOPLE_EPISODES = 60
+FLEETS = (1, 2, 4, 16, 64, 256)
 PLANNING = ("pets", "dlpa")  # their plans end with the trip, whatever `agent.values_end` says
 PLAYERS = {
     "knows": "best plans, which know the boat",
@@ -79,8 +81,11 @@ def gather(runs: Sequence[Run]) -> Rows:
             "memory": low.get("memory", ""),
             "sharing": run.config["agent"]["sharing"],
         }
+        fleet_size, fleet_seed = env["fleet_size"], env["fleet_seed"]
         rows.append(
             settings
+            | {"fleet_seed": fleet_seed if fleet_size else ""}
+            | {"key_orders": key_orders(fleet_size, fleet_seed) if fleet_size else "both"}
             | {"frames": run.summary["frames"], "seed": run.summary["seed"], "cpu_s": round(run.summary["cpu_s"], 1)}
             | {"ceiling": round(run.summary["ceiling"], 4), "success": round(run.summary["success"], 4)}
             | {f"score_{trip}": round(float(score), 4) for trip, score in enumerate(scores, start=1)}
@@ -149,33 +154,48 @@ def _mean(rows: Rows, column: str) -> float:
     return sum(row[column] for row in rows) / len(rows)
 
 
+def key_orders(fleet_size: int, fleet_seed: int) -> str:
+    """Return `both` if the keys of some training boats push one after another to the left and of some to the right.
+
+    Turned boats differ in nothing else, once they are seen in the frame of the first press. Else return `one`.
+    """
+    env = UnseenBoatsEnv(32 * fleet_size, fleet_size=fleet_size, fleet_seed=fleet_seed)
+    env.reset()
+    first, second = env.known_boats(env.state)[0].directions[:, :2].unbind(1)
+    is_left = first[:, 0] * second[:, 1] > first[:, 1] * second[:, 0]
+    return "both" if is_left.any() and not is_left.all() else "one"
+
+
 def of_new_boats(results: Rows) -> Rows:
     """Return the rows of agents that never sailed a boat twice in training."""
     return [row for row in results if row["fleet_size"] == "new"]
 
 
-def by_fleet(results: Rows) -> dict[int, dict[str, list[float]]]:
-    """Return the scores of later trips by the number of boats in training, then by which boats are scored.
+def by_fleet(results: Rows) -> dict[tuple[int, str], list[dict[str, dict]]]:
+    """Return the rows of each agent with few training boats, by the boats that it is scored on: `training` and `new`.
 
-    Agents are in the order of their seeds, which are the same for both.
+    Agents are grouped by the number of training boats and by the orders of their keys.
     """
-    found: dict[int, dict[str, list[float]]] = {}
-    rows = [row for row in results if row["fleet_size"] != "new"]
-    for row in sorted(rows, key=lambda row: (int(row["fleet_size"]), row["seed"])):
-        found.setdefault(int(row["fleet_size"]), {}).setdefault(row["scored_boats"], []).append(later(row))
-    return {size: scores for size, scores in found.items() if len(scores["training"]) == len(scores["new"])}
+    found: dict[tuple[int, str], dict[tuple[int, int], dict[str, dict]]] = {}
+    for row in sorted((row for row in results if row["fleet_size"] != "new"), key=lambda row: int(row["fleet_size"])):
+        agents = found.setdefault((int(row["fleet_size"]), row["key_orders"]), {})
+        agents.setdefault((row["fleet_seed"], row["seed"]), {})[row["scored_boats"]] = row
+    return {fleet: [rows for rows in agents.values() if len(rows) == 2] for fleet, agents in found.items()}
 
 
 def fleet_table(results: Rows) -> str:
-    """Return a line for each number of boats in training: the score of later trips on these boats and on new ones."""
-    lines = ["| training boats | n | on these boats | on new boats | difference | 95 % |", "|---|---|---|---|---|---|"]
-    for size, scores in by_fleet(results).items():
-        lost = [own - new for own, new in zip(scores["training"], scores["new"], strict=True)]
-        low, high = mean_interval(lost)
-        lines.append(
-            f"| {size} | {len(lost)} | {spread(scores['training'])} | {spread(scores['new'])} | {spread(lost)} "
-            f"| {low:.3f} to {high:.3f} |"
-        )
+    """Return a line for each number of training boats: the scores on these boats and on new ones."""
+    lines = [
+        "| training boats | orders of their keys | n | first trip, these boats | new boats | trips 3 to 8, these boats "
+        "| new boats | difference | 95 % |",
+        "|---" * 9 + "|",
+    ]
+    for (size, orders), agents in by_fleet(results).items():
+        scores = [[value(rows[boats]) for rows in agents] for value in (_first, later) for boats in ("training", "new")]
+        lost = [own - new for own, new in zip(*scores[2:], strict=True)]
+        interval = "{:.3f} to {:.3f}".format(*mean_interval(lost)) if len(lost) > 1 else ""
+        columns = [size, orders, len(agents), *map(spread, scores), spread(lost), interval]
+        lines.append(f"| {' | '.join(map(str, columns))} |")
     return "\n".join(lines)
 
 
@@ -219,13 +239,18 @@ def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
                 sessions.plot(trips, [row["score"] for row in found], color=colour, linestyle=line, label=label)
     sessions.set(xlabel="trip with a new boat", ylim=(-0.2, 3.8))
     sessions.set_ylabel("mean score of a trip")
-    sizes = by_fleet(results)
-    for scored, line, name in (("training", "o--", "these boats"), ("new", "o-", "new boats")):
-        means = [sum(scores[scored]) / len(scores[scored]) for scores in sizes.values()]
-        fleets.plot([*sizes], means, line, color=COLOURS["turned"], label=f"scored on {name}")
-    fleets.set(xscale="log", xlabel="boats in training")
-    fleets.set_xticks([*sizes], labels=[*map(str, sizes)])
-    fleets.legend(loc="lower right", fontsize=7, frameon=False)
+    markers = {"one": "x", "both": "o"}
+    for (size, orders), agents in by_fleet(results).items():
+        for boats, colour in (("training", "#8c8c8c"), ("new", COLOURS["turned"])):
+            scores = [later(rows[boats]) for rows in agents]
+            fleets.plot([size] * len(agents), scores, markers[orders], color=colour, mfc="none")
+    for orders, marker in markers.items():
+        label = f"new boats ({orders} order{'s' if orders == 'both' else ''} in training)"
+        fleets.plot([], [], marker, color=COLOURS["turned"], mfc="none", label=label)
+    fleets.plot([], [], "o", color="#8c8c8c", mfc="none", label="the training boats")
+    fleets.set(xscale="log", xlabel="boats in training", xticks=FLEETS, xticklabels=FLEETS)
+    fleets.minorticks_off()
+    fleets.legend(loc="lower right", fontsize=7, frameon=False, title="scored on", title_fontsize=7)
     scores = [row["score"] for row in people]
     episodes.plot(range(1, len(scores) + 1), scores, ".", color="#D98200", alpha=0.4, label="mean of 40 people")
     tens = [sum(scores[first : first + 10]) / 10 for first in range(0, len(scores), 10)]
