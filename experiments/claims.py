@@ -843,6 +843,12 @@ def generalisation() -> list[Claim]:
     over_ucb, over_one = by_value - by_ucb, by_value - one_boat  # seed by seed
     (ucb_low, ucb_high), (one_low, one_high) = mean_interval(over_ucb), mean_interval(over_one)
     two_boats = rows("generalisation/results.csv", family="turned", high="value", low="pets")
+    fleets = study("generalisation").by_fleet(rows("generalisation/results.csv"))
+    both, one = (
+        [agent for (_, orders), agents in fleets.items() if orders == which for agent in agents]
+        for which in ("both", "one")
+    )
+    of_two = fleets[2, "both"]
     turned, strength, any_boat, pets = (
         numbers_of(*cell) for cell in (("turned",), ("strength",), ("any",), ("any", "pets"))
     )
@@ -879,6 +885,22 @@ def generalisation() -> list[Claim]:
             "PETS scores {first}, {second} and {later}, {share:.0f} %, after {presses_made:,.0f} presses "
             "({seeds:word} seeds, {minutes:.0f} minutes of CPU time).",
             pets,
+        ),
+        Claim(
+            page("generalisation"),
+            "With {fewest} training boats of both orders it scores {few_new:.2f} from the third trip on with new boats, "
+            "and {few_own:.2f} with these {fewest} ({few:word} seeds). With one to {most:word} training boats of one "
+            "order it scores {one_new:.2f} and {one_own:.2f}.",
+            dict(
+                fewest=min(size for size, orders in fleets if orders == "both"),
+                few=len(of_two),
+                few_new=np.mean([later(agent["new"]) for agent in of_two]),
+                few_own=np.mean([later(agent["training"]) for agent in of_two]),
+                most=max(int(agent["new"]["fleet_size"]) for agent in one),
+                one_new=np.mean([later(agent["new"]) for agent in one]),
+                one_own=np.mean([later(agent["training"]) for agent in one]),
+            ),
+            holds=all(later(agent["training"]) - later(agent["new"]) < 0.05 for agent in both),
         ),
         Claim(
             page("generalisation"),
