@@ -888,9 +888,9 @@ def generalisation() -> list[Claim]:
         ),
         Claim(
             page("generalisation"),
-            "With {fewest} training boats of both orders it scores {few_new:.2f} from the third trip on with new boats, "
-            "and {few_own:.2f} with these {fewest} ({few:word} seeds). With one to {most:word} training boats of one "
-            "order it scores {one_new:.2f} and {one_own:.2f}.",
+            "With {fewest} training boats of both orders H-PPO scores {few_new:.2f} from the third trip on with new "
+            "boats, and {few_own:.2f} with these {fewest} ({few:word} seeds). With one to {most:word} training boats "
+            "of one order it scores {one_new:.2f} and {one_own:.2f}.",
             dict(
                 fewest=min(size for size, orders in fleets if orders == "both"),
                 few=len(of_two),
