@@ -62,6 +62,33 @@ Widths = Annotated[tuple[PositiveInt, ...], FromList]
 Indices = Annotated[tuple[NonNegativeInt, ...], FromList]
 
 
+class OnlyWith:
+    """Says, as a part of a setting's type, with which values of another setting it counts.
+
+    `Annotated[PositiveInt, OnlyWith("memory", "gru")]` is a setting that counts with `memory=gru` alone. Without
+    values, it counts if the other setting is neither null, 0 nor false.
+
+    Args:
+        name: of the other setting.
+        values: those with which this one counts.
+    """
+
+    def __init__(self, name: str, *values: Any) -> None:
+        self.name = name
+        self.values = values
+
+    def holds(self, settings: Mapping[str, Any]) -> bool:
+        """Return whether the setting counts beside the other settings of its class."""
+        value = settings[self.name]
+        return value in self.values if self.values else bool(value)
+
+    def __str__(self) -> str:
+        """Return when the setting counts."""
+        if not self.values:
+            return f"if {self.name} is set"
+        return f"with {self.name}={' or '.join('null' if value is None else str(value) for value in self.values)}"
+
+
 class SettingError(ValueError):
     """Raised by a constructor to refuse a setting. Users see the message in one line, without a traceback."""
 

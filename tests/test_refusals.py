@@ -6,19 +6,23 @@ import re
 
 import pytest
 import yaml
-from conftest import compose_config
+from conftest import CONF, choices, compose_config
 from omegaconf import DictConfig, OmegaConf
+from pydantic import TypeAdapter
 
+import hpamdp
 from hpamdp import memory
-from hpamdp.config.components import GROUPS
+from hpamdp.config.components import GROUPS, load_class, settings_model, takes_settings_model
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
 from hpamdp.run import capacity
 from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.checkpoint import progress_of
+from hpamdp.run.compatibility import settings_without_effect
 from hpamdp.run.players import load_player, split_words
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.train import run
+from hpamdp.settings import OnlyWith
 
 SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "eval.every=0"]
 PLATFORM = "env=platform high=none low=random "
@@ -362,6 +366,54 @@ def test_the_length_of_another_mode_is_refused(mode, word):
     words = [f"mode={mode}", "low=random", word]
     with pytest.raises(ConfigError, match=rf"^{re.escape(word)}: has no effect with mode={mode}; leave it out$"):
         resolve(compose_config(words), words)
+
+
+@pytest.mark.parametrize(
+    ("words", "needs"),
+    [
+        ("low=hppo low.memory_size=8", "with memory=gru"),
+        ("low=dlpa low.end_value_lr=0.1", "if end_values is set"),
+        ("low=qpamdp low.patience=3", "with parameter_updates=null"),
+        ("low=random high=ucb high.window=9", "with memory=sliding_window"),
+        ("low=random exploration=held exploration.epsilon_steps=9", "if epsilon_final is set"),
+        ("env=boatdock_unseen high=none low=random env.fleet_seed=3", "if fleet_size is set"),
+        ("low=hppo low.memory=gru low.memory_size=8", None),
+        ("low=hppo", None),
+        ("env=boatdock_unseen high=none low=hppo low.memory_size=8", None),  # whose recipe has low.memory=gru
+        ("low=random high=ucb high.memory=sliding_window high.window=9", None),
+        ("env=boatdock_unseen high=none low=random env.fleet_size=4 env.fleet_seed=3", None),
+    ],
+)
+def test_a_setting_that_counts_only_with_another_value_is_told(words, needs):
+    *_, last = words.split()
+    name = last.partition("=")[0].partition(".")[2]
+    expected = [] if needs is None else [f"{last}: has no effect; {name} counts only {needs}"]
+    assert settings_without_effect(read(config_of(words)), words.split()) == expected
+
+
+def test_a_setting_without_effect_is_told_once_by_both_doors(command, capsys):
+    words = ["env=platform", "high=none", "low=hppo", "low.minibatch_size=16", "low.memory_size=8"]
+    line = "low.memory_size=8: has no effect; memory_size counts only with memory=gru"
+    code, _, err = command(*words, *SMALL, "film=false")
+    assert code == 0 and err.count(line) == 1
+    capsys.readouterr()
+    settings = {"total_frames": 32, "num_envs": 4, "steps_per_batch": 4, "eval.layouts": 4, "progress": False}
+    hpamdp.train("platform", low={"name": "hppo", "minibatch_size": 16, "memory_size": 8}, **settings)
+    assert capsys.readouterr().err.count(line) == 1
+
+
+@pytest.mark.parametrize(("group", "name"), [(group, name) for group in GROUPS for name in choices(group)])
+def test_settings_that_count_with_another_one_name_a_setting_and_its_values(group, name):
+    target = yaml.safe_load((CONF / group / f"{name}.yaml").read_text()).get("_target_")
+    if target is None or not takes_settings_model(load_class(target)):
+        return
+    model = settings_model(load_class(target))
+    for field in model.model_fields.values():
+        for each in field.metadata:
+            if isinstance(each, OnlyWith):
+                assert each.name in model.model_fields
+                for value in each.values:
+                    TypeAdapter(model.model_fields[each.name].annotation).validate_python(value)
 
 
 def test_a_resumed_run_keeps_the_saved_options_of_the_choices_that_it_does_not_change(saved, command, tmp_path):

@@ -13,12 +13,13 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from hpamdp.complaints import as_json
-from hpamdp.config.components import Component, constructor_arguments, is_passed
+from hpamdp.config.components import GROUPS, Component, constructor_arguments, is_passed
 from hpamdp.config.compose import RECIPE
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.pickling import why_unsendable
+from hpamdp.settings import OnlyWith
 
 # The choice that picks a selector automatically, and the selector that it picks if there are options.
 AUTO_SELECTOR, DEFAULT_SELECTOR = "auto", "ucb"
@@ -103,6 +104,28 @@ def check_effects(mode: str, words: Sequence[str]) -> None:
     for word in words:
         if any(_sets(word, each) for each in _WITHOUT_EFFECT[mode]):
             raise ConfigError(f"{word}: has no effect {_WHERE[mode]}; leave it out")
+
+
+def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
+    """Return a warning for each word whose setting counts only with another value of another setting.
+
+    It is no mistake if one command line serves several values, such as those of a sweep.
+
+    Args:
+        config: config of the run.
+        words: words of the command line.
+    """
+    warnings = []
+    for word in words:
+        group, _, name = word.partition("=")[0].lstrip("+").partition(".")
+        component = getattr(config, group) if group in GROUPS else None
+        if component is None or component.as_model is None:
+            continue
+        field = type(component.as_model).model_fields.get(name)
+        for each in () if field is None else field.metadata:
+            if isinstance(each, OnlyWith) and not each.holds(component.settings):
+                warnings.append(f"{word}: has no effect; {name} counts only {each}")
+    return warnings
 
 
 def _sets(word: str, name: str) -> bool:

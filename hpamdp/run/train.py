@@ -20,6 +20,7 @@ from hpamdp.run.assemble import assemble
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, raised_by
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import CollectionError
+from hpamdp.run.compatibility import settings_without_effect
 from hpamdp.run.folder import check_no_link, check_no_training, check_unused
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.stopping import ProgramExitError, exits_explained
@@ -116,6 +117,8 @@ def begin(
             check_unused(output_dir, may_overwrite=may_overwrite or config.run.overwrite)
     torch.set_num_threads(config.run.threads)
     torch.manual_seed(config.run.seed)
+    for warning in settings_without_effect(config, overrides):
+        warn(warning)
     parts = assemble(config)
     try:
         check_saved_options(config, parts.env.base_env)

@@ -11,7 +11,7 @@ from typing_extensions import Self
 from hpamdp.env.boatdock.task import DOCKING_SPEED, RewardForm, speed
 from hpamdp.env.boatdock_unseen.fleet import Family, FleetRules
 from hpamdp.env.facts import ProblemFacts
-from hpamdp.settings import Settings
+from hpamdp.settings import OnlyWith, Settings
 
 MOST_TRIPS = 24
 BOAT_NAMES = ("boat_1", "boat_2")
@@ -29,13 +29,13 @@ class UnseenBoatsOptions(Settings):
 
     `any`: any three directions that are `separation` apart. `strength`: as `turned`, and speed and glide differ, too.
     """
-    separation: Annotated[float, Field(ge=0.0, le=110.0)] = 60.0
+    separation: Annotated[float, Field(ge=0.0, le=110.0), OnlyWith("family", "any")] = 60.0
     """With `family=any`: least angle between two directions, in degrees."""
-    spread: Annotated[float, Field(ge=0.0, le=0.5)] = 0.3
+    spread: Annotated[float, Field(ge=0.0, le=0.5), OnlyWith("family", "strength")] = 0.3
     """With `family=strength`: speed and glide are up to this share above or below those of people's boats."""
     fleet_size: Annotated[int, Field(ge=1, le=2**24)] | None = None
     """Number of different boats in training. If None, each session draws new ones."""
-    fleet_seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    fleet_seed: Annotated[int, Field(ge=0, lt=2**32), OnlyWith("fleet_size")] = 0
     """With a `fleet_size`: which boats these are."""
     scored_boats: Literal["new", "training"] = "new"
     """Boats of evaluations: `new` ones, which no training meets, or with a `fleet_size` those of `training`."""

@@ -30,7 +30,7 @@ from hpamdp.policies.base import Learner
 from hpamdp.policies.exploration.base import Exploration, Explored
 from hpamdp.policies.masks import random_discrete
 from hpamdp.policies.shared.exploration import linear_schedule
-from hpamdp.settings import Fraction, Settings
+from hpamdp.settings import Fraction, OnlyWith, Settings
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -44,7 +44,7 @@ class HeldOptions(Settings):
     """
     epsilon_final: Fraction | None = None
     """Probability after `epsilon_steps`; it falls linearly from `epsilon` to this value. If null, it stays."""
-    epsilon_steps: PositiveInt = 100_000
+    epsilon_steps: Annotated[PositiveInt, OnlyWith("epsilon_final")] = 100_000
     """With `epsilon_final`: the learner's own steps within which the probability falls."""
     mu: Annotated[float, Field(gt=1.0, le=10.0)] = 2.0
     """Exponent of the lengths: the probability of n steps is proportional to n^-mu. Less gives longer holds."""

@@ -17,7 +17,7 @@ Differs from the sources:
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -35,6 +35,7 @@ from hpamdp.policies.shared.option_values import OptionValueOptions
 from hpamdp.policies.shared.replay import first_multiple, packed_states, unpacked_states
 from hpamdp.policies.shared.selector_memory import RemembersDecisions, SelectorReplayMemoryOptions
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
+from hpamdp.settings import OnlyWith
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -45,12 +46,12 @@ class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
     """Number of critics in the ensemble."""
     exploration: Literal["epsilon", "ucb"] = "epsilon"
     """A random option with a decaying probability, or the option with the highest upper confidence bound."""
-    epsilon_decisions: NonNegativeInt = 1000
+    epsilon_decisions: Annotated[NonNegativeInt, OnlyWith("exploration", "epsilon")] = 1000
     """Finished decisions, after the warm-up, over which the probability of a random option falls.
 
     It falls linearly from 1 to `epsilon_final`. Decisions of a data set do not count.
     """
-    ucb_width: NonNegativeFloat = 2.0
+    ucb_width: Annotated[NonNegativeFloat, OnlyWith("exploration", "ucb")] = 2.0
     """Width of the upper confidence bound, in standard deviations over the critics."""
     updates_per_decision: PositiveFloat = 0.5
     """Updates for each finished decision; with `mode=offline`, `offline.updates` counts them instead."""

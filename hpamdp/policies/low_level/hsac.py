@@ -67,7 +67,7 @@ from hpamdp.policies.shared.networks import (
 )
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import LearningRate
+from hpamdp.settings import LearningRate, OnlyWith
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -88,9 +88,9 @@ class HSACOptions(HeadOptions, ReplayMemoryOptions, ActorCriticOptions, TargetRa
     """Learn the discrete temperature, so that the entropy meets `discrete_target_entropy`."""
     tune_parameter_temperature: bool = True
     """Learn the parameters' temperature, so that the entropy meets `parameter_target_entropy`."""
-    discrete_target_entropy: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
+    discrete_target_entropy: Annotated[float, Field(ge=0.0, lt=1.0), OnlyWith("tune_discrete_temperature")] = 0.1
     """Target entropy of the discrete action, as a fraction of the uniform distribution's entropy."""
-    parameter_target_entropy: Annotated[float, Field(lt=math.log(2.0))] = -2.0
+    parameter_target_entropy: Annotated[float, Field(lt=math.log(2.0)), OnlyWith("tune_parameter_temperature")] = -2.0
     """Target entropy in nats for each parameter of the executed action, where the bounds are [-1, 1].
 
     Uniform: 0.69. Standard deviation 0.1: -0.9; 0.03: -2.1; 0.01: -3.2.

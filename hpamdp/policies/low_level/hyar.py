@@ -47,7 +47,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
@@ -82,7 +82,7 @@ from hpamdp.policies.shared.networks import (
 )
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.policies.shared.scales import scale_of
-from hpamdp.settings import PositiveFraction, SettingError
+from hpamdp.settings import OnlyWith, PositiveFraction, SettingError
 from hpamdp.specs import PAMDPSpecs
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random
@@ -117,11 +117,11 @@ class HyAROptions(CodecOptions, TargetRateOptions, SearchingActorOptions):
     """Largest gradient norm of an update of the actor; if null, there is no limit."""
     noise_initial: PositiveFloat | None = None
     """Scale of the exploring noise after the warm-up; it falls to `parameter_noise`. If null, it is constant."""
-    noise_episodes: PositiveInt = 1000
+    noise_episodes: Annotated[PositiveInt, OnlyWith("noise_initial")] = 1000
     """The learner's own episodes, after its warm-up, within which this scale falls linearly."""
-    correction_factor: PositiveFloat = 5.0
+    correction_factor: Annotated[PositiveFloat, OnlyWith("parameter_tolerance", None)] = 5.0
     """Encode a stored z again if the error of its predicted change is this many times the codec's error."""
-    correction_error: Literal["mean", "latest"] = "mean"
+    correction_error: Annotated[Literal["mean", "latest"], OnlyWith("parameter_tolerance", None)] = "mean"
     """The codec's error: its mean over the last hundred or so updates of the codec, or the `latest`, as published.
 
     The latest is that of the 4,096 stored transitions from which the range of z was estimated last.

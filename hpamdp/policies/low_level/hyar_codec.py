@@ -5,7 +5,7 @@ Source: Li et al. 2022, arXiv 2109.05490, section 4.1; see `hyar.py`, also for t
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.networks import OutputLinear, as_preactivations, mlp
-from hpamdp.settings import LearningRate, PositiveFraction, Settings
+from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -62,11 +62,11 @@ class CodecOptions(Settings):
     """Transitions in an update of the codec, from all that are stored; if null, it shares those of the critics."""
     codec_pretrain_updates: PositiveInt = 2000
     """Updates of the codec alone at the end of the warm-up."""
-    codec_every: PositiveInt = 10
+    codec_every: Annotated[PositiveInt, OnlyWith("codec_episodes", None)] = 10
     """Critic updates for each update of the codec after that."""
     codec_episodes: PositiveInt | None = None
     """Instead, the learner's own episodes, after its warm-up, for each update of the codec."""
-    codec_first_episode: NonNegativeInt = 0
+    codec_first_episode: Annotated[NonNegativeInt, OnlyWith("codec_episodes")] = 0
     """The learner's own episodes, after its warm-up, before `codec_episodes` begins to count."""
     latent_coverage: PositiveFraction = 0.96
     """Central fraction of the encoded z that the actor can reach: the latent-space constraint of the paper."""

@@ -22,7 +22,7 @@ inverting gradients, for which the gradient must be changed between critic and a
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
@@ -47,7 +47,7 @@ from hpamdp.policies.shared.networks import (
     with_clipped_noise,
 )
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import LearningRate
+from hpamdp.settings import LearningRate, OnlyWith
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the scores of the discrete actions, which the critic sees.
@@ -59,11 +59,11 @@ class PADDPGOptions(ActorCriticOptions, TargetRateOptions, TwinCriticOptions, Ep
 
     twin: bool = False
     """Train as in TD3, which makes it PATD3: the lower of two critics counts, with smoothing and a delayed actor."""
-    target_smoothing: NonNegativeFloat = 0.1
+    target_smoothing: Annotated[NonNegativeFloat, OnlyWith("twin")] = 0.1
     """With `twin`: standard deviation of the noise on scores and parameters in the target; 0: none."""
-    target_smoothing_clip: NonNegativeFloat = 0.2
+    target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("twin")] = 0.2
     """With `twin`: largest size of this noise."""
-    policy_delay: PositiveInt = 2
+    policy_delay: Annotated[PositiveInt, OnlyWith("twin")] = 2
     """With `twin`: critic updates for each update of the actor and the target networks."""
     initial_parameters: InitialParameters = "domain"
     """`domain` adds the problem's own initial parameters, if it has any, by a frozen layer; `none` adds nothing."""

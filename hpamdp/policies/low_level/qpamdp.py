@@ -46,7 +46,7 @@ from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters
 from hpamdp.policies.shared.sized_by_data import SizedByData
-from hpamdp.settings import Fraction, FromList, PositiveFraction, SettingError, Settings
+from hpamdp.settings import Fraction, FromList, OnlyWith, PositiveFraction, SettingError, Settings
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].
@@ -115,7 +115,7 @@ class QPAMDPOptions(Settings):
     """Sample discrete actions also while the parameters are learned; if false, as published, take the best ones."""
     parameter_updates: PositiveInt | None = 10
     """Parameter updates in a phase: the k of Q-PAMDP(k). If null, that is Q-PAMDP(infinity), see `patience`."""
-    patience: PositiveInt = 5
+    patience: Annotated[PositiveInt, OnlyWith("parameter_updates", None)] = 5
     """Windows without a record of the mean return after which a phase ends, if `parameter_updates` is null.
 
     A window is a parameter update, or `relearning_episodes` of Sarsa(lambda).

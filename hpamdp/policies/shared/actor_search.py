@@ -10,6 +10,7 @@ et al. 2017, arXiv 1707.01495, appendix A (penalty on preactivations).
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
@@ -18,7 +19,7 @@ from torch.quasirandom import SobolEngine
 
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, AnnealedRateOptions, TwinCriticOptions
 from hpamdp.policies.shared.exploration import EpsilonOptions
-from hpamdp.settings import SettingError
+from hpamdp.settings import OnlyWith, SettingError
 
 
 class SearchingActorOptions(EpsilonOptions, AnnealedRateOptions, TwinCriticOptions, ActorCriticOptions):
@@ -35,11 +36,11 @@ class SearchingActorOptions(EpsilonOptions, AnnealedRateOptions, TwinCriticOptio
     """
     search_samples: NonNegativeInt = 0
     """Random actions for each discrete action that an update of the actor values with the critics; 0 is no search."""
-    search_weight: NonNegativeFloat = 0.1
+    search_weight: Annotated[NonNegativeFloat, OnlyWith("search_samples")] = 0.1
     """Weight of the distance to the best of these actions in the actor's loss, times its gain in value."""
     greedy_samples: NonNegativeInt = 0
     """Variations of the actor's actions from which the greedy policy takes the one with the highest value."""
-    greedy_noise: NonNegativeFloat = 0.3
+    greedy_noise: Annotated[NonNegativeFloat, OnlyWith("greedy_samples")] = 0.3
     """Standard deviation of these variations, in units where the bounds are [-1, 1]."""
 
 

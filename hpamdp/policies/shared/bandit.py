@@ -20,7 +20,7 @@ from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.stored_rows import check_choices
-from hpamdp.settings import Settings
+from hpamdp.settings import OnlyWith, Settings
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -29,9 +29,9 @@ class BanditOptions(Settings):
 
     memory: Literal["all", "discounted", "sliding_window"] = "discounted"
     """Which rewards count: `all` equally, recent ones more (`discounted`), or the last ones only (`sliding_window`)."""
-    discount: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.999
+    discount: Annotated[float, Field(gt=0.0, lt=1.0), OnlyWith("memory", "discounted")] = 0.999
     """Weight of a reward for each decision of its age; used with `discounted` only."""
-    window: PositiveInt = 2000
+    window: Annotated[PositiveInt, OnlyWith("memory", "sliding_window")] = 2000
     """Number of decisions that count; used with `sliding_window` only."""
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 from tensordict import TensorDictBase
@@ -20,7 +21,7 @@ from torch import Tensor, nn
 from hpamdp.policies.shared.gradients import expectile_loss
 from hpamdp.policies.shared.networks import mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import Expectile, LearningRate, PositiveFraction, Settings
+from hpamdp.settings import Expectile, LearningRate, OnlyWith, PositiveFraction, Settings
 
 
 class EndValueOptions(Settings):
@@ -32,11 +33,11 @@ class EndValueOptions(Settings):
     Set it if options end inside episodes, and for `high=value`: a plan of one option does not see the rewards of the
     next one. Set it also if all rewards are the same and the terminations are further away than the horizon.
     """
-    end_value_lr: LearningRate = 1e-3
+    end_value_lr: Annotated[LearningRate, OnlyWith("end_values")] = 1e-3
     """Learning rate of these values."""
-    end_value_tau: PositiveFraction = 0.02
+    end_value_tau: Annotated[PositiveFraction, OnlyWith("end_values")] = 0.02
     """Fraction of the way to the learned values that their target network moves at each update."""
-    end_value_expectile: Expectile = 0.9
+    end_value_expectile: Annotated[Expectile, OnlyWith("end_values")] = 0.9
     """Expectile of the returns that stored actions led to, from 0.5, their mean, towards 1, the best of them."""
 
 

@@ -22,7 +22,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from hpamdp.settings import Settings
+from hpamdp.settings import OnlyWith, Settings
 
 MemoryKind = Literal["none", "stack", "gru"]
 
@@ -32,7 +32,7 @@ class StackOptions(Settings):
 
     memory: MemoryKind = "none"
     """What the networks see beside the observation. `none`: nothing; `stack`: the observations before it."""
-    stack_steps: Annotated[int, Field(ge=2, le=1000)] = 4
+    stack_steps: Annotated[int, Field(ge=2, le=1000), OnlyWith("memory", "stack")] = 4
     """With `memory=stack`: number of observations that the networks see, the current one included.
 
     Zeros stand for observations before the first one.
@@ -54,16 +54,16 @@ class MemoryOptions(StackOptions):
 
     `gru`: the state of a GRU that has seen all observations since the memory was reset.
     """
-    memory_size: PositiveInt = 64
+    memory_size: Annotated[PositiveInt, OnlyWith("memory", "gru")] = 64
     """With `memory=gru`: units of the GRU."""
-    sequence_length: PositiveInt = 16
+    sequence_length: Annotated[PositiveInt, OnlyWith("memory", "gru")] = 16
     """With `memory=gru`: steps through which gradients flow back in time."""
 
 
 class ReplayMemoryOptions(MemoryOptions):
     """Settings of a memory that learns from a replay buffer."""
 
-    burn_in: NonNegativeInt = 8
+    burn_in: Annotated[NonNegativeInt, OnlyWith("memory", "gru")] = 8
     """With `memory=gru`: steps before each sequence that the current GRU replays without gradients.
 
     They give the state in which the sequence starts.
