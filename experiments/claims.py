@@ -53,7 +53,7 @@ SIMULATED = 20_000  # studies in which intervals are counted that contain the tr
 PARTS = {
     README: re.compile(r"^## Results$.*?(?=^## )", re.MULTILINE | re.DOTALL),
     RESULTS: re.compile(r".+", re.DOTALL),
-    "experiments/*/README.md": re.compile(r"^\*\*Answer\.\*\*.*?(?=\n\n)", re.MULTILINE | re.DOTALL),
+    "experiments/*/README.md": re.compile(r"^\*\*Answer\.\*\*.*?(?=\n\n(?!- ))", re.MULTILINE | re.DOTALL),
 }
 
 
