@@ -20,7 +20,7 @@ from hpamdp.api.export import HELD_LENGTH, HELD_OPTION, GreedyStep
 from hpamdp.run.assemble import option_length
 from hpamdp.run.players import load_agent
 
-PLATFORM, DATA = ["env=platform", "high=none"], ["mode=offline", "data=human"]
+PLATFORM = ["env=platform", "high=none"]
 LEARNERS = {
     "hppo": [*PLATFORM, "low=hppo"],
     "pdqn": [*PLATFORM, "low=pdqn"],
@@ -33,9 +33,9 @@ LEARNERS = {
     "hyar_that_searches": [*PLATFORM, "low=hyar", "low.greedy_samples=8"],
     "hyar_nearest": ["env=hard_move", "high=none", "low=hyar", "low.discrete=nearest"],
     "qpamdp": [*PLATFORM, "low=qpamdp"],
-    "td3_bc": [*DATA, "high=meta_critic", "low=td3_bc"],
-    "bc": [*DATA, "high=linucb", "low=bc"],
-    "iql": [*DATA, "high=ucb", "low=iql"],
+    "td3_bc": ["high=meta_critic", "low=td3_bc"],
+    "bc": ["high=linucb", "low=bc"],
+    "iql": ["high=ucb", "low=iql"],
 }
 SELECTORS = {
     "ucb": ["high=ucb", "low=hppo"],

@@ -396,7 +396,7 @@ def test_the_page_of_lengths_has_the_table_of_its_stored_runs(capsys):
 
 def test_a_run_of_another_sharing_replaces_no_stored_run_with_unknown_boats(tmp_path):
     study_of = study("generalisation")
-    row = dict.fromkeys(study_of.SETTINGS, "") | {"frames": 200, "seed": 1, "sharing": "shared"}
+    row = dict.fromkeys(study_of.RUN, "") | {"frames": 200, "seed": 1, "sharing": "shared"}
     other = row | {"sharing": "per_option"}
     write_tables(tmp_path, {"results": [row]})
     for new, num in ((row, 1), (other, 2)):
