@@ -222,7 +222,7 @@ def transfer_table(rows: Rows) -> str:
 
 
 def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
-    """Draw the score by number of the trip with one boat, and people's over their first episodes beside it."""
+    """Draw scores with one boat by number of the trip and by number of training boats, and people's by episode."""
     figure = Figure(figsize=(14.0, 4.2), layout="constrained")
     sessions, fleets, episodes = figure.subplots(1, 3, sharey=True, width_ratios=[3, 2, 2])
     trips = range(1, NUM_TRIPS + 1)

@@ -26,6 +26,7 @@ from hpamdp.api.arguments import (
 )
 from hpamdp.complaints import as_code, no_such
 from hpamdp.config.components import TARGET
+from hpamdp.config.compose import setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching
 from hpamdp.config.schema import RESUME_AUTO, Config
@@ -135,7 +136,7 @@ def _check_no_files(config: Config, words: Sequence[str]) -> None:
     if config.logger.name != "csv":
         raise ConfigError(f"{config.logger}: writes files, so give the run a folder")
     for each in words:
-        name = each.partition("=")[0]
+        name = setting_of(each)
         if name in _OF_FILES and getattr(config.run, name):
             raise ConfigError(f"{each}: writes files, so give the run a folder")
 

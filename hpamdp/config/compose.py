@@ -314,6 +314,11 @@ def is_name(name: object) -> TypeGuard[str]:
     return re.fullmatch(r"\w[\w.+-]*(/\w[\w.+-]*)*", name) is not None
 
 
+def setting_of(word: str) -> str:
+    """Return the name of the setting, or the group, that a word of a command line gives, adds or deletes."""
+    return word.partition("=")[0].lstrip("+~")
+
+
 def choosing(group: str, name: str) -> str:
     """Return the word that chooses a yaml file for a group. The quotes make names of `null` and `3`."""
     return f"{group}='{name}'"

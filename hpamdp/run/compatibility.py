@@ -13,8 +13,15 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from hpamdp.complaints import as_json
-from hpamdp.config.components import GROUPS, Component, constructor_arguments, is_passed
-from hpamdp.config.compose import RECIPE
+from hpamdp.config.components import (
+    GROUPS,
+    Component,
+    constructor_arguments,
+    is_passed,
+    settings_model,
+    takes_settings_model,
+)
+from hpamdp.config.compose import RECIPE, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.facts import ProblemFacts
@@ -32,20 +39,14 @@ GROUPS_OF_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment
 
 # Words of a command line that change nothing, by the mode of the run: settings, groups, and mappings of settings.
 # There is no run for a `player`, who is watched or played with, and for an `agent` that Python code loads.
-_OF_COLLECTION = (
-    *("total_frames", "num_envs", "steps_per_batch", "collector", "eval.every"),
-    "agent.uniform_option_steps",
-)
+_OF_STEPS = ("total_frames", "num_envs", "steps_per_batch", "collector", "eval.every", "agent.uniform_option_steps")
 _OF_LEARNING = ("offline", "data", "log_every", "callbacks", "save_best", "compile_updates", "update_precision")
 _OF_AGENTS_LEARNING = ("agent.values_end", "agent.selector_values_end", "low.freeze", "exploration")
 _OF_CHECKPOINTS = ("checkpoint_every", "checkpoint_minutes", "checkpoint_replay")
 _WITHOUT_EFFECT = {
     "train": ("offline",),
-    "offline": _OF_COLLECTION,
-    "eval": (
-        *(*_OF_COLLECTION, *_OF_LEARNING, *_OF_AGENTS_LEARNING, *_OF_CHECKPOINTS),
-        "eval.stop_score",
-    ),
+    "offline": _OF_STEPS,
+    "eval": (*_OF_STEPS, *_OF_LEARNING, *_OF_AGENTS_LEARNING, *_OF_CHECKPOINTS, "eval.stop_score"),
     "player": ("mode", "overwrite", "logger"),
     "agent": ("eval.layouts",),  # its method `evaluate` is told the number of episodes
 }
@@ -117,11 +118,11 @@ def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
     """
     warnings = []
     for word in words:
-        group, _, name = word.partition("=")[0].lstrip("+").partition(".")
-        component = getattr(config, group) if group in GROUPS else None
-        if component is None or component.as_model is None:
+        group, _, name = setting_of(word).partition(".")
+        component: Component | None = getattr(config, group) if group in GROUPS else None
+        if component is None or component.cls is None or not takes_settings_model(component.cls):
             continue
-        field = type(component.as_model).model_fields.get(name)
+        field = settings_model(component.cls).model_fields.get(name)
         for each in () if field is None else field.metadata:
             if isinstance(each, OnlyWith) and not each.holds(component.settings):
                 warnings.append(f"{word}: has no effect; {name} counts only {each}")
@@ -130,11 +131,11 @@ def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
 
 def _sets(word: str, name: str) -> bool:
     """Return whether a word of a command line sets something, as in `eval.every=5` and `eval={every:5}`."""
-    given, _, value = word.partition("=")
-    given = given.lstrip("+~")
+    given = setting_of(word)
     if given == name or given.startswith(f"{name}."):
         return True
-    return name.startswith(f"{given}.") and re.search(rf"[{{,]\s*{name[len(given) + 1 :]}\s*:", value) is not None
+    entry = name.removeprefix(f"{given}.")
+    return entry != name and re.search(rf"[{{,]\s*{entry}\s*:", word) is not None
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from hpamdp.config.compose import read
+from hpamdp.config.compose import read, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching, word
 from hpamdp.config.schema import Config
@@ -131,7 +131,7 @@ def load_agent(path: str | None, settings: Sequence[str], objects: Mapping[str, 
         ConfigError: the agent does not exist, or a setting is wrong or has no effect.
     """
     for each in settings:
-        if each.partition("=")[0].lstrip("+~") in _SAVED:
+        if setting_of(each) in _SAVED:
             raise ConfigError(f"{each}: give the folder or the name of a saved agent alone, without a setting")
     check_effects("player", settings)
     words = list(settings)

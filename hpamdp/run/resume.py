@@ -15,7 +15,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hpamdp.complaints import as_json
 from hpamdp.config.components import GROUPS
-from hpamdp.config.compose import choosing, chosen_names, conf_dir, names_of, plain, read, read_run
+from hpamdp.config.compose import choosing, chosen_names, conf_dir, names_of, plain, read, read_run, setting_of
 from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.outside_jobs import searched, searching
 from hpamdp.config.saved import choices_of, read_saved, upgraded
@@ -68,7 +68,7 @@ def resolve(
         values |= {name: _plain_value(cfg, name) for name in (*_NOT_EVALUATED, *_OF_TRAINING)}
     changes = _changes(overrides, saved, file, where)
     compatibility.check_effects(run.mode, changes)
-    changed = map(_name, changes)
+    changed = map(setting_of, changes)
     values |= {name: _plain_value(cfg, name) for name in changed if not name.startswith("hydra")}
     names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
     try:
@@ -116,7 +116,7 @@ def saved_words(source: str, where: str, words: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: the checkpoint does not exist, a word would change the saved agent, or a choice has no yaml file.
     """
-    given = {_name(each): each.partition("=")[2] for each in words}
+    given = {setting_of(each): each.partition("=")[2] for each in words}
     file = checkpoint.find(source, where)
     folders = []
     if given.get("trust", "").lower() == "true" and "hydra.searchpath" not in given:
@@ -190,15 +190,13 @@ def _option_names(progress: Mapping[str, Any], where: str, source: str) -> tuple
 def _changes(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:
     """Return the words that change the saved run; a repeated choice of a group changes nothing."""
     choices = choices_of(saved)
-    changes = [word for word in overrides if _name(word) not in GROUPS or _choice(word) != choices[_name(word)]]
+    changes = [
+        word for word in overrides if setting_of(word) not in GROUPS or _choice(word) != choices[setting_of(word)]
+    ]
     for word in changes:
-        if re.split(r"[./]", _name(word))[0] in compatibility.GROUPS_OF_AGENT:
+        if re.split(r"[./]", setting_of(word))[0] in compatibility.GROUPS_OF_AGENT:
             raise ConfigError(f"{word}: {where} takes the agent from {file}; leave this out")
     return changes
-
-
-def _name(override: str) -> str:
-    return override.partition("=")[0].lstrip("+~")
 
 
 def _choice(override: str) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from torch import Tensor
 
 from hpamdp.analysis import film
+from hpamdp.config.compose import setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.messages import reason_of, say
 from hpamdp.run.players import add_config_dir, load_player, split_words, whole_number, with_config_dirs
@@ -50,7 +51,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
         raise ConfigError(f"--fps {options.fps}: a GIF shows at most {film.GIF_FPS} pictures a second; write an .mp4")
     path, settings = split_words(options.player)
     for each in settings:
-        flag = _FLAGS.get(each.partition("=")[0].lstrip("+~"))
+        flag = _FLAGS.get(setting_of(each))
         if flag is not None:
             raise ConfigError(f"{each}: the command has a flag for it; use {flag}")
     if path is None and not settings:
