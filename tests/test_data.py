@@ -211,10 +211,9 @@ def timed(row=slice(None), value=2.5):
             WITH_OPTIONS,
             "row 3: action.discrete is 1, but must be an action of the row's option",
         ),
-        (timed(0, 0.0), SPECS, "row 0: next.duration is 0, but must be finite and greater than 0"),
-        (timed(3, -2.0), SPECS, "row 3: next.duration is -2, but must be finite and greater than 0"),
-        (timed(4, np.nan), SPECS, "row 4: next.duration is nan, but must be finite and greater than 0"),
-        (timed(1, np.inf), SPECS, "row 1: next.duration is inf, but must be finite and greater than 0"),
+        (timed(3, -2.0), SPECS, "row 3: next.duration is -2, but must be finite and at least 0"),
+        (timed(4, np.nan), SPECS, "row 4: next.duration is nan, but must be finite and at least 0"),
+        (timed(1, np.inf), SPECS, "row 1: next.duration is inf, but must be finite and at least 0"),
         (
             episodes(2).set(("next", "duration"), torch.ones(2)),
             SPECS,
@@ -228,6 +227,10 @@ def test_a_wrong_value_in_a_data_set_is_refused_with_its_row(rows, specs, said):
     with pytest.raises(DataError) as refused:
         Demonstrations(rows).check(specs)
     assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_step_may_take_no_time_as_where_two_signals_of_a_corridor_are_due_at_once():
+    Demonstrations(timed(1, 0.0)).check(SPECS)
 
 
 class OwnRows(Demonstrations):

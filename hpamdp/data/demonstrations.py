@@ -33,7 +33,7 @@ class Demonstrations:
             that a row does not take may be 0. `action_mask` and `option_mask` are optional, at the root and under
             `next`; without them learners take all actions and options as allowed.
             `pair_mask`, `parameter_low` and `parameter_high` are required if the environment gives them.
-            `("next", "duration")`, finite and greater than 0, goes with environments whose steps take different times.
+            `("next", "duration")`, finite and at least 0, goes with environments whose steps take different times.
             Without it learners discount all these steps alike.
         device: where the tensors are kept.
         decisions: `[K]`, for selectors, if more is known of the options' returns than the transitions show. At the root

@@ -228,7 +228,7 @@ def _transition_rules(rows: TensorDict) -> Iterator[_Rule]:
     yield from _finite(rows, keys.OBSERVATION, keys.PARAMETERS, ("next", keys.OBSERVATION), ("next", keys.REWARD))
     if DURATION in rows.keys(True, True):
         duration = rows[DURATION]
-        yield _Rule(DURATION, duration.isfinite() & (duration > 0.0), "finite and greater than 0")
+        yield _Rule(DURATION, duration.isfinite() & (duration >= 0.0), "finite and at least 0")
     episode = rows[TRAJECTORY]
     changes = episode[1:] != episode[:-1]
     edge = changes.new_ones(1)
