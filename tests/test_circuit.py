@@ -266,6 +266,32 @@ def test_training_may_begin_within_the_known_circuit_and_evaluation_begins_witho
     assert torch.allclose(env.reset()[keys.OBSERVATION][:, : table.shape[1]], table[0])
 
 
+@pytest.mark.parametrize("task", oracle.CIRCUITS)
+def test_the_planner_finishes_the_known_circuit_wherever_training_begins_in_it(task):
+    env = CircuitEnv(50, task=task, begin="known", oracle=True)
+    first = torch.tensor([0, *env.parameter_dims]).cumsum(0)
+    td = env.reset()
+    steps = []
+    while not td[keys.DONE].all():
+        plan = td["oracle"]
+        gate = plan["discrete"].squeeze(-1)
+        parameters = torch.zeros(50, int(first[-1]))
+        has_angle = first[gate + 1] > first[gate]
+        parameters[has_angle, first[gate][has_angle]] = plan["parameters"][has_angle, 0]
+        td = env.step(td.update({"action": {"discrete": gate, "parameters": parameters}}))["next"]
+        steps.append(td[keys.DONE].sum())
+    assert (td[keys.OUTCOME] == MATCHED).all() and env.state.similarity.min() > 0.999
+    assert steps[1] > 0 and len(steps) == len(oracle.CIRCUITS[task]) + 1  # some had but one gate to go
+
+
+def test_the_closing_table_has_the_score_of_no_gates_for_the_target_at_hand():
+    for settings in ({"task": "random_state", "target_number": 0}, {"task": "ghz"}):
+        env = CircuitEnv(1, **settings)
+        env.reset()
+        assert env.references({})["no gates"]["score"] == pytest.approx(float(env.state.similarity), abs=1e-6)
+    assert CircuitEnv(1, task="random_state").references({})["no gates"]["score"] == 0.25
+
+
 def test_random_targets_are_normalised_uniform_and_new_in_every_episode():
     env = CircuitEnv(4000, task="random_state")
     env.reset()

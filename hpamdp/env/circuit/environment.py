@@ -45,15 +45,8 @@ _PUBLISHED = {
     "random_unitary": 0.27,
     "toffoli": 0.295,
 }
-# Mean scores of a circuit without gates.
-_NOTHING = {
-    "hadamard": 0.2952,
-    "random_state": 0.25,
-    "bell": 0.5,
-    "ghz": 0.5,
-    "random_unitary": 0.2187,
-    "toffoli": 0.2952,
-}
+# Mean scores of a circuit without gates over random targets.
+_NOTHING = {"random_state": 0.25, "random_unitary": 0.2187}
 
 
 Costs = Annotated[tuple[float, float], FromList]
@@ -298,8 +291,12 @@ class CircuitEnv(BatchedEnv[CircuitState]):
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return the scores of a circuit without gates, of the best published learner, and the best possible one."""
-        task = self.options.task
-        known = {"no gates": {"score": _NOTHING[task]}}
+        task, target = self.options.task, self.design.target
+        if target is None:
+            nothing = _NOTHING[task]
+        else:
+            nothing = float(rules.similarity(rules.without_gates(self.design, target.device), target, self.design))
+        known = {"no gates": {"score": nothing}}
         if not self.design.is_native:
             known["published"] = {"score": _PUBLISHED[task]}
         ceiling = super().references(measured)

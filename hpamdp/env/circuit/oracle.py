@@ -98,6 +98,7 @@ class CircuitOracle:
             names = [gate.name for gate in design.gate_sets[0]]
             for place, (name, angle) in enumerate(CIRCUITS[task]):
                 self.gates[..., place], self.angles[..., place] = names.index(name), angle
+        self._known_gates, self._known_angles = self.gates[0, 0].clone(), self.angles[0, 0].clone()
 
     def spec(self) -> Composite:
         """Return the spec of the entries that `read` returns."""
@@ -113,7 +114,11 @@ class CircuitOracle:
 
     def plan(self, state: CircuitState, rows: Tensor) -> None:
         """Find the circuits for the environments of `rows`, bool `[N]`, which begin."""
-        if not self.design.is_native or not rows.any():
+        if not rows.any():
+            return
+        if self.design.beginnings is not None:
+            self._leave_out_begun(state, rows, self.design.beginnings[0])
+        if not self.design.is_native:
             return
         plans = _compiled(type(state)(*(column[rows] for column in state)), self.design)
         device = self.gates.device
@@ -122,6 +127,16 @@ class CircuitOracle:
             used = each.gates.shape[-1]
             self.gates[rows, number, :used] = torch.from_numpy(each.gates).to(device)
             self.angles[rows, number, :used] = torch.from_numpy(each.angles).float().to(device)
+
+    def _leave_out_begun(self, state: CircuitState, rows: Tensor, beginnings: Tensor) -> None:
+        """Keep of the known circuit what follows the gates with which episodes begin, complex64 `[L, R, C]`."""
+        begun, _ = rules.circuit_and_target(state, self.design)
+        distance = (begun[rows].unsqueeze(1) - beginnings.to(begun.device)).abs().sum((-2, -1))
+        num = self._known_gates.shape[-1]
+        place = torch.arange(num, device=begun.device) + distance.argmin(-1, keepdim=True)
+        place = place.clamp(max=num - 1)  # the stop
+        self.gates[rows] = self._known_gates[place].unsqueeze(1)
+        self.angles[rows] = self._known_angles[place].unsqueeze(1)
 
     def read(self, state: CircuitState) -> TensorDict:
         """Return the next gate of each circuit, `discrete` and `parameters` `[N, S]`, and the best `option` `[N]`."""
