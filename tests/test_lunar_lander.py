@@ -69,6 +69,26 @@ def test_every_chosen_engine_fires_even_at_its_lowest_throttle():
         assert power is None or power == pytest.approx(action["main"][1][1][0], abs=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("main", "side", "throttle", "line"),
+    [
+        (0, -1, 0.5, "discrete=-1, but allowed are 0 to 2"),
+        (2, 0, 0.5, "discrete=2, but allowed are 0 to 1"),
+        (1, 0, np.nan, "the parameters of action 1 are .nan., but must be finite"),
+    ],
+)
+def test_an_action_that_does_not_exist_is_refused_in_one_line(main, side, throttle, line):
+    none, box = np.zeros(0, np.float32), np.array([throttle], np.float32)
+    with pytest.raises(ValueError, match=f"^step: {line}$"):
+        continuous_action({"main": (main, (none, box)), "side": (side, (none, box, box))})
+
+
+def test_the_hand_written_player_is_shown_with_the_rules_for_which_it_was_measured_alone():
+    assert {*LunarLanderEnv(1).references({})} == {"solved", "heuristic"}
+    for settings in ({"gravity": -5.0}, {"enable_wind": True}, {"max_steps": 100}):
+        assert {*LunarLanderEnv(1, **settings).references({})} == {"solved"}
+
+
 def test_copies_have_episodes_of_their_own_and_the_settings_reach_them():
     env = LunarLanderEnv(3, gravity=-5.0, enable_wind=True)
     assert {copy.unwrapped.gravity for copy in env.envs} == {-5.0} and env.envs[0].unwrapped.enable_wind

@@ -199,6 +199,16 @@ def test_a_player_says_where_no_way_leads(tmp_path):
         PinballEnv(1, map=written(tmp_path, TABLE | {"polygons": wall}), oracle=True)
 
 
+def test_a_map_without_room_for_the_ball_beside_its_start_is_refused_with_starts_anywhere(tmp_path):
+    # The ball fits between four walls with a thousandth to spare, and the grid has no place there.
+    walls = [[0.0, 0.256, 0.0, 1.0], [0.744, 1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 0.256], [0.0, 1.0, 0.744, 1.0]]
+    polygons = [[[left, low], [left, high], [right, high], [right, low]] for left, right, low, high in walls]
+    narrow = {"ball": 0.243, "start": [0.5, 0.5], "target": [0.9, 0.9, 0.04], "polygons": polygons}
+    assert (PinballEnv(2, map=written(tmp_path, narrow)).reset()[keys.OBSERVATION] == 0.0).all()
+    with pytest.raises(SettingError, match=r"^map='.*': the ball lies free at no place of a grid of .*; use start=map"):
+        PinballEnv(2, map=written(tmp_path, narrow), start="anywhere")
+
+
 def test_a_run_names_the_setting_and_the_file(tmp_path):
     words = ["env=pinball", "high=none", "low=random", "env.map=nowhere.json", *SMALL]
     with pytest.raises(ConfigError, match=r"^env: map='nowhere.json': there is no such file; use simple, hard"):

@@ -115,6 +115,18 @@ def test_a_wrong_task_is_refused_with_those_that_exist():
         PrimitivesEnv(1, task="pick_place")
 
 
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [
+        ({"decisions": 0}, "decisions=0, but must be a whole number of at least 1"),
+        ({"reach": float("nan")}, "reach=nan, but must be above 0 and at most 1"),
+    ],
+)
+def test_a_wrong_number_is_refused_in_one_line(settings, line):
+    with pytest.raises(SettingError, match=f"^Manipulation: {line}$"):
+        Manipulation(**settings)
+
+
 def test_the_options_suggested_hold_every_action_once():
     for actions in ("primitives", "all"):
         facts = PrimitivesEnv.facts(PrimitivesEnv.Options(actions=actions))

@@ -377,6 +377,13 @@ def test_the_length_of_another_mode_is_refused(mode, word):
         ("low=random high=ucb high.window=9", "with memory=sliding_window"),
         ("low=random exploration=held exploration.epsilon_steps=9", "if epsilon_final is set"),
         ("env=boatdock_unseen high=none low=random env.fleet_seed=3", "if fleet_size is set"),
+        ("env=lunar_lander high=none low=random env.wind_power=3", "if enable_wind is set"),
+        ("env=circuit high=none low=random env.ion_costs=[0.1,0.2]", "with gate_set=choose or ion"),
+        ("env=primitives high=none low=random env.actions=small_steps env.reach=0.5", "with actions=primitives or all"),
+        (
+            "low=pets exploration=novelty exploration.in_plans=disagreement exploration.lr=0.1",
+            "with in_plans=auto or distillation",
+        ),
         ("low=hppo low.memory=gru low.memory_size=8", None),
         ("low=hppo", None),
         ("env=boatdock_unseen high=none low=hppo low.memory_size=8", None),  # whose recipe has low.memory=gru

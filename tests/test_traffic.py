@@ -24,10 +24,11 @@ from hpamdp.env.registration import register
 from hpamdp.env.traffic import network
 from hpamdp.env.traffic.environment import TrafficEnv
 from hpamdp.env.traffic.lights import TrafficLights
-from hpamdp.env.traffic.network import ARMS, GREENS, PHASES, network_file, run_tool
+from hpamdp.env.traffic.network import ARMS, GREENS, MAX_GREEN, MIN_GREEN, PHASES, network_file, run_tool
 from hpamdp.env.traffic.players import PLAYERS
 from hpamdp.env.traffic.process import SimulationProcess
 from hpamdp.env.traffic.simulation import Simulation, Task
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 if importlib.util.find_spec("libsumo") is None:
@@ -86,6 +87,33 @@ def lights_over_time(simulation, decisions):
     return states, ends
 
 
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [
+        ({"network": "square"}, "network=square, but must be one of crossing, corridor"),
+        ({"demand": "heavy"}, "demand=heavy, but must be one of light, rush, shifting"),
+        ({"reward": "queues"}, "reward=queues, but must be one of queue, waiting"),
+        ({"minutes": 0}, "minutes=0, but must be a whole number of at least 1"),
+        ({"minutes": 0.5}, "minutes=0.5, but must be a whole number of at least 1"),
+        ({"traffic": float("nan")}, "traffic=nan, but must be above 0 and at most 3"),
+    ],
+)
+def test_a_wrong_argument_of_the_gymnasium_environment_is_refused_in_one_line(settings, line):
+    with pytest.raises(SettingError, match=f"^TrafficLights: {line}$"):
+        TrafficLights(**settings)
+
+
+def test_greens_are_clipped_and_unknown_actions_refused(make):
+    env = make(TrafficLights)
+    env.reset(seed=1)
+    for green, seconds in ((-3.0, MIN_GREEN), (1e6, MAX_GREEN)):
+        env.step(action(0, green))
+        assert env.last_seconds() == seconds
+    for wrong, line in ((action(0, np.nan), "action 0 are .nan., but must be finite"), (action(-1), "discrete=-1")):
+        with pytest.raises(ValueError, match=line):
+            env.step(wrong)
+
+
 def test_three_seconds_of_yellow_stand_between_different_phases_and_none_between_equal_ones(tmp_path):
     run = simulation(tmp_path)
     run.begin(0)
@@ -121,7 +149,8 @@ def test_an_agent_that_always_takes_a_strategy_has_the_results_of_that_player(ma
             env.reset(seed=9)
             is_over = False
             while not is_over:
-                *_, is_over, info = env.step(action(len(PHASES) + number))
+                _, parameters = env.action_space.sample()
+                *_, is_over, info = env.step((len(PHASES) + number, parameters))
             assert info == env.play(player)
 
 

@@ -29,7 +29,7 @@ from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry
-from hpamdp.settings import FromList, SettingError, Settings
+from hpamdp.settings import FromList, OnlyWith, SettingError, Settings
 
 _NATIVE_TASKS = ("bell", "random_state")  # whose best circuits the compiler finds
 _SIMILARITY, _COST = "similarity", "cost"
@@ -63,9 +63,9 @@ class CircuitOptions(Settings):
 
     `choose` lets the agent choose one of the two native sets for each episode. Native sets are for states of two wires.
     """
-    superconducting_costs: Costs = (0.005, 0.3)
+    superconducting_costs: Annotated[Costs, OnlyWith("gate_set", "choose", "superconducting")] = (0.005, 0.3)
     """Costs of an SX and of a CX, which are subtracted from the score. RZ is free."""
-    ion_costs: Costs = (0.03, 0.05)
+    ion_costs: Annotated[Costs, OnlyWith("gate_set", "choose", "ion")] = (0.03, 0.05)
     """Costs of an RX or RY and of an XX."""
     reward: RewardName = "final"
     """`final`: the score, once, at the end. `progress`: its change with each gate, which adds up to the same less a

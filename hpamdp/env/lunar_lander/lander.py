@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from hpamdp.env.actions import check_single_action
 from hpamdp.settings import SettingError
 
 SOLVED = 200.0
@@ -67,13 +68,18 @@ class HybridLunarLander(gymnasium.Wrapper):
 
 
 def continuous_action(action: dict[str, Any]) -> np.ndarray:
-    """Return the action of LunarLanderContinuous-v3 that fires the same engines equally strongly, float32 `[2]`."""
-    (main, of_main), (side, of_side) = action["main"], action["side"]
+    """Return the action of LunarLanderContinuous-v3 that fires the same engines equally strongly, float32 `[2]`.
+
+    Raises:
+        ValueError: there is no such action, or its throttle is not finite.
+    """
+    of_main, of_side = action["main"][1], action["side"][1]
+    main, side = (check_single_action(*action[name]) for name in ("main", "side"))
     lift, push = np.float32(-1.0), np.float32(0.0)
     if main:
         lift = max(np.float32(2.0) * of_main[1][0] - np.float32(1.0), _LEAST_MAIN)
     if side:
-        push = np.float32(_SIDES[int(side)]) * max(of_side[int(side)][0], _LEAST_SIDE)
+        push = np.float32(_SIDES[side]) * max(of_side[side][0], _LEAST_SIDE)
     return np.array([lift, push], np.float32)
 
 

@@ -75,6 +75,8 @@ class PinballEnv(BatchedEnv[PinballState]):
             self.map = maps.read(self.options.map)
             is_fixed = self.options.start == "map"
             self._places = np.array([self.map.start], np.float64) if is_fixed else self.map.free_places(_GRID)
+            if not len(self._places):
+                raise maps.MapError(f"the ball lies free at no place of a grid of {_GRID} x {_GRID}; use start=map")
             self._planner = Planner(self.map, self.device) if self._has_oracle else None
         except maps.MapError as error:
             raise SettingError(f"map={self.options.map!r}: {error}") from error

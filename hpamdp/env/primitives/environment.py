@@ -14,7 +14,7 @@ from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
 from hpamdp.env.primitives.manipulation import ACTIONS, OBSERVED, Actions, Manipulation, Reward, Task
 from hpamdp.env.primitives.players import MEASURED
 from hpamdp.env.primitives.primitives import STEPS
-from hpamdp.settings import PositiveFraction, Settings
+from hpamdp.settings import OnlyWith, PositiveFraction, Settings
 
 _GROUPED_PRIMITIVES = {
     "move": ["move", "open"],
@@ -34,9 +34,9 @@ class PrimitivesOptions(Settings):
     """Primitives in an episode; 60 small or 6 large position steps take as long as one."""
     actions: Actions = "primitives"
     """What the agent chooses from: `primitives`, `small_steps` (up to 1 cm), `large_steps` (up to 10 cm), or `all`."""
-    reach: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    reach: Annotated[float, Field(gt=0.0, le=1.0), OnlyWith("actions", "primitives", "all")] = 1.0
     """Largest absolute value of a primitive's argument, in metres."""
-    negative_distances: bool = True
+    negative_distances: Annotated[bool, OnlyWith("actions", "primitives", "all")] = True
     """Whether primitives along one axis also take distances below 0, which count as 0, as in the source."""
     render: bool = False
     """Draw the arm, for films; without a display MuJoCo needs MUJOCO_GL=egl or osmesa."""

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from hpamdp.env.actions import check_single_action
 from hpamdp.env.primitives.primitives import (
     LARGE_POSITION_STEPS,
     PRIMITIVES,
@@ -95,6 +96,10 @@ class Manipulation(gymnasium.Env):
         for name, given, allowed in (("task", task, Task), ("actions", actions, Actions), ("reward", reward, Reward)):
             if given not in get_args(allowed):
                 raise SettingError(f"Manipulation: {name}={given}, but must be one of {', '.join(get_args(allowed))}")
+        if not isinstance(decisions, int | np.integer) or decisions < 1:
+            raise SettingError(f"Manipulation: decisions={decisions}, but must be a whole number of at least 1")
+        if not isinstance(reach, int | float | np.floating) or not 0.0 < reach <= 1.0:
+            raise SettingError(f"Manipulation: reach={reach}, but must be above 0 and at most 1")
         self.render_mode = render_mode
         self.actions = ACTIONS[actions]
         self._is_dense = reward == "dense"
@@ -133,10 +138,15 @@ class Manipulation(gymnasium.Env):
         return self._observation(seen), {}
 
     def step(self, action: tuple[Any, Any]) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Carry out an action, in all its low-level steps."""
-        number = int(action[0])
+        """Carry out an action, in all its low-level steps. Arguments are clipped to their bounds.
+
+        Raises:
+            ValueError: there is no such action, or its arguments are not finite.
+        """
+        discrete, parameters = action
+        number = check_single_action(discrete, parameters)
         chosen, box = self.actions[number], self._boxes[number]
-        arguments = np.clip(np.asarray(action[1][number], float), box.low, box.high)
+        arguments = np.clip(np.asarray(parameters[number], float), box.low, box.high)
         rewards, is_success = [], False
         for phase in phases(chosen, arguments):
             for command in phase.commands(self):

@@ -19,6 +19,8 @@ KINDS: tuple[str, ...] = get_args(Kind)
 HELD_OUT = 2**30
 """First number of a demand that training never draws."""
 NUM_DEMANDS = 2**31
+MOST_TRAFFIC = 3.0
+"""Largest factor of all flows."""
 _SLICE_S = 300  # length of the slices of constant flow
 
 

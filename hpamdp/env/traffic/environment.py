@@ -17,11 +17,11 @@ from hpamdp import keys
 from hpamdp.env.base import Metric
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
-from hpamdp.env.traffic.demand import HELD_OUT, Kind
+from hpamdp.env.traffic.demand import HELD_OUT, MOST_TRAFFIC, Kind
 from hpamdp.env.traffic.lights import TrafficLights
 from hpamdp.env.traffic.network import ARMS, MAX_GREEN, MIN_GREEN, NETWORKS, PHASES, lanes_of
 from hpamdp.env.traffic.players import PLAYERS, START_S, VEHICLE_S
-from hpamdp.env.traffic.simulation import VEHICLES, observation_names
+from hpamdp.env.traffic.simulation import VEHICLES, Reward, observation_names
 from hpamdp.geometry import Symmetries, make_symmetries
 from hpamdp.settings import PositiveFraction, Settings
 
@@ -40,9 +40,9 @@ class TrafficOptions(Settings):
     """`light`: constant; `rush`: a peak, highest on one axis; `shifting`: one axis is busy first, then the other."""
     minutes: PositiveInt = 60
     """Length of an episode in minutes."""
-    traffic: Annotated[float, Field(gt=0.0, le=3.0)] = 1.0
+    traffic: Annotated[float, Field(gt=0.0, le=MOST_TRAFFIC)] = 1.0
     """Factor of all flows."""
-    reward: Literal["queue", "waiting"] = "queue"
+    reward: Reward = "queue"
     """`queue`: minus the vehicle hours waited since the last decision. `waiting`: minus the change of the waiting time.
 
     The waiting time of `waiting` is that of the vehicles that stand now, in vehicle hours.

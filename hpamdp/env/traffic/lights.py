@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.traffic.demand import HELD_OUT, NUM_DEMANDS
-from hpamdp.env.traffic.network import MAX_GREEN, MIN_GREEN, PHASES, network_file
+from hpamdp.env.actions import check_single_action
+from hpamdp.env.traffic.demand import HELD_OUT, KINDS, MOST_TRAFFIC, NUM_DEMANDS
+from hpamdp.env.traffic.network import MAX_GREEN, MIN_GREEN, NETWORKS, PHASES, network_file
 from hpamdp.env.traffic.players import PLAYERS
 from hpamdp.env.traffic.process import SimulationProcess
-from hpamdp.env.traffic.simulation import Seen, Task, observation_names
+from hpamdp.env.traffic.simulation import Reward, Seen, Task, observation_names
+from hpamdp.settings import SettingError
 
 _NONE = spaces.Box(0.0, 1.0, (0,), np.float32)
 
@@ -44,7 +46,7 @@ class TrafficLights(gymnasium.Env):
         results: of the last episode that ended, as in the info.
 
     Raises:
-        SettingError: SUMO is not installed.
+        SettingError: an argument is wrong, or SUMO is not installed.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (Gymnasium's own declaration)
@@ -61,6 +63,14 @@ class TrafficLights(gymnasium.Env):
         strategies: bool = False,
         render_mode: str | None = None,
     ) -> None:
+        choices = (("network", network, (*NETWORKS,)), ("demand", demand, KINDS), ("reward", reward, get_args(Reward)))
+        for name, given, allowed in choices:
+            if given not in allowed:
+                raise SettingError(f"TrafficLights: {name}={given}, but must be one of {', '.join(allowed)}")
+        if not isinstance(minutes, int | np.integer) or minutes < 1:
+            raise SettingError(f"TrafficLights: minutes={minutes}, but must be a whole number of at least 1")
+        if not isinstance(traffic, int | float | np.floating) or not 0.0 < traffic <= MOST_TRAFFIC:
+            raise SettingError(f"TrafficLights: traffic={traffic}, but must be above 0 and at most {MOST_TRAFFIC:g}")
         self.render_mode = render_mode
         file = str(network_file(network))
         self._task = Task(network, demand, file, 60 * minutes, traffic, reward, render_mode is not None)
@@ -85,11 +95,16 @@ class TrafficLights(gymnasium.Env):
         return self._last.observation, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Set the signal that is due, and simulate until the next decision."""
+        """Set the signal that is due, and simulate until the next decision. Greens are clipped to their bounds.
+
+        Raises:
+            ValueError: there is no such action, or its green is not finite.
+        """
         assert self._simulation is not None
-        chosen, greens = int(action[0]), action[1]
+        discrete, greens = action
+        chosen = check_single_action(discrete, greens)
         if chosen < len(PHASES):
-            self._last = self._simulation.act(chosen, float(greens[chosen][0]))
+            self._last = self._simulation.act(chosen, min(max(float(greens[chosen][0]), MIN_GREEN), MAX_GREEN))
         else:
             self._last = self._simulation.follow(PLAYERS[chosen - len(PHASES)])
         if self._last.is_over:

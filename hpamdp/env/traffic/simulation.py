@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,6 +21,7 @@ from hpamdp.env.traffic.network import ARMS, GREENS, MAX_GREEN, NETWORKS, NUM_LA
 from hpamdp.env.traffic.players import ACTUATED, LongestQueue, MaxPressure, Webster
 from hpamdp.messages import one_line
 
+Reward = Literal["queue", "waiting"]
 VEHICLES = 20.0
 """Queues and approaching vehicles are observed in this many vehicles."""
 HOUR_S = 3600.0

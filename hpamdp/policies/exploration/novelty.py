@@ -42,8 +42,10 @@ from hpamdp.policies.exploration.base import Explored
 from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
 from hpamdp.policies.shared.hybrid_actor import hidden_layers
 from hpamdp.policies.shared.networks import OutputLinear
-from hpamdp.settings import LearningRate, SettingError, Settings, Widths
+from hpamdp.settings import LearningRate, OnlyWith, SettingError, Settings, Widths
 from hpamdp.specs import PAMDPSpecs
+
+_OfNetworks = OnlyWith("in_plans", "auto", "distillation")  # an ensemble's disagreement takes no networks
 
 
 class NoveltyOptions(Settings):
@@ -55,15 +57,15 @@ class NoveltyOptions(Settings):
     A bonus is an error in standard deviations of all errors so far. With disagreement, it is the members' standard
     deviation in units of the usual change of the state in a step.
     """
-    hidden_dims: Annotated[Widths, Field(min_length=1)] = (64, 64)
+    hidden_dims: Annotated[Widths, Field(min_length=1), _OfNetworks] = (64, 64)
     """Hidden layers of the random network and of the one that predicts it."""
-    num_features: PositiveInt = 32
+    num_features: Annotated[PositiveInt, _OfNetworks] = 32
     """Outputs of the random network."""
-    lr: LearningRate = 1e-3
+    lr: Annotated[LearningRate, _OfNetworks] = 1e-3
     """Learning rate of the predicting network. With more, states are familiar sooner."""
-    batch_size: PositiveInt = 128
+    batch_size: Annotated[PositiveInt, _OfNetworks] = 128
     """Steps in an update of the predicting network, which learns from each collected step once."""
-    largest: PositiveFloat = 5.0
+    largest: Annotated[PositiveFloat, _OfNetworks] = 5.0
     """Largest bonus before it is weighted."""
     in_plans: Literal["auto", "disagreement", "distillation"] = "auto"
     """Bonus of learners that plan: an ensemble's `disagreement` about the next state, or random network `distillation`.
