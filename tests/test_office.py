@@ -15,6 +15,7 @@ from conftest import make_config
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
+import hpamdp
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.decisions import with_decisions
@@ -376,6 +377,26 @@ def test_the_mask_of_options_says_which_goals_are_open(has, is_open):
     columns = {"coffee": torch.tensor([has[0]]).int(), "mail": torch.tensor([has[1]]).int()}
     env.set_env_state({**env.env_state(), **columns})
     assert env.read()[keys.OPTION_MASK].tolist() == [[*is_open]]
+
+
+def test_an_agent_that_chooses_goals_acts_in_gymnasium_whose_infos_say_which_are_open():
+    sizes = {"num_envs": 4, "steps_per_batch": 4, "total_frames": 16, "eval.layouts": 2}
+    agent = hpamdp.train("office", chooses_goal=True, high="uniform", low="random", progress=False, **sizes)
+    env = hpamdp.make_gymnasium("office", chooses_goal=True)
+    observation, info = env.reset(seed=0)
+    assert info["option_mask"].tolist() == [True, True, False]
+    env.unwrapped._env.state = env.unwrapped._env.state._replace(coffee=torch.ones(1, dtype=torch.int32))
+    for _ in range(3):
+        action = agent.act(observation, info)
+        observation, *_, info = env.step(action)
+        assert info["option_mask"].tolist() == [False, True, False]
+    many = hpamdp.make_gymnasium("office", num_envs=3, chooses_goal=True)
+    observations, infos = many.reset(seed=0)
+    agent.reset()
+    assert all(many.single_action_space.spaces[0].contains(option) for option in agent.act(observations, infos)[0])
+    _, infos = many.reset(options={"reset_mask": np.array([True, False, False])})
+    assert infos["option_mask"].tolist() == [[True, True, False], [False] * 3, [False] * 3]
+    assert infos["_option_mask"].tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("settings", [{}, {"chooses_goal": True}], ids=["any", "chosen"])

@@ -4,8 +4,8 @@ Their actions are the field's nested tuples, `(discrete action, (parameters of a
 option in front if the agent chooses one; batched spaces are Gymnasium's own: every leaf has a leading `[N]`. Only the
 parameters of the chosen action count.
 
-Infos: `outcome` (name), `steps` (actions so far), in sessions of trips `trip_ended`, and once the episode is over those
-of `BatchedEnv.final_infos`, such as `is_success`.
+Infos: `outcome` (name), `steps` (actions so far), in sessions of trips `trip_ended`, the masks of problems that forbid
+something, and once the episode is over those of `BatchedEnv.final_infos`, such as `is_success`.
 """
 
 from __future__ import annotations
@@ -198,14 +198,18 @@ class NumpyBatchedEnv(NumpyRows):
         infos = {"outcome": self._outcome_names[outcome], "steps": steps.astype(np.int64)}
         if self._env.has_trips:
             infos[keys.TRIP_ENDED] = self._env.trip_ends(self.rows)
-        return infos | self._env.final_infos(self.rows)
+        return infos | self._masks() | self._env.final_infos(self.rows)
+
+    def _masks(self) -> dict[str, np.ndarray]:
+        return {name: to_numpy(mask) for name, mask in self._env.masks().items()}
 
     def info(self) -> dict[str, Any]:
         """Return the infos of the first environment as Python's numbers."""
         steps, outcome, _ = self.rows.integers[STEPS_ROW:, 0].tolist()
-        values = {"outcome": self._env.outcomes[outcome], "steps": steps}
+        values: dict[str, Any] = {"outcome": self._env.outcomes[outcome], "steps": steps}
         if self._env.has_trips:
             values[keys.TRIP_ENDED] = self._env.trip_ends(self.rows).item(0)
+        values |= {name: mask[0] for name, mask in self._masks().items()}
         if outcome == GOING_ON:
             return values
         return values | {name: value.item(0) for name, value in self._env.final_infos(self.rows).items()}

@@ -342,6 +342,13 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         """Return what Gymnasium's infos tell of episodes that are over, `[N]` each: whether they succeeded."""
         return {"is_success": rows.integers[OUTCOME_ROW] == SUCCESS}
 
+    def masks(self) -> dict[str, Tensor]:
+        """Return what the current states allow, `action_mask` or `option_mask`, bool `[N, K]`; by default nothing.
+
+        Gymnasium's infos have them. A subclass also writes them beside the observation, by `_knowledge`.
+        """
+        return {}
+
     def env_state(self) -> dict[str, Tensor]:
         """Return the columns of the state, `[N]` each."""
         return self.state._asdict()

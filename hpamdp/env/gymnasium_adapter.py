@@ -269,7 +269,7 @@ class GymnasiumVectorAdapter(VectorEnv):
                 masked[name] = value
             elif has_value.any():
                 missing: Any = None if value.dtype == object else value.dtype.type(0)
-                masked[name] = np.where(has_value, value, missing)
+                masked[name] = np.where(has_value.reshape(-1, *[1] * (value.ndim - 1)), value, missing)
             else:
                 continue
             masked[f"_{name}"] = has_value.copy()

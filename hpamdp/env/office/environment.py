@@ -141,11 +141,12 @@ class OfficeEnv(BatchedEnv[OfficeState]):
             specs[keys.OPTION_MASK] = Binary(num, shape=(self.num_envs, num), dtype=torch.bool, device=self.device)
         return specs
 
+    def masks(self) -> dict[str, Tensor]:
+        """Return which goals are open, if the agent chooses them."""
+        return {keys.OPTION_MASK: rules.open_goals(self._state)} if self.options.chooses_goal else {}
+
     def _knowledge(self) -> dict[str, Any]:
-        knowledge = super()._knowledge()
-        if self.options.chooses_goal:
-            knowledge[keys.OPTION_MASK] = rules.open_goals(self._state)
-        return knowledge
+        return super()._knowledge() | self.masks()
 
     def draw(self, track: Sequence[OfficeState]) -> np.ndarray:
         """Return a picture of the office and the way so far, uint8 `[480, 480, 3]`."""
