@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import load_env_creator
 from pydantic import NonNegativeInt, PositiveInt
 
 from hpamdp.api.arguments import plain_name, problem_arguments, without_env_prefix
@@ -101,6 +104,21 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         return gymnasium.make_vec(env_id, num_envs=num_envs, **own)
     except (gymnasium.error.Error, SettingError) as error:
         raise ConfigError(f"{env_id}: {first_line(error)}") from error
+    except TypeError as error:
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+        if unknown is None:
+            raise
+        name = unknown.group(1)
+        raise ConfigError(f"{env_id}: {name}: {no_such('argument', name, _arguments_of(env_id))}") from error
+
+
+def _arguments_of(env_id: str) -> list[str]:
+    """Return the names of the arguments that the constructor behind an id takes."""
+    creator: Any = gymnasium.spec(env_id).entry_point
+    if isinstance(creator, str):
+        creator = load_env_creator(creator)
+    parameters = [] if creator is None else inspect.signature(creator).parameters.values()
+    return [each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
 
 
 def _id_of(name: str) -> str:

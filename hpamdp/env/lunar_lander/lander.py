@@ -37,18 +37,35 @@ class HybridLunarLander(gymnasium.Wrapper):
 
     Args:
         render_mode: None or `rgb_array`.
-        settings: further arguments of LunarLander: `gravity`, `enable_wind`, `wind_power`, `turbulence_power`.
+        gravity, enable_wind, wind_power, turbulence_power: those of LunarLander.
 
     Raises:
-        SettingError: Box2D is not installed.
+        SettingError: LunarLander refuses an argument, or Box2D is not installed.
     """
 
-    def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
+    def __init__(
+        self,
+        *,
+        render_mode: str | None = None,
+        gravity: float = -10.0,
+        enable_wind: bool = False,
+        wind_power: float = 15.0,
+        turbulence_power: float = 1.5,
+    ) -> None:
         try:
             from gymnasium.envs.box2d.lunar_lander import LunarLander
         except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
             raise SettingError("Box2D is not installed; pip install 'hpamdp[box2d]'") from error
-        super().__init__(LunarLander(render_mode=render_mode, continuous=True, **settings))
+        wind: dict[str, Any] = {
+            "enable_wind": enable_wind,
+            "wind_power": wind_power,
+            "turbulence_power": turbulence_power,
+        }
+        try:
+            lander = LunarLander(render_mode=render_mode, continuous=True, gravity=gravity, **wind)
+        except AssertionError as error:
+            raise SettingError(f"LunarLander: {error}") from error
+        super().__init__(lander)
         self.action_space = spaces.Dict(
             main=spaces.Tuple([spaces.Discrete(2), spaces.Tuple([_NONE, _THROTTLE])]),
             side=spaces.Tuple([spaces.Discrete(3), spaces.Tuple([_NONE, _THROTTLE, _THROTTLE])]),
