@@ -21,7 +21,7 @@ from hpamdp.run.train import run
 
 FOLDER = Path(__file__).resolve().parent.parent / "agents"
 # Those of others have none, the released rules are there for comparisons, pictures are another view of a problem, and
-# no agent of the package plays Office, Pinball, primitives or traffic lights yet.
+# no agent of the package plays primitives or traffic lights yet.
 NOT_LEARNED = {"primitives", "traffic"}
 PROBLEMS = {*choices("env")} - NOT_LEARNED - {"gymnasium", "boatdock_released", "catch_point_picture"}
 AGENTS = sorted(folder.name for folder in FOLDER.iterdir() if folder.is_dir())
@@ -53,8 +53,10 @@ def test_an_agent_scores_as_its_summary_says(name):
     player = load_player(str(FOLDER / name), ["eval.layouts=200", "film=false"])
     score = player.evaluation.run(player.agent.policy)["score"]
     summary = json.loads((FOLDER / name / "summary.json").read_text())
-    # A subset of the episodes of the summary: four standard errors.
-    assert score.mean() == pytest.approx(summary["score"], abs=float(4.0 * score.std() / len(score) ** 0.5 + 1e-3))
+    # A subset of the episodes of the summary: four standard errors. Networks are stored in half precision after they
+    # are scored. All episodes of Pinball are the same, and its walls amplify rounding.
+    rounding = 1e-3 * max(1.0, abs(summary["score"]))
+    assert score.mean() == pytest.approx(summary["score"], abs=float(4.0 * score.std() / len(score) ** 0.5 + rounding))
 
 
 def test_those_on_boats_can_be_played_against_and_the_others_are_not_even_built(monkeypatch):
