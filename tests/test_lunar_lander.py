@@ -107,3 +107,9 @@ def test_it_can_be_drawn():
     env.reset()
     (picture,) = env.film_state(1).values()
     assert picture.dtype == torch.uint8 and picture.shape[-1] == 3
+
+
+def test_watch_names_the_setting_with_which_it_is_drawn_before_it_plays(command, monkeypatch):
+    monkeypatch.setattr(LunarLanderEnv, "step", lambda *_: pytest.fail("it was played"))
+    code, _, err = command("watch", "env=lunar_lander", "high=none", "low=random", "--episodes", "2")
+    assert code == 2 and err == "env=lunar_lander: has no pictures to film; use env.render=true\n"

@@ -59,11 +59,15 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     episodes = [f"eval.layouts={options.episodes}", f"eval.seed={options.seed}", "film=true"]
     player = load_player(path, [*with_config_dirs(settings, options.config_dir), *episodes])
     evaluation = player.evaluation
+    draws = player.config.env.settings.get("render") is not False
+    lack = f"{player.config.env}: has no pictures to film{'' if draws else '; use env.render=true'}"
+    if not evaluation.problem.film_state(1):
+        raise ConfigError(lack)
     states: list[dict[str, Tensor]] = []
     played = evaluation.run(player.agent.policy, states)
     pictures = film.film(evaluation.problem, film.tracks_of(states), float(options.fps), options.size)
     if not pictures:
-        raise ConfigError(f"{player.config.env}: has no pictures to film")
+        raise ConfigError(lack)
     try:
         film.write(options.to, pictures, float(options.fps))
     except film.FilmError as error:
