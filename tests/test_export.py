@@ -208,6 +208,21 @@ def test_the_function_that_is_exported_acts_as_the_agent(name):
         assert differences(agent, traced_step(agent)) < 1e-5
 
 
+def test_goals_learned_by_pdqn_are_exported_for_any_number_of_rows(tmp_path):
+    pytest.importorskip("onnxscript")
+    agent = fresh_agent("env=office", "env.chooses_goal=true", "high=ucb", "low=pdqn")
+    agent.export(tmp_path / "goals.onnx")
+    session = session_of(tmp_path / "goals.onnx")
+    for num_rows in (1, 5):
+        inputs = {
+            keys.OBSERVATION: np.zeros((num_rows, 4), np.float32),
+            keys.OPTION_MASK: np.array([[False, True, False]] * num_rows),
+            HELD_OPTION: np.zeros(num_rows, np.int64),
+            keys.IS_DECISION: np.ones(num_rows, bool),
+        }
+        assert session.run(None, inputs)[2].tolist() == [1] * num_rows
+
+
 def test_options_end_where_the_selector_ends_them():
     agent = fresh_agent(*CASES["termination"])
     options = []

@@ -215,7 +215,9 @@ class PDQNPolicy(TensorDictModuleBase):
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         state = self.perception.see(td).reshape(-1, self.perception.specs.observation_dim)
         allowed = allowed_rows(self.specs, td)
-        is_fixed = self.specs.is_fixed(td.get(keys.OBSERVATION).reshape(len(state), -1))
+        observation = td.get(keys.OBSERVATION)
+        # An export keeps the size of a batch open, which `len` would fix.
+        is_fixed = self.specs.is_fixed(observation.reshape(-1, observation.shape[-1]))
         unit_parameters = with_fixed(self.actor(state), is_fixed)
         if is_greedy() and len(self.variations) > 0:
             discrete, unit_parameters = self._best_variation(state, unit_parameters, allowed, is_fixed)
