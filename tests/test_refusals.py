@@ -398,6 +398,22 @@ def test_a_setting_that_counts_only_with_another_value_is_told(words, needs):
     assert settings_without_effect(read(config_of(words)), words.split()) == expected
 
 
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        (
+            "+low.per_option={congruent:{name:hppo,memory_size:8}}",
+            ["low.per_option.congruent.memory_size: has no effect; memory_size counts only with memory=gru"],
+        ),
+        ("+low.per_option={congruent:{name:hppo,memory:gru,memory_size:8}}", []),
+        ("high={window:9}", ["high.window: has no effect; window counts only with memory=sliding_window"]),
+    ],
+)
+def test_a_setting_without_effect_is_found_inside_a_mapping(word, expected):
+    words = ["env=boatdock", "high=ucb", "low=random", word]
+    assert settings_without_effect(read(composed(*words)), words) == expected
+
+
 def test_a_setting_without_effect_is_told_once_by_both_doors(command, capsys):
     words = ["env=platform", "high=none", "low=hppo", "low.minibatch_size=16", "low.memory_size=8"]
     line = "low.memory_size=8: has no effect; memory_size counts only with memory=gru"

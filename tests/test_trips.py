@@ -529,12 +529,12 @@ def test_an_agent_that_chooses_by_the_rewards_of_a_session_does_not_act_without_
         (
             "boatdock_unseen",
             {"agent.selector_values_end": "trip", "env.boats": 2, "high": "ucb"},
-            "agent.selector_values_end=trip: high=ucb has no values; use agent.values_end=trip",
+            "agent.selector_values_end=trip: high=ucb has no values; use agent.selector_values_end=null",
         ),
         (
             "boatdock_unseen",
             {"agent.selector_values_end": "trip"},
-            "agent.selector_values_end=trip: high=none has no values; use agent.values_end=trip",
+            "agent.selector_values_end=trip: high=none has no values; use agent.selector_values_end=null",
         ),
         (
             "boatdock",
@@ -554,6 +554,11 @@ def test_an_agent_that_chooses_by_the_rewards_of_a_session_does_not_act_without_
             HiddenOption,
             {"low.memory": "gru", "low.per_option": {"left": {"name": "hppo", "memory": "stack"}}},
             "low.per_option: env=HiddenOption has trips, and so needs the same memory",
+        ),
+        (
+            HiddenOption,
+            {"low.memory": "gru", "low.per_option": {"left": "pets"}},
+            "which value each other's states; low=pets has no memory",
         ),
     ],
 )

@@ -12,6 +12,7 @@ from typing import Any, TypeGuard
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -317,6 +318,17 @@ def is_name(name: object) -> TypeGuard[str]:
 def setting_of(word: str) -> str:
     """Return the name of the setting, or the group, that a word of a command line gives, adds or deletes."""
     return word.partition("=")[0].lstrip("+~")
+
+
+def settings_in(word: str) -> list[str]:
+    """Return the names of all settings that a word gives: `eval={every:5}` gives `eval` and `eval.every`."""
+    override = OverridesParser.create().parse_override(word)
+    return _names_in(setting_of(word), None if override.is_sweep_override() else override.value())
+
+
+def _names_in(name: str, value: Any) -> list[str]:
+    entries = value.items() if isinstance(value, Mapping) else ()
+    return [name, *(each for key, entry in entries for each in _names_in(f"{name}.{key}", entry))]
 
 
 def choosing(group: str, name: str) -> str:

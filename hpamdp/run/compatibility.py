@@ -21,7 +21,7 @@ from hpamdp.config.components import (
     settings_model,
     takes_settings_model,
 )
-from hpamdp.config.compose import RECIPE, setting_of
+from hpamdp.config.compose import RECIPE, setting_of, settings_in
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.facts import ProblemFacts
@@ -116,26 +116,31 @@ def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
         config: config of the run.
         words: words of the command line.
     """
-    warnings = []
-    for word in words:
-        group, _, name = setting_of(word).partition(".")
-        component: Component | None = getattr(config, group) if group in GROUPS else None
-        if component is None or component.cls is None or not takes_settings_model(component.cls):
-            continue
-        field = settings_model(component.cls).model_fields.get(name)
-        for each in () if field is None else field.metadata:
-            if isinstance(each, OnlyWith) and not each.holds(component.settings):
-                warnings.append(f"{word}: has no effect; {name} counts only {each}")
-    return warnings
+    return [
+        f"{word if name == setting_of(word) else name}: has no effect; {name.rpartition('.')[2]} counts only {each}"
+        for word in words
+        for name in settings_in(word)
+        for each in _conditions(config, name)
+    ]
+
+
+def _conditions(config: Config, name: str) -> list[OnlyWith]:
+    """Return the conditions of a setting that do not hold, such as those of `low.memory_size` without `low.memory`."""
+    group, _, setting = name.partition(".")
+    component: Component | None = getattr(config, group) if group in GROUPS else None
+    if setting.startswith("per_option."):
+        _, option, setting = [*setting.split(".", 2), ""][:3]
+        component = config.low_of.get(option)
+    if component is None or component.cls is None or not takes_settings_model(component.cls):
+        return []
+    field = settings_model(component.cls).model_fields.get(setting)
+    conditions = () if field is None else field.metadata
+    return [each for each in conditions if isinstance(each, OnlyWith) and not each.holds(component.settings)]
 
 
 def _sets(word: str, name: str) -> bool:
     """Return whether a word of a command line sets something, as in `eval.every=5` and `eval={every:5}`."""
-    given = setting_of(word)
-    if given == name or given.startswith(f"{name}."):
-        return True
-    entry = name.removeprefix(f"{given}.")
-    return entry != name and re.search(rf"[{{,]\s*{entry}\s*:", word) is not None
+    return any(each == name or each.startswith(f"{name}.") for each in settings_in(word))
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:
@@ -292,7 +297,7 @@ def selector_values_have_a_selector(config: Config) -> str | None:
     values_end = config.run.agent.selector_values_end
     if config.run.mode == "eval" or values_end is None or "gamma" in config.high.settings:
         return None
-    return f"agent.selector_values_end={values_end}: {config.high} has no values; use agent.values_end={values_end}"
+    return f"agent.selector_values_end={values_end}: {config.high} has no values; use agent.selector_values_end=null"
 
 
 def what_counts_trips_has_trips(config: Config) -> str | None:
@@ -485,9 +490,10 @@ def memories_have_values(config: Config) -> str | None:
     memories = {tuple(each.settings[name] for name in settings if _memory(each)) for each in config.learners}
     if (run.termination != "episode" or has_trips(config)) and len(memories) > 1:
         given = f"{config.env} has trips, and so" if has_trips(config) else f"agent.termination={run.termination}"
+        without = [str(each) for each in config.learners if not _memory(each)]
         return (
             f"low.per_option: {given} needs the same memory, memory_size and stack_steps "
-            "in all learners, which value each other's states"
+            "in all learners, which value each other's states" + (f"; {without[0]} has no memory" if without else "")
         )
     return None
 
