@@ -10,6 +10,7 @@ python experiments/table1/study.py              draws and tabulates the stored c
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -46,6 +47,8 @@ BLOCK_EPISODES = 60
 BOATS = ("congruent", "incongruent")
 REWARDS = ("shaped", "sparse")
 EARLIER_SEEDS = (0, 1, 2)
+BUDGETS = (4_000, 20_000, 100_000, 400_000, 4_000_000, 24_000_000)  # presses after which learners are compared
+NEAR = 1.1  # an evaluation counts for a budget that differs by no more than this factor
 TABLES = ("results", "curves", "efficiency")
 CELL = ("low", "boat", "reward")
 LEARNERS = ("hppo", "pdqn", "hyar", "qpamdp", "dlpa")
@@ -282,6 +285,29 @@ def efficiency_table(efficiency: Rows, results: Rows) -> str:
     return "\n".join(lines)
 
 
+def budget_table(curves: Rows) -> str:
+    """Return a line for each learner and boat with its scores after equal numbers of presses.
+
+    A cell is empty if some run has no evaluation near the number of presses, or has ended before.
+    """
+    lines = [
+        f"| score after | controller | {' | '.join(f'{budget:,} presses' for budget in BUDGETS)} |",
+        f"|---|---|{'---|' * len(BUDGETS)}",
+    ]
+    for low, boat in itertools.product(LEARNERS, BOATS):
+        runs = groups(_of(curves, low, boat), "seed").values()
+        cells = [[_score_after(run, budget) for run in runs] for budget in BUDGETS]
+        texts = ["" if None in scores else spread(scores) for scores in cells]
+        lines.append(f"| {low} | {boat} | {' | '.join(texts)} |")
+    return "\n".join(lines)
+
+
+def _score_after(run: Rows, budget: int) -> float | None:
+    """Return the score of a run's evaluation that is nearest to a number of presses; None if none is near."""
+    nearest = min(run, key=lambda row: abs(row["frames"] - budget))
+    return nearest["eval/score"] if budget / NEAR <= nearest["frames"] <= budget * NEAR else None
+
+
 def _first_at_human_score(rows: Rows) -> dict[str, Any] | None:
     """Return a run's first evaluation at the mean human score or above."""
     return next((row for row in rows if row["eval/score"] >= HUMAN["chosen"]["score"]), None)
@@ -405,6 +431,7 @@ def main(folders: Sequence[str]) -> None:
         table(rows, shaped),
         efficiency_table(tables["efficiency"], shaped),
         reward_table(stored),
+        budget_table(curves),
         sep="\n\n",
     )
 
