@@ -292,6 +292,29 @@ def test_the_closing_table_has_the_score_of_no_gates_for_the_target_at_hand():
     assert CircuitEnv(1, task="random_state").references({})["no gates"]["score"] == 0.25
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_training_may_begin_as_many_gates_from_the_target_as_are_said_and_evaluation_begins_without_gates(task):
+    assert compare_with_rules(CircuitEnv(60, task=task, begin="near_target"), 3, 1e-5)[1] == 0
+    env = CircuitEnv(60, task=task, begin="near_target", begin_gates=1)
+    env.reset()
+    made, target = (matrices.to(torch.complex128) for matrices in rules.circuit_and_target(env.state, env.design))
+    empty = rules.without_gates(env.design, env.device)
+    is_empty = (made - empty).abs().amax((-2, -1)) < 1e-6
+    assert 0.3 < is_empty.float().mean() < 0.7
+    n = TASK_OF[task].n
+    undone = torch.zeros(len(made), dtype=torch.float64)
+    for name in env.discrete_names[:-1]:
+        for angle in np.linspace(-math.pi, math.pi, 181):
+            similarity = rules.similarity(
+                torch.from_numpy(gate(name, angle, n).astype(complex)) @ made, target, env.design
+            )
+            undone = undone.maximum(similarity)
+    assert undone[~is_empty].min() > 0.95  # angles two degrees apart
+    env.seed_evaluation(1)
+    env.reset()
+    assert torch.equal(rules.circuit_and_target(env.state, env.design)[0], empty.expand_as(made))
+
+
 def test_random_targets_are_normalised_uniform_and_new_in_every_episode():
     env = CircuitEnv(4000, task="random_state")
     env.reset()
@@ -447,6 +470,10 @@ def test_the_oracle_with_the_planner_reaches_the_ceiling_and_always_chooses_righ
     [
         ({"task": "cnot"}, "task='cnot': must be 'hadamard'"),
         ({"task": "toffoli", "gate_set": "ion"}, "gate_set=ion: native sets are for task=bell and random_state, not"),
+        (
+            {"task": "bell", "gate_set": "ion", "begin": "near_target"},
+            "begin=near_target: needs gate_set=published",
+        ),
         ({"task": "random_state", "begin": "known"}, "begin=known: needs gate_set=published and a target with a"),
         ({"task": "bell", "target_number": 1}, "target_number=1: task=bell has one target; leave it out"),
         ({"floor": 0.9}, "floor=0.9: needs reward=gain, not reward=final"),

@@ -81,11 +81,14 @@ class CircuitOptions(Settings):
 
     If None, each episode has its own.
     """
-    begin: Literal["empty", "known"] = "empty"
+    begin: Literal["empty", "known", "near_target"] = "empty"
     """How training episodes begin. `empty`: without gates, as evaluation always does.
 
     `known`: with the first gates of the circuit that makes the fixed target, from none of them to all but one.
+    `near_target`: with the target after a few random gates, which the agent has to undo.
     """
+    begin_gates: Annotated[int, Field(ge=1, le=100), OnlyWith("begin", "near_target")] = 6
+    """The most random gates. Their number is uniform between 0, which begins without gates, and this one."""
     observe_depth: bool = False
     """Whether the observation ends in the depth of each wire, as a fraction of the limit."""
     max_steps: PositiveInt | None = None
@@ -113,6 +116,8 @@ class CircuitOptions(Settings):
             raise ValueError(
                 f"begin=known: needs gate_set=published and a target with a known circuit, task={' or '.join(CIRCUITS)}"
             )
+        if self.begin == "near_target" and self.gate_set != "published":
+            raise ValueError(f"begin=near_target: needs gate_set=published, not gate_set={self.gate_set}")
         for name in NATIVE_SETS:
             one, two = self.costs(name)
             if not 0.001 <= one <= two <= 1.0:
@@ -188,6 +193,7 @@ class CircuitEnv(BatchedEnv[CircuitState]):
             observes_depth=options.observe_depth,
             max_steps=self.max_steps,
             beginnings=beginnings(options.task) if options.begin == "known" else None,
+            begin_gates=options.begin_gates if options.begin == "near_target" else 0,
         )
         depths = [f"depth_{wire}" for wire in range(task.n)] if options.observe_depth else []
         self.observation_names = (*self.design.entry_names, *depths)
@@ -229,7 +235,7 @@ class CircuitEnv(BatchedEnv[CircuitState]):
         return Bounded(0.0, highest, shape=(self.num_envs, 1), device=self.device, dtype=torch.float32)
 
     def start(self, episode: Tensor, rng: RngKey) -> CircuitState:
-        """Return circuits without gates or, in training with `begin=known`, parts of the known one."""
+        """Return circuits without gates or, in training, what `begin` says."""
         return rules.start(episode, rng, self.design, is_training=self._streams[0] == counter_rng.TRAINING)
 
     def act(self, state: CircuitState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[CircuitState, Tensor]:

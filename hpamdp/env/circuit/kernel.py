@@ -24,7 +24,7 @@ from hpamdp.env.rng_streams import TRAINING
 WIRES, DEPTH, COLUMNS, IS_NATIVE, REWARD, OBSERVES_DEPTH, IS_RANDOM, NUM_BEGINNINGS = range(
     kernels.OWN, kernels.OWN + 8
 )
-FLOOR, NUM_GATES, NUM_SETS, OWN_GATES = range(kernels.OWN + 8, kernels.OWN + 12)
+FLOOR, BEGIN_GATES, NUM_GATES, NUM_SETS, OWN_GATES = range(kernels.OWN + 8, kernels.OWN + 13)
 NUM_OF_GATE = 6
 _KIND, _FLIPPED, _CONTROL, _HAS_ANGLE, _ANGLE, _COST = range(NUM_OF_GATE)
 _GATE_SET_ROW, _GATE_ROW = -5, -4
@@ -45,7 +45,8 @@ def settings_of(design: Design) -> Sequence[float]:
     flags = [design.is_native, rules.REWARDS.index(design.reward), design.observes_depth, design.target is None]
     circuits, depths = design.beginnings or ([], [])
     floor = math.nan if design.floor is None else design.floor
-    numbers: list[float] = [*sizes, *flags, len(circuits), floor, len(design.gate_sets[0]), len(design.gate_sets)]
+    sets = [len(design.gate_sets[0]), len(design.gate_sets)]
+    numbers: list[float] = [*sizes, *flags, len(circuits), floor, design.begin_gates, *sets]
     for gate in (gate for gate_set in design.gate_sets for gate in gate_set):
         angle = 0.0 if gate.angle is None else gate.angle
         numbers += [gate.kind, gate.flipped, gate.control, gate.angle is None, angle, gate.cost]
@@ -166,6 +167,29 @@ def _draw_target(entries: Any, bits: Any, step: Any, num_rows: Any, num_columns:
 
 
 @part
+def _below(uniform: Any, num: Any) -> Any:
+    """Return a whole number from 0 to `num - 1` for a uniform one in (0, 1)."""
+    return min(int(uniform * _F(num)), num - 1)
+
+
+@part
+def _begin_near_target(entries: Any, bits: Any, step: Any, settings: Any, num_rows: Any, num_columns: Any) -> None:
+    """Write a circuit near its target into a row without gates: `rules.near_target`."""
+    num, num_gates = num_rows * num_columns, int(settings[NUM_GATES]) - 1
+    number = _below(kernels.uniform(bits, step, rules.NEAR_TARGET), int(settings[BEGIN_GATES]) + 1)
+    if number == 0:
+        return
+    for place in range(2 * num):
+        entries[place] = entries[2 * num + place]
+    for i in range(number):
+        action = _below(kernels.uniform(bits, step, rules.NEAR_TARGET + 1 + 2 * i), num_gates)
+        angle = (kernels.uniform(bits, step, rules.NEAR_TARGET + 2 + 2 * i) * TWO - ONE) * _PI
+        first = OWN_GATES + NUM_OF_GATE * action
+        kind, flipped, control = int(settings[first]), int(settings[first + _FLIPPED]), int(settings[first + _CONTROL])
+        _apply(entries, kind, flipped, control, angle, num_rows, num_columns)
+
+
+@part
 def _start(entries: Any, integers: Any, row: Any, bits: Any, step: Any, settings: Any, drawn: Any) -> None:
     """Begin a circuit in a row: `rules.start`."""
     num_wires, num_columns, limit = int(settings[WIRES]), int(settings[COLUMNS]), _F(settings[DEPTH])
@@ -179,7 +203,7 @@ def _start(entries: Any, integers: Any, row: Any, bits: Any, step: Any, settings
             entries[2 * num + place] = settings[first + place]
     depth, num_beginnings = 0, int(settings[NUM_BEGINNINGS])
     if num_beginnings > 0 and settings[kernels.EPISODE_STREAM] == TRAINING:
-        number = min(int(kernels.uniform(bits, step, 0) * _F(num_beginnings)), num_beginnings - 1)
+        number = _below(kernels.uniform(bits, step, 0), num_beginnings)
         first += 2 * num + number * (2 * num + num_wires)
         for place in range(2 * num):
             entries[place] = settings[first + place]
@@ -193,6 +217,8 @@ def _start(entries: Any, integers: Any, row: Any, bits: Any, step: Any, settings
             entries[i * num_columns + i] = ONE
         for wire in range(num_wires):
             integers[wire, row] = 0
+        if settings[BEGIN_GATES] > 0 and settings[kernels.EPISODE_STREAM] == TRAINING:
+            _begin_near_target(entries, bits, step, settings, num_rows, num_columns)
     entries[4 * num] = _similarity(entries, num_rows, num_columns)
     entries[4 * num + 1], entries[4 * num + 2] = _depth_cost(depth, limit), ZERO
     integers[_GATE_SET_ROW, row], integers[_GATE_ROW, row] = 0, -1

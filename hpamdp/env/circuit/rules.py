@@ -8,6 +8,8 @@ Differs from the source:
 - A circuit of full depth terminates the episode. There it truncates it, with the same reward.
 - The rewards `progress` and `gain` are new here; the score is the source's.
 - The native gate sets are new here. Their costs take the place of the cost of depth.
+- Training episodes may begin within the known circuit, or near the target (Florensa et al. 2017, *Reverse Curriculum
+  Generation for Reinforcement Learning*, arXiv:1707.05300).
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ RANDOM_TASKS = ("random_state", "random_unitary")
 OUTCOMES = ("building", "matched", "missed", "time limit")
 BUILDING, MATCHED, MISSED, TIME_LIMIT = range(4)
 MATCH = 0.99  # similarity from which on a finished circuit matches its target
+NEAR_TARGET = 1000  # first of the random numbers of a circuit that begins near its target; targets take lower ones
 
 
 class Task(NamedTuple):
@@ -93,6 +96,7 @@ class Design:
         max_steps: steps after which an episode is truncated.
         beginnings: circuits that training episodes begin with, and the depths of their wires, complex64 `[B, R, C]`
             and int32 `[B, n]`; None if they begin without gates.
+        begin_gates: most random gates after the target that training episodes begin with; 0 if they do not.
     """
 
     task: Task
@@ -104,6 +108,7 @@ class Design:
     observes_depth: bool
     max_steps: int
     beginnings: tuple[Tensor, Tensor] | None = None
+    begin_gates: int = 0
 
     @property
     def num_rows(self) -> int:
@@ -188,19 +193,21 @@ def random_target(rng: RngKey, task: Task) -> Tensor:
 def start(episode: Tensor, rng: RngKey, design: Design, *, is_training: bool) -> CircuitState:
     """Return the initial states of the episodes with these numbers, int32 `[N]`: a circuit without gates.
 
-    In training it is one of the design's `beginnings`, if there are any.
+    In training it is one of the design's `beginnings` or a circuit `near_target`, if the design says so.
     """
     num = len(episode)
     none, nothing = torch.zeros_like(episode), torch.zeros_like(episode, dtype=torch.float32)
+    drawn = random_target(rng, design.task) if design.target is None else design.target.to(episode.device)
+    target = drawn.to(torch.complex64).expand(num, -1, -1)
     if is_training and design.beginnings is not None:
         circuits, depths = (table.to(episode.device) for table in design.beginnings)
-        number = (counter_rng.uniform(rng, 0) * len(circuits)).long().clamp(max=len(circuits) - 1)
+        number = _below(counter_rng.uniform(rng, 0), len(circuits))
         begun, levels = circuits[number], [*depths[number].unbind(-1)]
         cost = depth_cost(depths[number].amax(-1), design.task.depth)
     else:
         begun, levels, cost = without_gates(design, episode.device).expand(num, -1, -1), [none] * design.task.n, nothing
-    drawn = random_target(rng, design.task) if design.target is None else design.target.to(episode.device)
-    target = drawn.to(torch.complex64).expand(num, -1, -1)
+        if is_training and design.begin_gates > 0:
+            begun = near_target(target, rng, design)
     return design.state_type(
         *_entries(begun),
         *_entries(target),
@@ -214,6 +221,36 @@ def start(episode: Tensor, rng: RngKey, design: Design, *, is_training: bool) ->
         none,
         episode,
     )
+
+
+def near_target(target: Tensor, rng: RngKey, design: Design) -> Tensor:
+    """Return circuits that as many gates turn into their targets `[N, R, C]` as were drawn, complex64 `[N, R, C]`.
+
+    They are the targets after 0 to `begin_gates` random gates with random angles: each of these gates is undone by
+    itself with the opposite angle. If none is drawn, the circuit has no gates.
+    """
+    most, num_gates = design.begin_gates, len(design.gate_sets[0]) - 1
+    number = _below(counter_rng.uniform(rng, NEAR_TARGET), most + 1)
+    begun = torch.where((number == 0)[:, None, None], without_gates(design, target.device), target)
+    for i in range(most):
+        gate = _below(counter_rng.uniform(rng, NEAR_TARGET + 1 + 2 * i), num_gates)
+        angle = (counter_rng.uniform(rng, NEAR_TARGET + 2 + 2 * i) * 2.0 - 1.0) * math.pi
+        begun = torch.where((number > i)[:, None, None], _with_gate(begun, gate, angle, design)[0], begun)
+    return begun
+
+
+def _below(uniform: Tensor, num: int) -> Tensor:
+    """Return whole numbers from 0 to `num - 1` for uniform ones in (0, 1), int64."""
+    return (uniform * num).long().clamp(max=num - 1)
+
+
+def _with_gate(made: Tensor, number: Tensor, angle: Tensor, design: Design) -> tuple[Tensor, Tensor]:
+    """Return circuits `[N, R, C]` after the gates with these numbers in `Design.tables`, and the angles used, `[N]`."""
+    matrices, factors, angles, _, _ = (table.to(angle.device) for table in design.tables)
+    used = torch.where(angles[number].isnan(), angle, angles[number])
+    turn = (factors[number] * used)[:, None, None]
+    fixed, of_cosine, of_sine = matrices[number].unbind(1)
+    return (fixed + turn.cos() * of_cosine + turn.sin() * of_sine) @ made, used
 
 
 def without_gates(design: Design, device: torch.device) -> Tensor:
@@ -263,14 +300,11 @@ def act(
         angle: angle of the gate in [-pi, pi], `[N]`; ignored if the gate has none.
         design: settings of the circuits.
     """
-    matrices, factors, angles, wires, costs = (table.to(angle.device) for table in design.tables)
+    _, _, _, wires, costs = (table.to(angle.device) for table in design.tables)
     chosen = state.gate_set if option is None else torch.where(state.steps == 0, option.int(), state.gate_set)
     number = chosen.long() * len(design.gate_sets[0]) + discrete
-    used = torch.where(angles[number].isnan(), angle, angles[number])
-    turn = (factors[number] * used)[:, None, None]
-    fixed, of_cosine, of_sine = matrices[number].unbind(1)
     made, target = circuit_and_target(state, design)
-    made = (fixed + turn.cos() * of_cosine + turn.sin() * of_sine) @ made
+    made, used = _with_gate(made, number, angle, design)
     # A gate stands one level above the highest gate on its wires.
     is_taken = wires[number]
     levels = torch.stack([state._asdict()[name] for name in _level_names(design)], -1)
