@@ -480,6 +480,7 @@ def test_the_oracle_with_the_planner_reaches_the_ceiling_and_always_chooses_righ
         ({"reward": "gain", "floor": 1.0}, "floor=1.0: must be less than 1"),
         ({"ion_costs": [0.0, 0.1]}, r"ion_costs=\[0.0, 0.1\]: must lie between 0.001 and 1, and the second"),
         ({"task": "random_unitary", "oracle": True}, "task=random_unitary: nobody knows its best circuits"),
+        ({"task": "bell", "begin": "near_target", "oracle": True}, "begin=near_target: nobody knows the best circuits"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused_in_one_line(settings, words):

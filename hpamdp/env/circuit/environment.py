@@ -203,6 +203,8 @@ class CircuitEnv(BatchedEnv[CircuitState]):
         self.parameter_dims = tuple(int(any(gate.angle is None for gate in same)) for same in of_each)
         if self._has_oracle and not options.has_known_circuits:
             raise SettingError(f"task={options.task}: nobody knows its best circuits with the published gates")
+        if self._has_oracle and options.begin == "near_target":
+            raise SettingError("begin=near_target: nobody knows the best circuits from there; use begin=known or empty")
         self._oracle = (
             CircuitOracle(self.num_envs, self.design, options.task, self.device) if self._has_oracle else None
         )
