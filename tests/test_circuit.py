@@ -304,12 +304,12 @@ def test_training_may_begin_as_many_gates_from_the_target_as_are_said_and_evalua
     n = TASK_OF[task].n
     undone = torch.zeros(len(made), dtype=torch.float64)
     for name in env.discrete_names[:-1]:
-        for angle in np.linspace(-math.pi, math.pi, 181):
+        for angle in np.linspace(-math.pi, math.pi, 61):
             similarity = rules.similarity(
                 torch.from_numpy(gate(name, angle, n).astype(complex)) @ made, target, env.design
             )
             undone = undone.maximum(similarity)
-    assert undone[~is_empty].min() > 0.95  # angles two degrees apart
+    assert undone[~is_empty].min() > 0.9  # angles six degrees apart
     env.seed_evaluation(1)
     env.reset()
     assert torch.equal(rules.circuit_and_target(env.state, env.design)[0], empty.expand_as(made))
