@@ -1055,7 +1055,15 @@ def problems() -> list[Claim]:
         of_task = rows("problems/results.csv", problem=f"circuit {task}", learner="hppo")
         circuits |= {task: mean(of_task), f"{task}_published": bars[f"circuit {task}"][0], "seeds": seeds(of_task)}
     gate_sets = rows("problems/results.csv", problem="circuit random_state, gate_set=choose")
+    near_target = "circuit random_state, one target, begin=near_target"
+    states = rows("problems/results.csv", problem=near_target)
     return [
+        Claim(
+            page("problems"),
+            "On random states it scores {mean:.3f} ({seeds:word} seeds, each with a state of its own; "
+            "published {bar:.2f}).",
+            dict(mean=mean(states), seeds=seeds(states), bar=bars[near_target][0]),
+        ),
         Claim(
             page("problems"),
             "On circuits H-PPO beats the best published score on Hadamard ({hadamard:.3f}, published "
