@@ -322,7 +322,10 @@ def setting_of(word: str) -> str:
 
 def settings_in(word: str) -> list[str]:
     """Return the names of all settings that a word gives: `eval={every:5}` gives `eval` and `eval.every`."""
-    override = OverridesParser.create().parse_override(word)
+    try:
+        override = OverridesParser.create().parse_override(word)
+    except (hydra.errors.HydraException, RecursionError, ValueError):  # reported when the config is composed
+        return [setting_of(word)]
     return _names_in(setting_of(word), None if override.is_sweep_override() else override.value())
 
 
