@@ -224,10 +224,10 @@ def start(episode: Tensor, rng: RngKey, design: Design, *, is_training: bool) ->
 
 
 def near_target(target: Tensor, rng: RngKey, design: Design) -> Tensor:
-    """Return circuits that as many gates turn into their targets `[N, R, C]` as were drawn, complex64 `[N, R, C]`.
+    """Return circuits near their targets `[N, R, C]`, complex64 `[N, R, C]`.
 
-    They are the targets after 0 to `begin_gates` random gates with random angles: each of these gates is undone by
-    itself with the opposite angle. If none is drawn, the circuit has no gates.
+    A circuit is its target after 0 to `begin_gates` random gates with random angles. The same gates with the opposite
+    angles, the last one first, make the target again. If no gate is drawn, the circuit begins without gates.
     """
     most, num_gates = design.begin_gates, len(design.gate_sets[0]) - 1
     number = _below(counter_rng.uniform(rng, NEAR_TARGET), most + 1)
