@@ -723,7 +723,8 @@ def learners_on_domains() -> list[Claim]:
         hard_bars={num: published[f"hard_move_{num}"] for num in hard_moves},
         patd3_hard_move=of_patd3("hard_move_4"),
         patd3_catch=of_patd3("catch_point"),
-        patd3_good=sum(row["score"] >= 0.9995 for row in patd3),
+        patd3_mean=mean(patd3),
+        paddpg=mean(results["platform", "paddpg"]),
         patd3_seeds=seeds(patd3),
         patd3_worst=min(column(patd3, "score")),
         mpdqn=mean(results["platform", "mpdqn_published"]),
@@ -759,10 +760,9 @@ def learners_on_domains() -> list[Claim]:
         ),
         Claim(
             "docs/learners/paddpg.md",
-            "On Platform PATD3 returns 1.000 with {patd3_good:word} of {patd3_seeds:word} seeds, and {patd3_worst:.3f} "
-            "with the other.",
+            "On Platform PATD3 returns {patd3_mean:.3f} in the mean of {patd3_seeds:word} new seeds, and "
+            "{patd3_worst:.3f} with the worst; PADDPG, with one critic, {paddpg:.3f}.",
             numbers,
-            holds=sum(row["score"] >= 0.9995 for row in patd3) == len(patd3) - 1,
         ),
         Claim(
             "docs/learners/pdqn.md",
