@@ -103,7 +103,8 @@ def check_effects(mode: str, words: Sequence[str]) -> None:
         ConfigError: there is such a word.
     """
     for word in words:
-        if any(_sets(word, each) for each in _WITHOUT_EFFECT[mode]):
+        given = settings_in(word)
+        if any(each == name or each.startswith(f"{name}.") for each in given for name in _WITHOUT_EFFECT[mode]):
             raise ConfigError(f"{word}: has no effect {_WHERE[mode]}; leave it out")
 
 
@@ -129,18 +130,13 @@ def _conditions(config: Config, name: str) -> list[OnlyWith]:
     group, _, setting = name.partition(".")
     component: Component | None = getattr(config, group) if group in GROUPS else None
     if setting.startswith("per_option."):
-        _, option, setting = [*setting.split(".", 2), ""][:3]
+        option, _, setting = setting.removeprefix("per_option.").partition(".")
         component = config.low_of.get(option)
     if component is None or component.cls is None or not takes_settings_model(component.cls):
         return []
     field = settings_model(component.cls).model_fields.get(setting)
     conditions = () if field is None else field.metadata
     return [each for each in conditions if isinstance(each, OnlyWith) and not each.holds(component.settings)]
-
-
-def _sets(word: str, name: str) -> bool:
-    """Return whether a word of a command line sets something, as in `eval.every=5` and `eval={every:5}`."""
-    return any(each == name or each.startswith(f"{name}.") for each in settings_in(word))
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:
