@@ -61,6 +61,8 @@ PROBLEMS = {
         {
             "map": st.sampled_from(["simple", "hard"]),
             "start": st.sampled_from(["map", "anywhere"]),
+            "training_start": st.sampled_from([None, "map", "anywhere"]),
+            "spread_episodes": st.sampled_from([0, 3]),
             "max_steps": st.sampled_from([3, 600]),
         },
         1e-4,
@@ -142,7 +144,9 @@ def test_a_kernel_does_what_the_rules_say_with_all_settings(name, data, seed, is
 def test_the_comparison_meets_every_outcome_but_the_rarest(name):
     problem, _, tolerance = PROBLEMS[name]
     outcomes, num_different = play(problem(2000, seed=1, max_steps=4), 12, tolerance)
-    assert len(outcomes) >= len(problem.outcomes) - 1
+    # Random gates seldom match, and a circuit that reaches the limit of steps is finished.
+    num_unmet = 2 if name == "circuit" else 1
+    assert len(outcomes) >= len(problem.outcomes) - num_unmet
     assert num_different <= 12
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -264,6 +265,34 @@ def test_training_may_begin_within_the_known_circuit_and_evaluation_begins_witho
     assert {*distance.argmin(-1).tolist()} == {*range(len(circuit))}
     env.seed_evaluation(1)
     assert torch.allclose(env.reset()[keys.OBSERVATION][:, : table.shape[1]], table[0])
+
+
+def test_training_begins_with_one_gate_less_of_the_known_circuit_after_as_many_episodes_as_are_said():
+    env = CircuitEnv(2000, task="ghz", begin="known", begin_episodes=2)
+    assert compare_with_rules(CircuitEnv(100, task="ghz", begin="known", begin_episodes=2), 12, 1e-5)[1] == 0
+    circuits = env.design.beginnings[0]
+    for episode in range(9):
+        env.reset()
+        begun = rules.circuit_and_target(env.state, env.design)[0]
+        number = (begun.unsqueeze(1) - circuits).abs().sum((-2, -1)).argmin(-1)
+        most = min(4, 1 + episode // 2)
+        expected = torch.full((4,), 0.25 / 4)  # a quarter of the circuits lack any number of gates
+        expected[4 - most :] += 0.75 / most
+        torch.testing.assert_close(number.bincount(minlength=4) / 2000, expected, atol=0.04, rtol=0.0)
+
+
+@pytest.mark.parametrize("reward", get_args(rules.RewardName))
+def test_a_circuit_of_as_many_gates_as_are_allowed_is_finished_and_has_its_score(reward):
+    env = CircuitEnv(50, task="bell", reward=reward, max_steps=2)
+    player = random_player(1)
+    reading, total = env.reset(), torch.zeros(50)
+    while not reading[keys.DONE].all():
+        reading = env.step(player(env))["next"]
+        total += reading[keys.REWARD].squeeze(-1)
+    assert reading[keys.TERMINATED].all() and not reading[keys.TRUNCATED].any()
+    score = env.results(reading)["score"]
+    expected = {"final": score, "progress": score - 0.5, "gain": (score - 0.5).clamp(min=0.0)}[reward]
+    assert torch.allclose(total, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("task", oracle.CIRCUITS)

@@ -13,7 +13,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from hpamdp import keys
 from hpamdp.geometry import PlaneGeometry
 from hpamdp.policies.low_level.hppo import HPPO, RAW
-from hpamdp.policies.shared.on_policy import generalised_advantages
+from hpamdp.policies.shared.on_policy import generalised_advantages, normalised
 from hpamdp.specs import PAMDPSpecs
 
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
@@ -203,6 +203,21 @@ def test_rewards_are_learned_from_after_scaling():
     mask = torch.ones(3, 6, dtype=torch.bool)
     for one, other in zip(plain.advantages(td, mask), scaled.advantages(large, mask), strict=True):
         torch.testing.assert_close(one, other)
+
+
+def test_advantages_smaller_than_the_least_are_not_blown_up():
+    advantage = torch.tensor([0.0, 0.01, 0.02, 0.03])
+    torch.testing.assert_close(normalised(advantage, least=0.5), (advantage - 0.015) / 0.5)
+    torch.testing.assert_close(normalised(100.0 * advantage, least=0.5), normalised(100.0 * advantage))
+    moved = []
+    for least in (0.0, 1e9):
+        learner = make(least_advantage=least, discrete_entropy=0.0)
+        rows = one_step_rows(learner, 256)
+        before = torch.cat([parameter.detach().flatten().clone() for parameter in learner.actor.parameters()])
+        learner.learn(rows, torch.ones(256, 1, dtype=torch.bool))
+        after = torch.cat([parameter.detach().flatten() for parameter in learner.actor.parameters()])
+        moved.append((after - before).abs().max().item())
+    assert moved[0] > 1e-3 and moved[1] < 1e-5
 
 
 def test_rows_of_other_learners_change_nothing():

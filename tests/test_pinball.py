@@ -81,6 +81,41 @@ def test_episodes_that_begin_anywhere_begin_at_rest_between_the_walls_and_outsid
     assert torch.equal(again.state.x, state.x) and torch.equal(again.state.y, state.y)
 
 
+@pytest.mark.parametrize("has_kernel", [True, False])
+def test_training_may_begin_anywhere_while_evaluation_begins_at_the_start_of_the_map(has_kernel):
+    env = PinballEnv(100, training_start="anywhere")
+    if not has_kernel:
+        env.leave_kernel()
+    everywhere = PinballEnv(100, start="anywhere")
+    for env_seen in (env, everywhere):
+        env_seen.reset()
+    assert torch.equal(env.state.x, everywhere.state.x) and torch.equal(env.state.y, everywhere.state.y)
+    env.seed_evaluation(3)
+    expected = torch.tensor([2.0 * each - 1.0 for each in env.map.start])
+    torch.testing.assert_close(env.reset()[keys.OBSERVATION][:, :2], expected.expand(100, -1))
+    assert env.references({}) != {}
+
+
+def test_the_starts_of_training_spread_from_the_hole_over_the_map_in_as_many_episodes_as_are_said():
+    env = PinballEnv(2000, map="hard", training_start="anywhere", spread_episodes=4)
+    everywhere = {*map(tuple, env.map.free_places(100).astype(np.float32).tolist())}
+    seen, farthest = [], []
+    for _ in range(5):
+        env.reset()
+        places = env.position
+        seen.append({*map(tuple, places.tolist())})
+        farthest.append((places - torch.tensor(env.map.target[:2])).norm(dim=-1).max().item())
+    shares = [len(each) / len(everywhere) for each in seen]
+    assert shares[0] < 0.25 < shares[2] and farthest[0] < 0.6 < farthest[3]
+    assert set.union(*seen) <= everywhere
+    # Cells on the other side of a wall are near, but their ways are long: the nearest quarter is no disc.
+    disc = sorted(everywhere, key=lambda place: np.hypot(*np.subtract(place, env.map.target[:2])))
+    assert not seen[0] <= {*disc[: len(everywhere) // 4]}
+    env.seed_evaluation(0)
+    env.reset()
+    assert len(env.position.unique(dim=0)) == 1
+
+
 @each_map
 def test_the_hand_written_player_reaches_the_hole_with_the_return_of_the_references(name):
     env = PinballEnv(1, map=name)
@@ -205,7 +240,9 @@ def test_a_map_without_room_for_the_ball_beside_its_start_is_refused_with_starts
     polygons = [[[left, low], [left, high], [right, high], [right, low]] for left, right, low, high in walls]
     narrow = {"ball": 0.243, "start": [0.5, 0.5], "target": [0.9, 0.9, 0.04], "polygons": polygons}
     assert (PinballEnv(2, map=written(tmp_path, narrow)).reset()[keys.OBSERVATION] == 0.0).all()
-    with pytest.raises(SettingError, match=r"^map='.*': the ball lies free at no place of a grid of .*; use start=map"):
+    with pytest.raises(
+        SettingError, match=r"^map='.*': the ball lies free at no place of a grid of .*; begin at the map's start"
+    ):
         PinballEnv(2, map=written(tmp_path, narrow), start="anywhere")
 
 

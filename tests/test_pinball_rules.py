@@ -81,7 +81,8 @@ def columns(rows: object, dtype: torch.dtype = torch.float64) -> PinballState:
 
 def table_of(name: str) -> rules.Table:
     found = maps.read(name)
-    return rules.make_table(found, np.array([found.start]), dtype=torch.float64)
+    start = np.array([found.start])
+    return rules.make_table(found, (start, start), dtype=torch.float64)
 
 
 def random_rows(name: str, num: int, seed: int) -> torch.Tensor:

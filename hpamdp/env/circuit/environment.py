@@ -87,12 +87,17 @@ class CircuitOptions(Settings):
     `known`: with the first gates of the circuit that makes the fixed target, from none of them to all but one.
     `near_target`: with the target after a few random gates, which the agent has to undo.
     """
+    begin_episodes: Annotated[NonNegativeInt, OnlyWith("begin", "known")] = 0
+    """Episodes of an environment after which training circuits may lack one gate more; at first they lack the last one.
+
+    A quarter of them may lack any number of gates at any time. If 0, all may.
+    """
     begin_gates: Annotated[int, Field(ge=1, le=100), OnlyWith("begin", "near_target")] = 6
     """The most random gates. Their number is uniform between 0, which begins without gates, and this one."""
     observe_depth: bool = False
     """Whether the observation ends in the depth of each wire, as a fraction of the limit."""
     max_steps: PositiveInt | None = None
-    """Steps after which an episode is truncated. If None, 2 n times the limit of depth, which no circuit reaches."""
+    """Actions after which a circuit is finished. If None, 2 n times the limit of depth, which no circuit reaches."""
 
     @property
     def has_known_circuits(self) -> bool:
@@ -139,7 +144,8 @@ class CircuitEnv(BatchedEnv[CircuitState]):
       held until its end.
 
     The score of a circuit is its similarity to the target less the cost of its depth or, in the native sets, of its
-    gates. An episode ends with the stop, or once the circuit has the depth of the task.
+    gates. An episode ends with the stop, once the circuit has the depth of the task, or after `max_steps` actions. So
+    none is truncated.
 
     Only random targets are random. For the constructor's arguments and errors see `BatchedEnv`.
     """
@@ -193,6 +199,7 @@ class CircuitEnv(BatchedEnv[CircuitState]):
             observes_depth=options.observe_depth,
             max_steps=self.max_steps,
             beginnings=beginnings(options.task) if options.begin == "known" else None,
+            begin_episodes=options.begin_episodes if options.begin == "known" else 0,
             begin_gates=options.begin_gates if options.begin == "near_target" else 0,
         )
         depths = [f"depth_{wire}" for wire in range(task.n)] if options.observe_depth else []

@@ -16,7 +16,7 @@ import torch
 from hpamdp.env import kernels
 from hpamdp.env.circuit import gates, rules
 from hpamdp.env.circuit.rules import Design
-from hpamdp.env.kernels import HALF, ONE, OUTCOME_ROW, STEPS_ROW, TWO, ZERO, kernel, part
+from hpamdp.env.kernels import EPISODE_ROW, HALF, ONE, OUTCOME_ROW, STEPS_ROW, TWO, ZERO, kernel, part
 from hpamdp.env.rng_streams import TRAINING
 
 # The problem's own settings: the sizes, what is rewarded and observed, whether targets are random; then the gates of
@@ -24,7 +24,7 @@ from hpamdp.env.rng_streams import TRAINING
 WIRES, DEPTH, COLUMNS, IS_NATIVE, REWARD, OBSERVES_DEPTH, IS_RANDOM, NUM_BEGINNINGS = range(
     kernels.OWN, kernels.OWN + 8
 )
-FLOOR, BEGIN_GATES, NUM_GATES, NUM_SETS, OWN_GATES = range(kernels.OWN + 8, kernels.OWN + 13)
+FLOOR, BEGIN_EPISODES, BEGIN_GATES, NUM_GATES, NUM_SETS, OWN_GATES = range(kernels.OWN + 8, kernels.OWN + 14)
 NUM_OF_GATE = 6
 _KIND, _FLIPPED, _CONTROL, _HAS_ANGLE, _ANGLE, _COST = range(NUM_OF_GATE)
 _GATE_SET_ROW, _GATE_ROW = -5, -4
@@ -46,7 +46,8 @@ def settings_of(design: Design) -> Sequence[float]:
     circuits, depths = design.beginnings or ([], [])
     floor = math.nan if design.floor is None else design.floor
     sets = [len(design.gate_sets[0]), len(design.gate_sets)]
-    numbers: list[float] = [*sizes, *flags, len(circuits), floor, design.begin_gates, *sets]
+    begin = [design.begin_episodes, design.begin_gates]
+    numbers: list[float] = [*sizes, *flags, len(circuits), floor, *begin, *sets]
     for gate in (gate for gate_set in design.gate_sets for gate in gate_set):
         angle = 0.0 if gate.angle is None else gate.angle
         numbers += [gate.kind, gate.flipped, gate.control, gate.angle is None, angle, gate.cost]
@@ -203,7 +204,10 @@ def _start(entries: Any, integers: Any, row: Any, bits: Any, step: Any, settings
             entries[2 * num + place] = settings[first + place]
     depth, num_beginnings = 0, int(settings[NUM_BEGINNINGS])
     if num_beginnings > 0 and settings[kernels.EPISODE_STREAM] == TRAINING:
-        number = _below(kernels.uniform(bits, step, 0), num_beginnings)
+        most, wait = num_beginnings, int(settings[BEGIN_EPISODES])
+        if wait > 0 and kernels.uniform(bits, step, 1) >= _F(rules.ANY_BEGINNING):
+            most = min(most, 1 + integers[EPISODE_ROW, row] // wait)
+        number = num_beginnings - most + _below(kernels.uniform(bits, step, 0), most)
         first += 2 * num + number * (2 * num + num_wires)
         for place in range(2 * num):
             entries[place] = settings[first + place]
@@ -255,14 +259,14 @@ def _act(entries: Any, integers: Any, row: Any, option: Any, action: Any, given:
     else:
         cost = _depth_cost(depth, limit)
     entries[4 * num], entries[4 * num + 1] = similarity, cost
-    has_ended = kind == _STOP or depth >= limit
+    has_ended = kind == _STOP or depth >= limit or steps + 1 >= settings[kernels.MAX_STEPS]
     outcome = rules.BUILDING
     if has_ended:
         outcome = rules.MATCHED if similarity >= _MATCH else rules.MISSED
     score = similarity - cost
     if settings[REWARD] == _PROGRESS:
         return outcome, score - before
-    if not has_ended and steps + 1 < settings[kernels.MAX_STEPS]:
+    if not has_ended:
         return outcome, ZERO
     if settings[REWARD] == _GAIN:
         floor = _F(settings[FLOOR])

@@ -39,6 +39,9 @@ RANDOM_TASKS = ("random_state", "random_unitary")
 OUTCOMES = ("building", "matched", "missed", "time limit")
 BUILDING, MATCHED, MISSED, TIME_LIMIT = range(4)
 MATCH = 0.99  # similarity from which on a finished circuit matches its target
+# Share of training circuits that may lack any number of gates, whatever `begin_episodes` says. Where a policy never is,
+# it takes over what it learns elsewhere, and has no other actions left once it comes there.
+ANY_BEGINNING = 0.25
 NEAR_TARGET = 1000  # first of the random numbers of a circuit that begins near its target; targets take lower ones
 
 
@@ -93,9 +96,11 @@ class Design:
         reward: what is rewarded; see `CircuitOptions`.
         floor: score that `gain` counts from; None for that of no gates.
         observes_depth: whether the depths of the wires are observed.
-        max_steps: steps after which an episode is truncated.
+        max_steps: steps after which a circuit is finished.
         beginnings: circuits that training episodes begin with, and the depths of their wires, complex64 `[B, R, C]`
             and int32 `[B, n]`; None if they begin without gates.
+        begin_episodes: episodes of an environment after which training circuits may lack one gate more; 0 if they may
+            lack any number from the start.
         begin_gates: most random gates after the target that training episodes begin with; 0 if they do not.
     """
 
@@ -108,6 +113,7 @@ class Design:
     observes_depth: bool
     max_steps: int
     beginnings: tuple[Tensor, Tensor] | None = None
+    begin_episodes: int = 0
     begin_gates: int = 0
 
     @property
@@ -201,7 +207,7 @@ def start(episode: Tensor, rng: RngKey, design: Design, *, is_training: bool) ->
     target = drawn.to(torch.complex64).expand(num, -1, -1)
     if is_training and design.beginnings is not None:
         circuits, depths = (table.to(episode.device) for table in design.beginnings)
-        number = _below(counter_rng.uniform(rng, 0), len(circuits))
+        number = _beginning(episode, rng, design)
         begun, levels = circuits[number], [*depths[number].unbind(-1)]
         cost = depth_cost(depths[number].amax(-1), design.task.depth)
     else:
@@ -223,6 +229,20 @@ def start(episode: Tensor, rng: RngKey, design: Design, *, is_training: bool) ->
     )
 
 
+def _beginning(episode: Tensor, rng: RngKey, design: Design) -> Tensor:
+    """Return numbers of `Design.beginnings` for episodes with these numbers `[N]`, int64 `[N]`.
+
+    The later ones lack fewer gates. With `begin_episodes` those that lack more come later in training.
+    """
+    assert design.beginnings is not None
+    num, wait = len(design.beginnings[0]), design.begin_episodes
+    most = torch.full_like(episode, num)
+    if wait > 0:
+        is_any = counter_rng.uniform(rng, 1) < ANY_BEGINNING
+        most = torch.where(is_any, most, (1 + episode.clamp(min=0) // wait).clamp(max=num))
+    return num - most + _below(counter_rng.uniform(rng, 0), most)
+
+
 def near_target(target: Tensor, rng: RngKey, design: Design) -> Tensor:
     """Return circuits near their targets `[N, R, C]`, complex64 `[N, R, C]`.
 
@@ -239,8 +259,8 @@ def near_target(target: Tensor, rng: RngKey, design: Design) -> Tensor:
     return begun
 
 
-def _below(uniform: Tensor, num: int) -> Tensor:
-    """Return whole numbers from 0 to `num - 1` for uniform ones in (0, 1), int64."""
+def _below(uniform: Tensor, num: int | Tensor) -> Tensor:
+    """Return whole numbers from 0 to `num - 1` for uniform ones in (0, 1), int64 `[N]`."""
     return (uniform * num).long().clamp(max=num - 1)
 
 
@@ -315,18 +335,17 @@ def act(
     similar = similarity(made, target, design)
     cost = state.cost + costs[number] if design.is_native else depth_cost(depth, design.task.depth)
     is_stop = discrete == len(design.gate_sets[0]) - 1
-    has_ended = is_stop | (depth >= design.task.depth)
+    has_ended = is_stop | (depth >= design.task.depth) | (state.steps + 1 >= design.max_steps)
     outcome = torch.where(similar >= MATCH, MATCHED, MISSED)
-    is_last = has_ended | (state.steps + 1 >= design.max_steps)
     score = similar - cost
     if design.reward == "progress":
         reward = score - (state.similarity - state.cost)
     elif design.reward == "gain":
         nothing = similarity(without_gates(design, target.device), target, design)
         floor = nothing if design.floor is None else design.floor
-        reward = torch.where(is_last, (score - floor).clamp(min=0.0), 0.0)
+        reward = torch.where(has_ended, (score - floor).clamp(min=0.0), 0.0)
     else:
-        reward = torch.where(is_last, score, 0.0)
+        reward = torch.where(has_ended, score, 0.0)
     after = replaced(
         state,
         **dict(zip(design.entry_names, _entries(made), strict=False)),

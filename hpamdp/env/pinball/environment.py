@@ -10,16 +10,17 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from pydantic import Field, PositiveInt
+from pydantic import Field, NonNegativeInt, PositiveInt
 from torch import Tensor
 
+from hpamdp.env import counter_rng
 from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.pinball import kernel, maps, rendering, rules
 from hpamdp.env.pinball.planner import Planner
 from hpamdp.env.pinball.rules import PinballState
-from hpamdp.settings import SettingError, Settings
+from hpamdp.settings import OnlyWith, SettingError, Settings
 
 _GRID = 100  # places in a row from which a ball may start anywhere
 _SCRIPTED = {"simple": 9_837.0, "hard": 9_404.0}  # returns of the hand-written player from the start of the map
@@ -32,6 +33,13 @@ class PinballOptions(Settings):
     """A map of the source, `simple` or `hard`, or the path of a JSON file with a map of one's own."""
     start: Literal["map", "anywhere"] = "map"
     """Where episodes begin: at the start of the `map`, or `anywhere` between the walls. The ball is at rest."""
+    training_start: Literal["map", "anywhere"] | None = None
+    """Where the episodes of training begin. If None, where those of evaluation do, see `start`."""
+    spread_episodes: Annotated[NonNegativeInt, OnlyWith("training_start", "anywhere")] = 0
+    """Episodes of an environment in which the starts of training spread from the hole, along the ways, over the map.
+
+    If 0, they are spread over the map from the beginning.
+    """
     max_steps: PositiveInt = 600
     """Steps after which an episode is truncated."""
 
@@ -47,7 +55,7 @@ class PinballEnv(BatchedEnv[PinballState]):
     A push costs 5 and none costs 1. The step in which the ball reaches the hole has the reward 10,000 instead, and ends
     the episode.
 
-    Nothing is random, except the start with `start=anywhere`. For the constructor's arguments and errors see
+    Nothing is random, except starts that are `anywhere`. For the constructor's arguments and errors see
     `BatchedEnv`.
     """
 
@@ -71,20 +79,23 @@ class PinballEnv(BatchedEnv[PinballState]):
         return ProblemFacts(title=cls.__name__, default_options=groups, has_oracle=True)
 
     def _prepare(self) -> None:
+        self._spread = self.options.spread_episodes if self.options.training_start == "anywhere" else 0
         try:
             self.map = maps.read(self.options.map)
-            is_fixed = self.options.start == "map"
-            self._places = np.array([self.map.start], np.float64) if is_fixed else self.map.free_places(_GRID)
-            if not len(self._places):
-                raise maps.MapError(f"the ball lies free at no place of a grid of {_GRID} x {_GRID}; use start=map")
-            self._planner = Planner(self.map, self.device) if self._has_oracle else None
+            self._places = _places(self.map, self.options.start)
+            self._training_places = _places(self.map, self.options.training_start or self.options.start)
+            self._planner = Planner(self.map, self.device) if self._has_oracle or self._spread else None
+            if self._spread:
+                assert self._planner is not None
+                self._training_places = self._planner.nearest_first(self._training_places)
         except maps.MapError as error:
             raise SettingError(f"map={self.options.map!r}: {error}") from error
-        self._table = rules.make_table(self.map, self._places, self.device)
+        places = self._training_places, self._places
+        self._table = rules.make_table(self.map, places, self._spread, self.device)
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the map in numbers."""
-        return kernel.settings_of(self.map, self._places)
+        return kernel.settings_of(self.map, (self._training_places, self._places), self._spread)
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
@@ -98,7 +109,7 @@ class PinballEnv(BatchedEnv[PinballState]):
 
     def start(self, episode: Tensor, rng: RngKey) -> PinballState:
         """Return states with the balls at rest where episodes begin."""
-        return rules.start(episode, rng, self._table)
+        return rules.start(episode, rng, self._table, is_training=self._streams[0] == counter_rng.TRAINING)
 
     def act(self, state: PinballState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[PinballState, Tensor]:
         """Return the states after one step and the rewards `[N]`."""
@@ -122,3 +133,13 @@ class PinballEnv(BatchedEnv[PinballState]):
     def draw(self, track: Sequence[PinballState]) -> np.ndarray:
         """Return a picture of the table and the way of the ball, uint8 `[480, 480, 3]`."""
         return rendering.draw(track, self.map)
+
+
+def _places(found: maps.PinballMap, start: str) -> np.ndarray:
+    """Return where episodes begin, `[S, 2]`, for a value of the setting `start`."""
+    if start == "map":
+        return np.array([found.start], np.float64)
+    places = found.free_places(_GRID)
+    if not len(places):
+        raise maps.MapError(f"the ball lies free at no place of a grid of {_GRID} x {_GRID}; begin at the map's start")
+    return places

@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 
 from hpamdp.env import kernels
-from hpamdp.env.kernels import ONE, OUTCOME_ROW, TWO, ZERO, kernel, part
+from hpamdp.env.kernels import EPISODE_ROW, ONE, OUTCOME_ROW, TWO, ZERO, kernel, part
 from hpamdp.env.pinball import rules
 from hpamdp.env.pinball.maps import PinballMap
+from hpamdp.env.rng_streams import TRAINING
 
-# The problem's own settings: the map. After these numbers follow the polygons, the edges and the places to start.
-BALL, TARGET_X, TARGET_Y, TARGET_RADIUS, NUM_POLYGONS, NUM_EDGES, NUM_PLACES = range(kernels.OWN, kernels.OWN + 7)
-_FIRST = kernels.OWN + 7
+# The problem's own settings: the map. After these numbers follow the polygons, the edges, and the places to start:
+# those of training, then those of evaluation.
+BALL, TARGET_X, TARGET_Y, TARGET_RADIUS, NUM_POLYGONS, NUM_EDGES, NUM_TRAINING, NUM_PLACES, SPREAD = range(
+    kernels.OWN, kernels.OWN + 9
+)
+_FIRST = kernels.OWN + 9
 
 _X, _Y, _VX, _VY = range(4)
 # Columns of a polygon: its edges, and the box around it.
@@ -32,8 +36,8 @@ _MOVES = _F((rules.TICKS + 1.0) / rules.TICKS)  # of a step, with that after a t
 _SLACK = _F(1e-4)  # for rounding
 
 
-def settings_of(found: PinballMap, places: np.ndarray) -> list[float]:
-    """Return a map and the places `[S, 2]` to start as the kernel's own settings."""
+def settings_of(found: PinballMap, places: tuple[np.ndarray, np.ndarray], spread: int) -> list[float]:
+    """Return a map, the places to start and their spread as the kernel's own settings; see `rules.Table`."""
     edges = found.edges()
     polygons, begin = [], 0
     for polygon in found.polygons:
@@ -46,10 +50,12 @@ def settings_of(found: PinballMap, places: np.ndarray) -> list[float]:
         *found.target,
         len(polygons),
         begin,
-        len(places),
+        len(places[0]),
+        len(places[1]),
+        spread,
         *np.array(polygons, np.float64).ravel().tolist(),
         *np.stack(columns, -1).ravel().tolist(),
-        *places.ravel().tolist(),
+        *np.concatenate(places).ravel().tolist(),
     ]
 
 
@@ -129,9 +135,9 @@ def _roll(floats: Any, row: Any, settings: Any, polygons: Any, edges: Any, near:
 
 
 @part
-def _start(floats: Any, row: Any, places: Any, bits: Any, step: Any) -> None:
-    """Put a ball where an episode begins: `rules.start`."""
-    place = min(int(kernels.uniform(bits, step, 0) * _F(len(places))), len(places) - 1)
+def _start(floats: Any, row: Any, places: Any, num: Any, bits: Any, step: Any) -> None:
+    """Put a ball where an episode begins, one of the first places: `rules.start`."""
+    place = min(int(kernels.uniform(bits, step, 0) * _F(num)), num - 1)
     floats[_X, row], floats[_Y, row] = _F(places[place, 0]), _F(places[place, 1])
     floats[_VX, row], floats[_VY, row] = ZERO, ZERO
 
@@ -162,7 +168,12 @@ def advance(
     end_edges = end_polygons + 6 * int(settings[NUM_EDGES])
     polygons = settings[_FIRST:end_polygons].astype(np.float32).reshape((-1, 6))
     edges = settings[end_polygons:end_edges].astype(np.float32).reshape((-1, 6))
-    starts = settings[end_edges : end_edges + 2 * int(settings[NUM_PLACES])].reshape((-1, 2))
+    end_training = end_edges + 2 * int(settings[NUM_TRAINING])
+    begin, end = end_training, end_training + 2 * int(settings[NUM_PLACES])
+    spread = 0
+    if settings[kernels.EPISODE_STREAM] == TRAINING:
+        begin, end, spread = end_edges, end_training, int(settings[SPREAD])
+    starts = settings[begin:end].reshape((-1, 2))
     near = np.empty(len(edges), np.int64)
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.ROLLING
@@ -180,7 +191,10 @@ def advance(
         for reading in range(len(observations)):
             if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
                 bits, step = kernels.new_episode(integers, row, settings)
-                _start(floats, row, starts, bits, step)
+                num = len(starts)
+                if spread > 0:
+                    num = max(1, num * min(1 + integers[EPISODE_ROW, row], spread) // spread)
+                _start(floats, row, starts, num, bits, step)
             observations[reading, row, 0] = TWO * floats[_X, row] - ONE
             observations[reading, row, 1] = TWO * floats[_Y, row] - ONE
             observations[reading, row, 2] = floats[_VX, row] / _MAX_SPEED

@@ -61,7 +61,8 @@ class Table(NamedTuple):
     Attributes:
         ball: radius of the ball.
         target: x, y and radius of the hole.
-        places: where a ball may start, `[S, 2]`.
+        places: where a ball may start in training, `[T, 2]`, and in evaluation, `[S, 2]`.
+        spread: episodes until all places of training are in use; before that the first ones are. If 0, all are at once.
         corner_x, corner_y: where each edge begins, `[E]`.
         side_x, side_y: from there to its end, `[E]`.
         squared: squared lengths of the edges, `[E]`.
@@ -70,7 +71,8 @@ class Table(NamedTuple):
 
     ball: float
     target: tuple[float, float, float]
-    places: Tensor
+    places: tuple[Tensor, Tensor]
+    spread: int
     corner_x: Tensor
     corner_y: Tensor
     side_x: Tensor
@@ -79,8 +81,14 @@ class Table(NamedTuple):
     belongs: Tensor
 
 
-def make_table(found: PinballMap, places: np.ndarray, device: Any = None, dtype: torch.dtype = torch.float32) -> Table:
-    """Return a map as tensors, with the places `[S, 2]` where a ball may start."""
+def make_table(
+    found: PinballMap,
+    places: tuple[np.ndarray, np.ndarray],
+    spread: int = 0,
+    device: Any = None,
+    dtype: torch.dtype = torch.float32,
+) -> Table:
+    """Return a map as tensors, with the places where a ball may start; see `Table`."""
     edges = found.edges()
 
     def tensor(array: np.ndarray) -> Tensor:
@@ -89,7 +97,8 @@ def make_table(found: PinballMap, places: np.ndarray, device: Any = None, dtype:
     return Table(
         ball=found.ball,
         target=found.target,
-        places=tensor(places),
+        places=(tensor(places[0]), tensor(places[1])),
+        spread=spread,
         corner_x=tensor(edges.corner[:, 0]),
         corner_y=tensor(edges.corner[:, 1]),
         side_x=tensor(edges.side[:, 0]),
@@ -99,11 +108,14 @@ def make_table(found: PinballMap, places: np.ndarray, device: Any = None, dtype:
     )
 
 
-def start(episode: Tensor, rng: RngKey, table: Table) -> PinballState:
+def start(episode: Tensor, rng: RngKey, table: Table, *, is_training: bool) -> PinballState:
     """Return the initial states of the episodes with these numbers, int32 `[N]`: at rest in one of the places."""
-    num = len(table.places)
-    place = (counter_rng.uniform(rng, 0) * num).long().clamp(max=num - 1)
-    x, y = table.places[place].unbind(-1)
+    places = table.places[0 if is_training else 1]
+    num = torch.full_like(episode, len(places), dtype=torch.long)
+    if is_training and table.spread > 0:
+        num = (num * (1 + episode).clamp(max=table.spread) // table.spread).clamp(min=1)
+    place = (counter_rng.uniform(rng, 0) * num).long().minimum(num - 1)
+    x, y = places[place].unbind(-1)
     nothing = torch.zeros_like(episode)
     return PinballState(x, y, torch.zeros_like(x), torch.zeros_like(y), nothing, nothing + ROLLING, episode)
 

@@ -162,15 +162,16 @@ def generalised_advantages(
     return advantage, advantage + value
 
 
-def normalised(advantage: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Return advantages `[M]` or `[M, components]` with mean 0 and standard deviation 1.
+def normalised(advantage: Tensor, weight: Tensor | None = None, *, least: float = 0.0) -> Tensor:
+    """Return advantages `[M]` or `[M, components]` with mean 0 and standard deviation 1, or less.
 
     Args:
         advantage: the advantages.
         weight: 1 for the rows whose mean and deviation count, else 0, `[M]`. If None, all rows count.
+        least: a smaller standard deviation counts as this one.
     """
     counted = advantage if weight is None or not weight.any() else advantage[weight > 0.0]
-    return (advantage - counted.mean()) / (counted.std(correction=0) + 1e-6)
+    return (advantage - counted.mean()) / (counted.std(correction=0) + 1e-6).clamp(min=least)
 
 
 def mean_scalars(steps: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
