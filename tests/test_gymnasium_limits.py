@@ -15,7 +15,9 @@ from toy_environments import OldToy, Toy
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.env.gymnasium.time_limit import limit_of
 from hpamdp.run.train import run
+from hpamdp.settings import SettingError
 
 WORDS = ["env=gymnasium", "env.entry_point=test_gymnasium_limits:Leaving", "env.max_steps=3", "high=none", "low=random"]
 WORDS += ["num_envs=2", "steps_per_batch=4", "total_frames=64", "eval.layouts=2"]
@@ -42,6 +44,16 @@ def wrapped(*limits: int) -> gymnasium.Env:
     for limit in limits:
         env = gymnasium.wrappers.OrderEnforcing(gymnasium.wrappers.TimeLimit(env, limit))
     return env
+
+
+@pytest.mark.parametrize("env_id", sorted(each for each in gymnasium.registry if each.startswith("hpamdp/")))
+def test_each_problem_with_an_id_has_a_time_limit_as_a_gymnasium_environment(env_id):
+    try:
+        env = gymnasium.make(env_id)
+    except SettingError as error:
+        pytest.skip(str(error))
+    limit = limit_of(env, None)
+    assert limit > 4 and limit_of(env, 4) == 4
 
 
 class Leaving(Toy):

@@ -50,6 +50,7 @@ class BatchedEnvAdapter(GymnasiumAdapter):
         env = _load(problem)(1, **settings)
         super().__init__(NumpyBatchedEnv(env, ()), render_mode)
         self._env = env
+        self.own_time_limit = env.max_steps
 
     def _draw(self) -> np.ndarray:
         return self._env.draw(self._track)

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from hpamdp.env.boatdock import task
 from hpamdp.env.boatdock.numpy_boats import ActionFormat, NumpyBoats
 from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.gymnasium_adapter import GymnasiumAdapter, GymnasiumVectorAdapter
@@ -48,6 +49,7 @@ class BoatDock(GymnasiumAdapter):
         rules = BoatDockOptions.of(options, settings).rules
         super().__init__(NumpyBoats(rules, (), action_format), render_mode)
         self._rules = rules
+        self.own_time_limit = task.MAX_PRESSES
 
     def _draw(self) -> np.ndarray:
         from hpamdp.env.boatdock import rendering  # it brings torch along

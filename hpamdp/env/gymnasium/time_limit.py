@@ -15,13 +15,17 @@ def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
     """Return the number of steps after which an episode of the environment is truncated.
 
     Args:
-        env: its own limit is the lowest one of its TimeLimit wrappers. Without such a wrapper, its spec has the limit.
+        env: its own limit is the lowest one of its TimeLimit wrappers, or of one of this package's problems. Without
+            any, its spec has the limit.
         max_steps: the limit to apply. If None, the environment's own.
 
     Raises:
         ValueError: the environment has no valid limit of its own, and none is given.
     """
     limits = _applied_limits(env)
+    own = getattr(env.unwrapped, "own_time_limit", None)  # of this package's problems, which end their episodes
+    if own is not None:
+        limits.append(own)
     if max_steps is None and not limits:
         max_steps = _limit_of_spec(env)
     if max_steps is not None:

@@ -13,7 +13,6 @@ from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
 from hpamdp.env.primitives.manipulation import ACTIONS, OBSERVED, Actions, Manipulation, Reward, Task
 from hpamdp.env.primitives.players import MEASURED
-from hpamdp.env.primitives.primitives import STEPS
 from hpamdp.settings import OnlyWith, PositiveFraction, Settings
 
 _GROUPED_PRIMITIVES = {
@@ -79,9 +78,7 @@ class PrimitivesEnv(GymnasiumEnv):
         **settings: Any,
     ) -> None:
         given = PrimitivesOptions.of(options, settings)
-        shortest = min(action.ticks for action in ACTIONS[given.actions])
         reading = GymnasiumOptions(
-            max_steps=given.decisions * STEPS // shortest,
             reward_scaling=given.reward_scaling,
             num_workers=given.num_workers,
         )

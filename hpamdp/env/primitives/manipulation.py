@@ -74,6 +74,7 @@ class Manipulation(gymnasium.Env):
         render_mode: None or `rgb_array`.
 
     Attributes:
+        own_time_limit: most actions of an episode.
         on_low_level_step: None, or called after every low-level step, such as to draw it.
 
     Raises:
@@ -113,6 +114,7 @@ class Manipulation(gymnasium.Env):
             low = 0.0 if is_one_sided else -largest
             boxes.append(spaces.Box(low, largest, (action.num_arguments,), np.float32))
         self._boxes = boxes
+        self.own_time_limit = decisions * STEPS // min(action.ticks for action in self.actions)
         self.action_space = spaces.Tuple([spaces.Discrete(len(boxes)), spaces.Tuple(boxes)])
         self.on_low_level_step: Callable[[], None] | None = None
         self._ticks_left = 0

@@ -107,9 +107,7 @@ class TrafficEnv(GymnasiumEnv):
         # Names before the base class reads them.
         self.discrete_names = (*PHASES, *(PLAYERS if given.strategies else ()))
         self.observation_names = tuple(observation_names(given.network))
-        most = 60 * given.minutes // MIN_GREEN + 1
         reading = GymnasiumOptions(
-            max_steps=most * len(NETWORKS[given.network]),
             observation_scaling="none",
             reward_scaling=given.reward_scaling,
             num_workers=given.num_workers,

@@ -43,6 +43,7 @@ class TrafficLights(gymnasium.Env):
         render_mode: None or `rgb_array`.
 
     Attributes:
+        own_time_limit: most decisions of an episode.
         results: of the last episode that ended, as in the info.
 
     Raises:
@@ -79,6 +80,7 @@ class TrafficLights(gymnasium.Env):
         self.action_space = spaces.Tuple([spaces.Discrete(len(boxes)), spaces.Tuple(boxes)])
         num_entries = len(observation_names(network))
         self.observation_space = spaces.Box(-np.inf, np.inf, (num_entries,), np.float32)
+        self.own_time_limit = (60 * minutes // MIN_GREEN + 1) * len(NETWORKS[network])
         self.results: dict[str, float] = {}
         self._last: Seen | None = None
         self._simulation: SimulationProcess | None = None
