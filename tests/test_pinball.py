@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from batched_players import action, play
-from conftest import make_config
+from conftest import compose_config, make_config
 from torchrl.envs.utils import check_env_specs
 
 import hpamdp
@@ -20,6 +20,7 @@ from hpamdp.config.saved import needs_trust, read_saved
 from hpamdp.env.pinball import maps
 from hpamdp.env.pinball.environment import PinballEnv
 from hpamdp.run.assemble import assemble
+from hpamdp.run.train import run
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
@@ -244,6 +245,18 @@ def test_a_map_without_room_for_the_ball_beside_its_start_is_refused_with_starts
         SettingError, match=r"^map='.*': the ball lies free at no place of a grid of .*; begin at the map's start"
     ):
         PinballEnv(2, map=written(tmp_path, narrow), start="anywhere")
+
+
+def test_a_run_does_not_continue_on_a_map_that_was_edited_since(tmp_path):
+    file, folder = written(tmp_path, TABLE), tmp_path / "run"
+    words = ["env=pinball", "high=none", "low=random", f"env.map={file}", *SMALL, "total_frames=64"]
+    assert run(compose_config(words), folder, words) == 0
+    resume = [f"resume={folder}", "trust=true", "total_frames=128"]
+    written(tmp_path, TABLE | {"start": [0.2, 0.6]})
+    with pytest.raises(ConfigError, match="env.map='.*table.json' is no longer the one of this state"):
+        run(compose_config(resume), folder, resume)
+    written(tmp_path, TABLE)
+    assert run(compose_config(resume), folder, resume) == 0
 
 
 def test_a_run_names_the_setting_and_the_file(tmp_path):

@@ -5,6 +5,7 @@ Source: Konidaris and Barto 2009; see `hpamdp.env.pinball.rules`, also for the d
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -22,6 +23,7 @@ from hpamdp.env.pinball.planner import Planner
 from hpamdp.env.pinball.rules import PinballState
 from hpamdp.settings import OnlyWith, SettingError, Settings
 
+_MAP = "map_checksum"  # in an `env_state`
 _GRID = 100  # places in a row from which a ball may start anywhere
 _SCRIPTED = {"simple": 9_837.0, "hard": 9_404.0}  # returns of the hand-written player from the start of the map
 
@@ -106,6 +108,40 @@ class PinballEnv(BatchedEnv[PinballState]):
     def position(self) -> Tensor:
         """The balls' positions, `[N, 2]`."""
         return torch.stack([self.state.x, self.state.y], -1)
+
+    def env_state(self) -> dict[str, Tensor]:
+        """Return the columns of the state, `[N]` each, and of a map of one's own the checksum of its file."""
+        return {**super().env_state(), **self._checksum()}
+
+    def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Refuse counters and outcomes that do not exist, and the state of another map.
+
+        Raises:
+            ValueError: a number is invalid.
+        """
+        for name, checksum in self._checksum().items():
+            if not torch.equal(columns[name].to(checksum), checksum):
+                raise ValueError(f"the file env.map={self.options.map!r} is no longer the one of this state")
+        super().check_env_state({name: column for name, column in columns.items() if name != _MAP})
+
+    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Continue from an `env_state`.
+
+        Raises:
+            ValueError: it is not the state of this many environments.
+        """
+        super().set_env_state({name: column for name, column in columns.items() if name != _MAP})
+
+    def film_state(self, num: int) -> dict[str, Tensor]:
+        """Return the columns of the state alone, of the first `num` environments."""
+        return {name: column[:num].cpu().clone() for name, column in self.state._asdict().items()}
+
+    def _checksum(self) -> dict[str, Tensor]:
+        """Return the column that tells the file of a map from another one; none for the maps of the source."""
+        if self.options.map in maps.OWN_MAPS:
+            return {}
+        checksum = zlib.crc32(self.map.model_dump_json().encode())
+        return {_MAP: torch.full((self.num_envs,), checksum, dtype=torch.int64, device=self.device)}
 
     def start(self, episode: Tensor, rng: RngKey) -> PinballState:
         """Return states with the balls at rest where episodes begin."""
