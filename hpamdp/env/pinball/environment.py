@@ -40,7 +40,7 @@ class PinballOptions(Settings):
     spread_episodes: Annotated[NonNegativeInt, OnlyWith("training_start", "anywhere")] = 0
     """Episodes of an environment in which the starts of training spread from the hole, along the ways, over the map.
 
-    If 0, they are spread over the map from the beginning.
+    A tenth of the episodes begins anywhere on it at any time. If 0, all do.
     """
     max_steps: PositiveInt = 600
     """Steps after which an episode is truncated."""

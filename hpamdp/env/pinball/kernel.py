@@ -192,7 +192,7 @@ def advance(
             if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
                 bits, step = kernels.new_episode(integers, row, settings)
                 num = len(starts)
-                if spread > 0:
+                if spread > 0 and kernels.uniform(bits, step, 1) >= _F(rules.ANY_START):
                     num = max(1, num * min(1 + integers[EPISODE_ROW, row], spread) // spread)
                 _start(floats, row, starts, num, bits, step)
             observations[reading, row, 0] = TWO * floats[_X, row] - ONE

@@ -41,6 +41,9 @@ DRAG = 0.995  # factor on the speed after a step
 _COSINE = math.cos(math.pi / 1.99)
 TOUCHING = _COSINE * _COSINE
 LOW_PLACE, HIGH_PLACE = 0.05, 0.95  # where a ball is put that has left the square
+# Share of training episodes that begin anywhere before the starts are spread. Where a policy never is, it takes over
+# what it learns elsewhere, and then pushes against walls.
+ANY_START = 0.1
 
 
 class PinballState(NamedTuple):
@@ -113,7 +116,8 @@ def start(episode: Tensor, rng: RngKey, table: Table, *, is_training: bool) -> P
     places = table.places[0 if is_training else 1]
     num = torch.full_like(episode, len(places), dtype=torch.long)
     if is_training and table.spread > 0:
-        num = (num * (1 + episode).clamp(max=table.spread) // table.spread).clamp(min=1)
+        nearest = (num * (1 + episode).clamp(max=table.spread) // table.spread).clamp(min=1)
+        num = torch.where(counter_rng.uniform(rng, 1) < ANY_START, num, nearest)
     place = (counter_rng.uniform(rng, 0) * num).long().minimum(num - 1)
     x, y = places[place].unbind(-1)
     nothing = torch.zeros_like(episode)
