@@ -103,11 +103,15 @@ def test_the_starts_of_training_spread_from_the_hole_over_the_map_in_as_many_epi
     # From nearest to farthest by the ways along which the hand-written player rolls, not by straight lines.
     order = Planner(env.map).nearest_first(env.map.free_places(100)).astype(np.float32)
     number = {place: i for i, place in enumerate(map(tuple, order.tolist()))}
-    for quarters in (1, 2, 3, 4, 4):
+    for quarters in (1, 2, 3, 4):
         env.reset()
         numbers = torch.tensor([number[place] for place in map(tuple, env.position.tolist())])
         share = (numbers < quarters * len(order) // 4).float().mean().item()
         assert share == pytest.approx(0.9 + 0.1 * quarters / 4, abs=0.02)  # a tenth begins anywhere
+    env.reset()
+    is_at_start = (env.position == torch.tensor(env.map.start)).all(-1)
+    assert is_at_start.float().mean().item() == pytest.approx(0.5, abs=0.04)
+    assert {*map(tuple, env.position[~is_at_start].tolist())} <= {*number}
     distance = np.hypot(*(order - np.float32(env.map.target[:2])).T)
     assert distance[len(order) // 4 :].min() < 0.2 < 0.5 < distance[: len(order) // 4].max()
     env.seed_evaluation(0)

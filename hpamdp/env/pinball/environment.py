@@ -40,7 +40,8 @@ class PinballOptions(Settings):
     spread_episodes: Annotated[NonNegativeInt, OnlyWith("training_start", "anywhere")] = 0
     """Episodes of an environment in which the starts of training spread from the hole, along the ways, over the map.
 
-    A tenth of the episodes begins anywhere on it at any time. If 0, all do.
+    Meanwhile a tenth of the episodes begins anywhere. Then half of them begin where evaluation does. If 0, all begin
+    anywhere from the beginning.
     """
     max_steps: PositiveInt = 600
     """Steps after which an episode is truncated."""

@@ -169,11 +169,9 @@ def advance(
     polygons = settings[_FIRST:end_polygons].astype(np.float32).reshape((-1, 6))
     edges = settings[end_polygons:end_edges].astype(np.float32).reshape((-1, 6))
     end_training = end_edges + 2 * int(settings[NUM_TRAINING])
-    begin, end = end_training, end_training + 2 * int(settings[NUM_PLACES])
-    spread = 0
-    if settings[kernels.EPISODE_STREAM] == TRAINING:
-        begin, end, spread = end_edges, end_training, int(settings[SPREAD])
-    starts = settings[begin:end].reshape((-1, 2))
+    in_training = settings[end_edges:end_training].reshape((-1, 2))
+    in_evaluation = settings[end_training : end_training + 2 * int(settings[NUM_PLACES])].reshape((-1, 2))
+    is_training, spread = settings[kernels.EPISODE_STREAM] == TRAINING, int(settings[SPREAD])
     near = np.empty(len(edges), np.int64)
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.ROLLING
@@ -191,9 +189,14 @@ def advance(
         for reading in range(len(observations)):
             if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
                 bits, step = kernels.new_episode(integers, row, settings)
-                num = len(starts)
-                if spread > 0 and kernels.uniform(bits, step, 1) >= _F(rules.ANY_START):
-                    num = max(1, num * min(1 + integers[EPISODE_ROW, row], spread) // spread)
+                starts = in_training if is_training else in_evaluation
+                num, episode = len(starts), integers[EPISODE_ROW, row]
+                if is_training and spread > 0:
+                    uniform = kernels.uniform(bits, step, 1)
+                    if episode < spread and uniform >= _F(rules.ANY_START):
+                        num = max(1, num * (1 + episode) // spread)
+                    if episode >= spread and uniform < _F(rules.EVALUATED_START):
+                        starts, num = in_evaluation, len(in_evaluation)
                 _start(floats, row, starts, num, bits, step)
             observations[reading, row, 0] = TWO * floats[_X, row] - ONE
             observations[reading, row, 1] = TWO * floats[_Y, row] - ONE

@@ -44,6 +44,8 @@ LOW_PLACE, HIGH_PLACE = 0.05, 0.95  # where a ball is put that has left the squa
 # Share of training episodes that begin anywhere before the starts are spread. Where a policy never is, it takes over
 # what it learns elsewhere, and then pushes against walls.
 ANY_START = 0.1
+# Share of training episodes that begin where evaluation does, once the starts are spread.
+EVALUATED_START = 0.5
 
 
 class PinballState(NamedTuple):
@@ -113,15 +115,25 @@ def make_table(
 
 def start(episode: Tensor, rng: RngKey, table: Table, *, is_training: bool) -> PinballState:
     """Return the initial states of the episodes with these numbers, int32 `[N]`: at rest in one of the places."""
-    places = table.places[0 if is_training else 1]
-    num = torch.full_like(episode, len(places), dtype=torch.long)
-    if is_training and table.spread > 0:
-        nearest = (num * (1 + episode).clamp(max=table.spread) // table.spread).clamp(min=1)
-        num = torch.where(counter_rng.uniform(rng, 1) < ANY_START, num, nearest)
-    place = (counter_rng.uniform(rng, 0) * num).long().minimum(num - 1)
-    x, y = places[place].unbind(-1)
+    in_training, in_evaluation = table.places
+    x, y = _drawn(in_evaluation, torch.full_like(episode, len(in_evaluation)), rng).unbind(-1)
+    if is_training:
+        num = torch.full_like(episode, len(in_training))
+        uniform = counter_rng.uniform(rng, 1)
+        is_spreading = episode < table.spread
+        if table.spread > 0:
+            nearest = (num * (1 + episode.clamp(max=table.spread - 1)) // table.spread).clamp(min=1)
+            num = torch.where(is_spreading & (uniform >= ANY_START), nearest, num)
+        is_own = is_spreading | (uniform >= EVALUATED_START) | (table.spread == 0)
+        own_x, own_y = _drawn(in_training, num, rng).unbind(-1)
+        x, y = torch.where(is_own, own_x, x), torch.where(is_own, own_y, y)
     nothing = torch.zeros_like(episode)
     return PinballState(x, y, torch.zeros_like(x), torch.zeros_like(y), nothing, nothing + ROLLING, episode)
+
+
+def _drawn(places: Tensor, num: Tensor, rng: RngKey) -> Tensor:
+    """Return one of the first `num` `[N]` places for each row, `[N, 2]`."""
+    return places[(counter_rng.uniform(rng, 0) * num).long().clamp(max=num - 1)]
 
 
 def act(state: PinballState, discrete: Tensor, strength: Tensor, table: Table) -> tuple[PinballState, Tensor]:
