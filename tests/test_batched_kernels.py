@@ -62,7 +62,6 @@ PROBLEMS = {
             "map": st.sampled_from(["simple", "hard"]),
             "start": st.sampled_from(["map", "anywhere"]),
             "training_start": st.sampled_from([None, "map", "anywhere"]),
-            "spread_episodes": st.sampled_from([0, 3]),
             "max_steps": st.sampled_from([3, 600]),
         },
         1e-4,

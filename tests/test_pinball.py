@@ -19,7 +19,6 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import needs_trust, read_saved
 from hpamdp.env.pinball import maps
 from hpamdp.env.pinball.environment import PinballEnv
-from hpamdp.env.pinball.planner import Planner
 from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
 from hpamdp.settings import SettingError
@@ -96,27 +95,6 @@ def test_training_may_begin_anywhere_while_evaluation_begins_at_the_start_of_the
     expected = torch.tensor([2.0 * each - 1.0 for each in env.map.start])
     torch.testing.assert_close(env.reset()[keys.OBSERVATION][:, :2], expected.expand(100, -1))
     assert env.references({}) != {}
-
-
-def test_the_starts_of_training_spread_from_the_hole_over_the_map_in_as_many_episodes_as_are_said():
-    env = PinballEnv(2000, map="hard", training_start="anywhere", spread_episodes=4)
-    # From nearest to farthest by the ways along which the hand-written player rolls, not by straight lines.
-    order = Planner(env.map).nearest_first(env.map.free_places(100)).astype(np.float32)
-    number = {place: i for i, place in enumerate(map(tuple, order.tolist()))}
-    for quarters in (1, 2, 3, 4):
-        env.reset()
-        numbers = torch.tensor([number[place] for place in map(tuple, env.position.tolist())])
-        share = (numbers < quarters * len(order) // 4).float().mean().item()
-        assert share == pytest.approx(0.9 + 0.1 * quarters / 4, abs=0.02)  # a tenth begins anywhere
-    env.reset()
-    is_at_start = (env.position == torch.tensor(env.map.start)).all(-1)
-    assert is_at_start.float().mean().item() == pytest.approx(0.5, abs=0.04)
-    assert {*map(tuple, env.position[~is_at_start].tolist())} <= {*number}
-    distance = np.hypot(*(order - np.float32(env.map.target[:2])).T)
-    assert distance[len(order) // 4 :].min() < 0.2 < 0.5 < distance[: len(order) // 4].max()
-    env.seed_evaluation(0)
-    env.reset()
-    assert len(env.position.unique(dim=0)) == 1
 
 
 @each_map

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from pydantic import Field, NonNegativeInt, PositiveInt
+from pydantic import Field, PositiveInt
 from torch import Tensor
 
 from hpamdp.env import counter_rng
@@ -21,7 +21,7 @@ from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.pinball import kernel, maps, rendering, rules
 from hpamdp.env.pinball.planner import Planner
 from hpamdp.env.pinball.rules import PinballState
-from hpamdp.settings import OnlyWith, SettingError, Settings
+from hpamdp.settings import SettingError, Settings
 
 _MAP = "map_checksum"  # in an `env_state`
 _GRID = 100  # places in a row from which a ball may start anywhere
@@ -37,12 +37,6 @@ class PinballOptions(Settings):
     """Where episodes begin: at the start of the `map`, or `anywhere` between the walls. The ball is at rest."""
     training_start: Literal["map", "anywhere"] | None = None
     """Where the episodes of training begin. If None, where those of evaluation do, see `start`."""
-    spread_episodes: Annotated[NonNegativeInt, OnlyWith("training_start", "anywhere")] = 0
-    """Episodes of an environment in which the starts of training spread from the hole, along the ways, over the map.
-
-    Meanwhile a tenth of the episodes begins anywhere. Then half of them begin where evaluation does. If 0, all begin
-    anywhere from the beginning.
-    """
     max_steps: PositiveInt = 600
     """Steps after which an episode is truncated."""
 
@@ -82,23 +76,18 @@ class PinballEnv(BatchedEnv[PinballState]):
         return ProblemFacts(title=cls.__name__, default_options=groups, has_oracle=True)
 
     def _prepare(self) -> None:
-        self._spread = self.options.spread_episodes if self.options.training_start == "anywhere" else 0
         try:
             self.map = maps.read(self.options.map)
             self._places = _places(self.map, self.options.start)
             self._training_places = _places(self.map, self.options.training_start or self.options.start)
-            self._planner = Planner(self.map, self.device) if self._has_oracle or self._spread else None
-            if self._spread:
-                assert self._planner is not None
-                self._training_places = self._planner.nearest_first(self._training_places)
+            self._planner = Planner(self.map, self.device) if self._has_oracle else None
         except maps.MapError as error:
             raise SettingError(f"map={self.options.map!r}: {error}") from error
-        places = self._training_places, self._places
-        self._table = rules.make_table(self.map, places, self._spread, self.device)
+        self._table = rules.make_table(self.map, (self._training_places, self._places), self.device)
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the map in numbers."""
-        return kernel.settings_of(self.map, (self._training_places, self._places), self._spread)
+        return kernel.settings_of(self.map, (self._training_places, self._places))
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 
 from hpamdp.env import kernels
-from hpamdp.env.kernels import EPISODE_ROW, ONE, OUTCOME_ROW, TWO, ZERO, kernel, part
+from hpamdp.env.kernels import ONE, OUTCOME_ROW, TWO, ZERO, kernel, part
 from hpamdp.env.pinball import rules
 from hpamdp.env.pinball.maps import PinballMap
 from hpamdp.env.rng_streams import TRAINING
 
 # The problem's own settings: the map. After these numbers follow the polygons, the edges, and the places to start:
 # those of training, then those of evaluation.
-BALL, TARGET_X, TARGET_Y, TARGET_RADIUS, NUM_POLYGONS, NUM_EDGES, NUM_TRAINING, NUM_PLACES, SPREAD = range(
-    kernels.OWN, kernels.OWN + 9
+BALL, TARGET_X, TARGET_Y, TARGET_RADIUS, NUM_POLYGONS, NUM_EDGES, NUM_TRAINING, NUM_PLACES = range(
+    kernels.OWN, kernels.OWN + 8
 )
-_FIRST = kernels.OWN + 9
+_FIRST = kernels.OWN + 8
 
 _X, _Y, _VX, _VY = range(4)
 # Columns of a polygon: its edges, and the box around it.
@@ -36,8 +36,8 @@ _MOVES = _F((rules.TICKS + 1.0) / rules.TICKS)  # of a step, with that after a t
 _SLACK = _F(1e-4)  # for rounding
 
 
-def settings_of(found: PinballMap, places: tuple[np.ndarray, np.ndarray], spread: int) -> list[float]:
-    """Return a map, the places to start and their spread as the kernel's own settings; see `rules.Table`."""
+def settings_of(found: PinballMap, places: tuple[np.ndarray, np.ndarray]) -> list[float]:
+    """Return a map and the places to start as the kernel's own settings; see `rules.Table`."""
     edges = found.edges()
     polygons, begin = [], 0
     for polygon in found.polygons:
@@ -52,7 +52,6 @@ def settings_of(found: PinballMap, places: tuple[np.ndarray, np.ndarray], spread
         begin,
         len(places[0]),
         len(places[1]),
-        spread,
         *np.array(polygons, np.float64).ravel().tolist(),
         *np.stack(columns, -1).ravel().tolist(),
         *np.concatenate(places).ravel().tolist(),
@@ -135,9 +134,9 @@ def _roll(floats: Any, row: Any, settings: Any, polygons: Any, edges: Any, near:
 
 
 @part
-def _start(floats: Any, row: Any, places: Any, num: Any, bits: Any, step: Any) -> None:
-    """Put a ball where an episode begins, one of the first places: `rules.start`."""
-    place = min(int(kernels.uniform(bits, step, 0) * _F(num)), num - 1)
+def _start(floats: Any, row: Any, places: Any, bits: Any, step: Any) -> None:
+    """Put a ball where an episode begins: `rules.start`."""
+    place = min(int(kernels.uniform(bits, step, 0) * _F(len(places))), len(places) - 1)
     floats[_X, row], floats[_Y, row] = _F(places[place, 0]), _F(places[place, 1])
     floats[_VX, row], floats[_VY, row] = ZERO, ZERO
 
@@ -169,9 +168,10 @@ def advance(
     polygons = settings[_FIRST:end_polygons].astype(np.float32).reshape((-1, 6))
     edges = settings[end_polygons:end_edges].astype(np.float32).reshape((-1, 6))
     end_training = end_edges + 2 * int(settings[NUM_TRAINING])
-    in_training = settings[end_edges:end_training].reshape((-1, 2))
-    in_evaluation = settings[end_training : end_training + 2 * int(settings[NUM_PLACES])].reshape((-1, 2))
-    is_training, spread = settings[kernels.EPISODE_STREAM] == TRAINING, int(settings[SPREAD])
+    begin, end = end_training, end_training + 2 * int(settings[NUM_PLACES])
+    if settings[kernels.EPISODE_STREAM] == TRAINING:
+        begin, end = end_edges, end_training
+    starts = settings[begin:end].reshape((-1, 2))
     near = np.empty(len(edges), np.int64)
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.ROLLING
@@ -189,15 +189,7 @@ def advance(
         for reading in range(len(observations)):
             if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
                 bits, step = kernels.new_episode(integers, row, settings)
-                starts = in_training if is_training else in_evaluation
-                num, episode = len(starts), integers[EPISODE_ROW, row]
-                if is_training and spread > 0:
-                    uniform = kernels.uniform(bits, step, 1)
-                    if episode < spread and uniform >= _F(rules.ANY_START):
-                        num = max(1, num * (1 + episode) // spread)
-                    if episode >= spread and uniform < _F(rules.EVALUATED_START):
-                        starts, num = in_evaluation, len(in_evaluation)
-                _start(floats, row, starts, num, bits, step)
+                _start(floats, row, starts, bits, step)
             observations[reading, row, 0] = TWO * floats[_X, row] - ONE
             observations[reading, row, 1] = TWO * floats[_Y, row] - ONE
             observations[reading, row, 2] = floats[_VX, row] / _MAX_SPEED

@@ -41,7 +41,7 @@ class Planner:
         middle = (np.arange(_CELLS) + 0.5) / _CELLS
         self._middles = np.stack(np.meshgrid(middle, middle, indexing="ij"), -1).reshape(-1, 2)
         self._clearance = table.clearance(self._middles) - table.ball
-        following, self._length = self._ways(np.array(table.target[:2]))
+        following = self._ways(np.array(table.target[:2]))
         begin = self._cell(np.array(table.start))
         if not self._is_way(int(begin), following):
             raise MapError("start: no way leads from there to the target")
@@ -62,18 +62,14 @@ class Planner:
         strength = (wanted / rules.PUSH).clamp(-1.0, 1.0)
         return torch.where(is_enough, rules.NONE, push), torch.where(is_enough, 0.0, strength)
 
-    def nearest_first(self, places: np.ndarray) -> np.ndarray:
-        """Return places `[S, 2]` in the order of the lengths of their ways to the hole."""
-        return places[np.argsort(self._length[self._cell(places)], kind="stable")]
-
     @staticmethod
     def _cell(places: np.ndarray) -> np.ndarray:
         """Return the numbers of the cells of places `[..., 2]`."""
         column, row = np.moveaxis(np.clip((places * _CELLS).astype(np.int64), 0, _CELLS - 1), -1, 0)
         return column * _CELLS + row
 
-    def _ways(self, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the next cell of each cell's shortest way to the target, negative there, and its length, `[C]`."""
+    def _ways(self, target: np.ndarray) -> np.ndarray:
+        """Return the next cell of each cell's shortest way to the target, `[C]`; negative at the target itself."""
         columns, rows = np.divmod(np.arange(_CELLS**2), _CELLS)
         # Ways through narrow places are longer, and through walls much longer, so that every cell has one.
         room = np.clip(self._clearance / _ROOMY, 0.0, 1.0)
@@ -90,8 +86,7 @@ class Planner:
             (np.concatenate(lengths), (np.concatenate(begins), np.concatenate(ends))), shape=(_CELLS**2, _CELLS**2)
         )
         target_cell = int(self._cell(target))
-        lengths, following = dijkstra(graph.tocsr(), directed=False, indices=target_cell, return_predecessors=True)
-        return following, lengths
+        return dijkstra(graph.tocsr(), directed=False, indices=target_cell, return_predecessors=True)[1]
 
     def _is_way(self, cell: int, following: np.ndarray) -> bool:
         """Return whether the ball fits everywhere on a cell's way."""

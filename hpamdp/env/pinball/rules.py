@@ -41,11 +41,6 @@ DRAG = 0.995  # factor on the speed after a step
 _COSINE = math.cos(math.pi / 1.99)
 TOUCHING = _COSINE * _COSINE
 LOW_PLACE, HIGH_PLACE = 0.05, 0.95  # where a ball is put that has left the square
-# Share of training episodes that begin anywhere before the starts are spread. Where a policy never is, it takes over
-# what it learns elsewhere, and then pushes against walls.
-ANY_START = 0.1
-# Share of training episodes that begin where evaluation does, once the starts are spread.
-EVALUATED_START = 0.5
 
 
 class PinballState(NamedTuple):
@@ -67,7 +62,6 @@ class Table(NamedTuple):
         ball: radius of the ball.
         target: x, y and radius of the hole.
         places: where a ball may start in training, `[T, 2]`, and in evaluation, `[S, 2]`.
-        spread: episodes until all places of training are in use; before that the first ones are. If 0, all are at once.
         corner_x, corner_y: where each edge begins, `[E]`.
         side_x, side_y: from there to its end, `[E]`.
         squared: squared lengths of the edges, `[E]`.
@@ -77,7 +71,6 @@ class Table(NamedTuple):
     ball: float
     target: tuple[float, float, float]
     places: tuple[Tensor, Tensor]
-    spread: int
     corner_x: Tensor
     corner_y: Tensor
     side_x: Tensor
@@ -89,7 +82,6 @@ class Table(NamedTuple):
 def make_table(
     found: PinballMap,
     places: tuple[np.ndarray, np.ndarray],
-    spread: int = 0,
     device: Any = None,
     dtype: torch.dtype = torch.float32,
 ) -> Table:
@@ -103,7 +95,6 @@ def make_table(
         ball=found.ball,
         target=found.target,
         places=(tensor(places[0]), tensor(places[1])),
-        spread=spread,
         corner_x=tensor(edges.corner[:, 0]),
         corner_y=tensor(edges.corner[:, 1]),
         side_x=tensor(edges.side[:, 0]),
@@ -115,25 +106,12 @@ def make_table(
 
 def start(episode: Tensor, rng: RngKey, table: Table, *, is_training: bool) -> PinballState:
     """Return the initial states of the episodes with these numbers, int32 `[N]`: at rest in one of the places."""
-    in_training, in_evaluation = table.places
-    x, y = _drawn(in_evaluation, torch.full_like(episode, len(in_evaluation)), rng).unbind(-1)
-    if is_training:
-        num = torch.full_like(episode, len(in_training))
-        uniform = counter_rng.uniform(rng, 1)
-        is_spreading = episode < table.spread
-        if table.spread > 0:
-            nearest = (num * (1 + episode.clamp(max=table.spread - 1)) // table.spread).clamp(min=1)
-            num = torch.where(is_spreading & (uniform >= ANY_START), nearest, num)
-        is_own = is_spreading | (uniform >= EVALUATED_START) | (table.spread == 0)
-        own_x, own_y = _drawn(in_training, num, rng).unbind(-1)
-        x, y = torch.where(is_own, own_x, x), torch.where(is_own, own_y, y)
+    places = table.places[0 if is_training else 1]
+    num = len(places)
+    place = (counter_rng.uniform(rng, 0) * num).long().clamp(max=num - 1)
+    x, y = places[place].unbind(-1)
     nothing = torch.zeros_like(episode)
     return PinballState(x, y, torch.zeros_like(x), torch.zeros_like(y), nothing, nothing + ROLLING, episode)
-
-
-def _drawn(places: Tensor, num: Tensor, rng: RngKey) -> Tensor:
-    """Return one of the first `num` `[N]` places for each row, `[N, 2]`."""
-    return places[(counter_rng.uniform(rng, 0) * num).long().clamp(max=num - 1)]
 
 
 def act(state: PinballState, discrete: Tensor, strength: Tensor, table: Table) -> tuple[PinballState, Tensor]:
