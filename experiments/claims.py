@@ -1070,6 +1070,11 @@ def problems() -> list[Claim]:
         ),
         Claim(
             page("problems"),
+            "On Pinball's hard map H-PPO passes {bar:,.0f} with {reaching:word} of {seeds:word} seeds",
+            numbers_of("pinball hard, training_start=anywhere", "hppo", 10_010_624),
+        ),
+        Claim(
+            page("problems"),
             "is built by {built:word} of {seeds:word} seeds (mean {mean:.3f}), if training circuits begin with parts "
             "of the textbook's circuit.",
             dict(

@@ -56,6 +56,23 @@ def test_each_problem_with_an_id_has_a_time_limit_as_a_gymnasium_environment(env
     assert limit > 4 and limit_of(env, 4) == 4
 
 
+@pytest.mark.parametrize(
+    ("env_id", "settings"),
+    [("hpamdp/PinballHard-v0", {"training_start": "anywhere"}), ("hpamdp/CircuitGHZ-v0", {"begin": "known"})],
+)
+def test_problems_whose_training_begins_elsewhere_are_refused_as_gymnasium_environments(env_id, settings):
+    with pytest.raises(SettingError, match="its training begins elsewhere than its evaluation"):
+        GymnasiumEnv(2, id=env_id, kwargs=settings)
+    GymnasiumEnv(2, id=env_id).close()
+
+
+@pytest.mark.parametrize("own", ["x", -3, 0, 2.5, True, None])
+def test_what_is_no_whole_number_is_no_time_limit_of_an_environment(own):
+    env = wrapped()
+    env.own_time_limit = own
+    assert limit_of(env, 50) == 50
+
+
 class Leaving(Toy):
     """Calls `sys.exit` somewhere."""
 

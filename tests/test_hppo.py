@@ -211,7 +211,7 @@ def test_advantages_smaller_than_the_least_are_not_blown_up():
     torch.testing.assert_close(normalised(100.0 * advantage, least=0.5), normalised(100.0 * advantage))
     moved = []
     for least in (0.0, 1e9):
-        learner = make(least_advantage=least, discrete_entropy=0.0)
+        learner = make(least_deviation=least, discrete_entropy=0.0)
         rows = one_step_rows(learner, 256)
         before = torch.cat([parameter.detach().flatten().clone() for parameter in learner.actor.parameters()])
         learner.learn(rows, torch.ones(256, 1, dtype=torch.bool))

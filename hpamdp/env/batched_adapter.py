@@ -51,6 +51,7 @@ class BatchedEnvAdapter(GymnasiumAdapter):
         super().__init__(NumpyBatchedEnv(env, ()), render_mode)
         self._env = env
         self.own_time_limit = env.max_steps
+        self.training_begins_elsewhere = env.training_begins_elsewhere
 
     def _draw(self) -> np.ndarray:
         return self._env.draw(self._track)

@@ -199,6 +199,11 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         self._pure_reset = torch.compile(self.restart, **arguments)
         self._pure_observe = torch.compile(self.observe, **arguments)
 
+    @property
+    def training_begins_elsewhere(self) -> bool:
+        """Whether episodes of training begin in other states than those of evaluation."""
+        return False
+
     def kernel_settings(self) -> Sequence[float]:
         """Return the problem's own numbers for its kernel."""
         return ()

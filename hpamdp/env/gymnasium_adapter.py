@@ -138,7 +138,8 @@ class GymnasiumAdapter(gymnasium.Env):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (Gymnasium's own declaration)
-    own_time_limit: int  # steps after which the environment itself truncates an episode
+    own_time_limit: int  # steps after which the environment itself ends an episode
+    training_begins_elsewhere: bool = False
 
     def __init__(self, problem: NumpyEnv, render_mode: RenderMode) -> None:
         if render_mode not in (None, "rgb_array"):

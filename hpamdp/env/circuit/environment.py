@@ -87,7 +87,7 @@ class CircuitOptions(Settings):
     `known`: with the first gates of the circuit that makes the fixed target, from none of them to all but one.
     `near_target`: with the target after a few random gates, which the agent has to undo.
     """
-    begin_episodes: Annotated[NonNegativeInt, OnlyWith("begin", "known")] = 0
+    begin_episodes: Annotated[int, Field(ge=0, le=2**30), OnlyWith("begin", "known")] = 0
     """Episodes of an environment after which training circuits may lack one gate more; at first they lack the last one.
 
     A quarter of them may lack any number of gates at any time. If 0, all may.
@@ -217,6 +217,11 @@ class CircuitEnv(BatchedEnv[CircuitState]):
         )
         num = sum(self.parameter_dims)
         self.parameter_low, self.parameter_high = (-math.pi,) * num, (math.pi,) * num
+
+    @property
+    def training_begins_elsewhere(self) -> bool:
+        """Whether training circuits begin with gates."""
+        return self.options.begin != "empty"
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the design in numbers."""

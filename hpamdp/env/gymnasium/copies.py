@@ -151,6 +151,11 @@ class Copies:
         self._check_spaces()
         try:
             self.example = self.envs[0]
+            if getattr(self.example.unwrapped, "training_begins_elsewhere", False):  # of this package's problems
+                raise SettingError(
+                    "its training begins elsewhere than its evaluation, and a Gymnasium environment does not know "
+                    "which of the two it is in; use the problem itself, such as env=pinball"
+                )
             self._limits = [limit_of(env, reading.max_steps) for env in self.envs]
             self.max_steps = max(self._limits)
             space = self.envs[0].observation_space

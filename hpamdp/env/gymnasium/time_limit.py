@@ -15,16 +15,16 @@ def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
     """Return the number of steps after which an episode of the environment is truncated.
 
     Args:
-        env: its own limit is the lowest one of its TimeLimit wrappers, or of one of this package's problems. Without
-            any, its spec has the limit.
-        max_steps: the limit to apply. If None, the environment's own.
+        env: its own limit is the lowest one of its TimeLimit wrappers and, in a problem of this package, of the
+            problem. An environment without these has the limit of its spec.
+        max_steps: a limit that counts if it is lower than the environment's own. If None, the latter.
 
     Raises:
         ValueError: the environment has no valid limit of its own, and none is given.
     """
     limits = _applied_limits(env)
     own = getattr(env.unwrapped, "own_time_limit", None)  # of this package's problems, which end their episodes
-    if own is not None:
+    if isinstance(own, int) and not isinstance(own, bool) and own >= 1:
         limits.append(own)
     if max_steps is None and not limits:
         max_steps = _limit_of_spec(env)

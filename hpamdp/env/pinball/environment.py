@@ -85,6 +85,11 @@ class PinballEnv(BatchedEnv[PinballState]):
             raise SettingError(f"map={self.options.map!r}: {error}") from error
         self._table = rules.make_table(self.map, (self._training_places, self._places), self.device)
 
+    @property
+    def training_begins_elsewhere(self) -> bool:
+        """Whether episodes of training begin at other places than those of evaluation."""
+        return self.options.training_start not in (None, self.options.start)
+
     def kernel_settings(self) -> Sequence[float]:
         """Return the map in numbers."""
         return kernel.settings_of(self.map, (self._training_places, self._places))
@@ -100,17 +105,17 @@ class PinballEnv(BatchedEnv[PinballState]):
         return torch.stack([self.state.x, self.state.y], -1)
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return the columns of the state, `[N]` each, and of a map of one's own the checksum of its file."""
+        """Return the columns of the state, `[N]` each, and the checksum of a map of one's own."""
         return {**super().env_state(), **self._checksum()}
 
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Refuse counters and outcomes that do not exist, and the state of another map.
+        """Refuse counters and outcomes that do not exist, and the state of another version of the map's file.
 
         Raises:
             ValueError: a number is invalid.
         """
         for name, checksum in self._checksum().items():
-            if not torch.equal(columns[name].to(checksum), checksum):
+            if (columns[name] != checksum[0]).any():
                 raise ValueError(f"the file env.map={self.options.map!r} is no longer the one of this state")
         super().check_env_state({name: column for name, column in columns.items() if name != _MAP})
 
@@ -127,7 +132,7 @@ class PinballEnv(BatchedEnv[PinballState]):
         return {name: column[:num].cpu().clone() for name, column in self.state._asdict().items()}
 
     def _checksum(self) -> dict[str, Tensor]:
-        """Return the column that tells the file of a map from another one; none for the maps of the source."""
+        """Return the column that tells versions of a map's file apart; none for the maps of the source."""
         if self.options.map in maps.OWN_MAPS:
             return {}
         checksum = zlib.crc32(self.map.model_dump_json().encode())

@@ -88,8 +88,9 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     """Discount of a step."""
     gae_lambda: Fraction = 0.95
     """Lambda of the generalised advantages: 0 bootstraps after one step, 1 at the end of the episode."""
-    least_advantage: NonNegativeFloat = 0.0
-    """Advantages are divided by their standard deviation, or by this number if it is larger.
+    least_deviation: NonNegativeFloat = 0.0
+    """Advantages are divided by their standard deviation, or by this number if it is larger. Its unit is that of the
+    scaled rewards.
 
     While nothing is rewarded, all advantages are errors of the critic. Divided by their own small deviation, they move
     the policy as much as rewards would: its noise and its entropy fall before it has found anything.
@@ -222,7 +223,7 @@ class HPPO(OnPolicy, Learner):
             return {}
         if self.credit_critic is not None:
             rows["advantage"] = rows["advantage"].unsqueeze(-1) - rows[BASELINE]
-        rows["advantage"] = normalised(rows["advantage"], rows.get(OWN, None), least=options.least_advantage)
+        rows["advantage"] = normalised(rows["advantage"], rows.get(OWN, None), least=options.least_deviation)
         for group in self.optimizer.param_groups:
             group["lr"] = options.lr + progress * (options.lr_final - options.lr)
         # A tensor, since code would be compiled again for another number.
