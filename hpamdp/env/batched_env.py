@@ -358,6 +358,10 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         """Return the columns of the state, `[N]` each."""
         return self.state._asdict()
 
+    def film_state(self, num: int) -> dict[str, Tensor]:
+        """Return the columns of the state alone, of the first `num` environments."""
+        return {name: column[:num].cpu().clone() for name, column in self.state._asdict().items()}
+
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Refuse counters and outcomes that do not exist.
 

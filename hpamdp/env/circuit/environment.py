@@ -351,10 +351,6 @@ class CircuitEnv(BatchedEnv[CircuitState]):
         if self._oracle is not None and plans:
             self._oracle.set_plans(plans)
 
-    def film_state(self, num: int) -> dict[str, Tensor]:
-        """Return the columns of the state alone, of the first `num` environments."""
-        return {name: column[:num].cpu().clone() for name, column in self.state._asdict().items()}
-
     def _on_start(self, mask: Tensor) -> None:
         if self._oracle is not None:
             self._oracle.plan(self._state, mask)

@@ -232,7 +232,7 @@ def start(episode: Tensor, rng: RngKey, design: Design, *, is_training: bool) ->
 def _beginning(episode: Tensor, rng: RngKey, design: Design) -> Tensor:
     """Return numbers of `Design.beginnings` for episodes with these numbers `[N]`, int64 `[N]`.
 
-    The later ones lack fewer gates. With `begin_episodes` those that lack more come later in training.
+    A later one lacks fewer gates. With `begin_episodes`, training comes to the earlier ones gradually.
     """
     assert design.beginnings is not None
     num, wait = len(design.beginnings[0]), design.begin_episodes

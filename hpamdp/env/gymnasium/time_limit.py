@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numbers
+from typing import Any, TypeGuard
 
 import gymnasium
 from gymnasium.wrappers import TimeLimit
@@ -24,7 +25,7 @@ def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
     """
     limits = _applied_limits(env)
     own = getattr(env.unwrapped, "own_time_limit", None)  # of this package's problems, which end their episodes
-    if isinstance(own, int) and not isinstance(own, bool) and own >= 1:
+    if _is_whole(own) and own >= 1:
         limits.append(own)
     if max_steps is None and not limits:
         max_steps = _limit_of_spec(env)
@@ -43,12 +44,15 @@ def _applied_limits(env: gymnasium.Env) -> list[int]:
     return limits
 
 
+def _is_whole(limit: Any) -> TypeGuard[int]:
+    return isinstance(limit, numbers.Integral) and not isinstance(limit, bool)
+
+
 def _limit_of_spec(env: gymnasium.Env) -> int:
     limit = getattr(env.unwrapped.spec, "max_episode_steps", None)
-    is_whole = isinstance(limit, numbers.Integral) and not isinstance(limit, bool)
-    if limit is None or (is_whole and limit == -1):  # `gymnasium.make` takes -1 as no limit
+    if limit is None or (_is_whole(limit) and limit == -1):  # `gymnasium.make` takes -1 as no limit
         raise SettingError("has no time limit of its own; set env.max_steps")
-    if not is_whole or limit < 1:
+    if not _is_whole(limit) or limit < 1:
         raise SettingError(
             f"its spec has max_episode_steps={shown(limit)}, which must be a whole number of at least 1; "
             "set env.max_steps"

@@ -127,10 +127,6 @@ class PinballEnv(BatchedEnv[PinballState]):
         """
         super().set_env_state({name: column for name, column in columns.items() if name != _MAP})
 
-    def film_state(self, num: int) -> dict[str, Tensor]:
-        """Return the columns of the state alone, of the first `num` environments."""
-        return {name: column[:num].cpu().clone() for name, column in self.state._asdict().items()}
-
     def _checksum(self) -> dict[str, Tensor]:
         """Return the column that tells versions of a map's file apart; none for the maps of the source."""
         if self.options.map in maps.OWN_MAPS:
