@@ -61,7 +61,7 @@ PROBLEMS = {
         {
             "map": st.sampled_from(["simple", "hard"]),
             "start": st.sampled_from(["map", "anywhere"]),
-            "training_start": st.sampled_from([None, "map", "anywhere"]),
+            "training_start": st.sampled_from([None, "map", "anywhere", "both"]),
             "max_steps": st.sampled_from([3, 600]),
         },
         1e-4,

@@ -97,6 +97,18 @@ def test_training_may_begin_anywhere_while_evaluation_begins_at_the_start_of_the
     assert env.references({}) != {}
 
 
+def test_half_of_the_training_may_begin_at_the_start_of_the_map_and_half_anywhere():
+    env = PinballEnv(2000, training_start="both")
+    env.reset()
+    begins = torch.tensor(env.map.start, dtype=env.state.x.dtype)
+    at_start = (env.state.x == begins[0]) & (env.state.y == begins[1])
+    assert 0.45 < at_start.float().mean() < 0.55
+    assert env.state.x[~at_start].unique().numel() > 50
+    env.seed_evaluation(3)
+    env.reset()
+    assert ((env.state.x == begins[0]) & (env.state.y == begins[1])).all()
+
+
 @each_map
 def test_the_hand_written_player_reaches_the_hole_with_the_return_of_the_references(name):
     env = PinballEnv(1, map=name)

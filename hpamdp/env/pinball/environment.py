@@ -35,8 +35,11 @@ class PinballOptions(Settings):
     """A map of the source, `simple` or `hard`, or the path of a JSON file with a map of one's own."""
     start: Literal["map", "anywhere"] = "map"
     """Where episodes begin: at the start of the `map`, or `anywhere` between the walls. The ball is at rest."""
-    training_start: Literal["map", "anywhere"] | None = None
-    """Where the episodes of training begin. If None, where those of evaluation do, see `start`."""
+    training_start: Literal["map", "anywhere", "both"] | None = None
+    """Where the episodes of training begin; with `both`, half of them at the start of the map and half `anywhere`.
+
+    If None, they begin where those of evaluation do, see `start`.
+    """
     max_steps: PositiveInt = 600
     """Steps after which an episode is truncated."""
 
@@ -169,4 +172,6 @@ def _places(found: maps.PinballMap, start: str) -> np.ndarray:
     places = found.free_places(_GRID)
     if not len(places):
         raise maps.MapError(f"the ball lies free at no place of a grid of {_GRID} x {_GRID}; begin at the map's start")
+    if start == "both":
+        return np.concatenate([places, np.tile(found.start, (len(places), 1))])
     return places
