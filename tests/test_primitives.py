@@ -205,6 +205,23 @@ def test_an_episode_terminates_after_its_time(actions, decisions, steps):
 
 
 @needs_simulator
+@pytest.mark.parametrize("settings", [{}, {"reach": 0.3, "negative_distances": False}])
+def test_initial_parameters_lead_grasps_to_the_object_and_pulls_towards_the_goal(settings):
+    env = PrimitivesEnv(1, task="disassemble", actions="all", **settings)
+    seen = env.reset()[keys.OBSERVATION][0]
+    weight, bias = env.initial_parameters()
+    space = env.full_action_spec_unbatched[keys.PARAMETERS].space
+    unit = weight @ seen + bias
+    metres = (space.low + (unit + 1.0) / 2.0 * (space.high - space.low)).flatten()
+    object_offset, goal_offset = seen[4:7] / 2.0, seen[11:14] / 2.0
+    for first in (0, 3):
+        torch.testing.assert_close(metres[first : first + 3], object_offset)
+    x, y, z = goal_offset.tolist()
+    torch.testing.assert_close(metres[6:12], torch.tensor([z, -z, -x, x, y, -y]))
+    assert not metres[12:].any()  # position steps begin at rest
+
+
+@needs_simulator
 def test_a_small_step_is_a_step_of_metaworld():
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 

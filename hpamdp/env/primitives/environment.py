@@ -8,11 +8,23 @@ from typing import Annotated, Any, ClassVar
 
 import torch
 from pydantic import Field, NonNegativeInt, PositiveInt
+from torch import Tensor
 
+from hpamdp import keys
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
-from hpamdp.env.primitives.manipulation import ACTIONS, OBSERVED, Actions, Manipulation, Reward, Task
+from hpamdp.env.primitives.manipulation import (
+    ACTIONS,
+    HIGHEST,
+    LOWEST,
+    OBSERVED,
+    Actions,
+    Manipulation,
+    Reward,
+    Task,
+)
 from hpamdp.env.primitives.players import MEASURED
+from hpamdp.env.primitives.primitives import AXES, PRIMITIVES
 from hpamdp.settings import OnlyWith, PositiveFraction, Settings
 
 _GROUPED_PRIMITIVES = {
@@ -20,6 +32,9 @@ _GROUPED_PRIMITIVES = {
     "grasp": ["grasp", "close"],
     "pull": ["lift", "drop", "left", "right", "forward", "backward"],
 }
+
+
+_OBJECT, _GOAL = (slice(first, first + 3) for first in map(OBSERVED.index, ("object_x", "goal_x")))
 
 
 class PrimitivesOptions(Settings):
@@ -111,6 +126,27 @@ class PrimitivesEnv(GymnasiumEnv):
     def default_options(self) -> Mapping[str, Sequence[int | str]]:
         """The kinds of primitives, or with `actions=all` the ways of steering."""
         return _default_options(self._given.actions)
+
+    def initial_parameters(self) -> tuple[Tensor, Tensor]:
+        """Return where an arm would begin to search: moves and grasps go to the object, and pulls as far as the goal.
+
+        Returns:
+            Weights `[num_parameters, 15]` and bias `[num_parameters]`. A vector is the object's offset from the hand,
+            a distance is the goal's offset from the object along its axis. Position steps have the vector 0.
+        """
+        metres = torch.zeros(sum(self.parameter_dims), len(OBSERVED), dtype=torch.float32)
+        row = 0
+        for action in ACTIONS[self._given.actions]:
+            if action in PRIMITIVES and action.num_arguments == 3:
+                metres[row : row + 3, _OBJECT] = torch.eye(3, dtype=torch.float32)
+            elif action.num_arguments == 1:
+                metres[row, _GOAL] = torch.tensor(AXES[action.name], dtype=torch.float32)
+            row += action.num_arguments
+        # An offset of 1 in [-1, 1] is that many metres; offsets of 0 are in the middle.
+        metres *= torch.as_tensor((HIGHEST - LOWEST) / 2.0)
+        bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
+        middle, half = (bounds.high + bounds.low).flatten() / 2.0, (bounds.high - bounds.low).flatten() / 2.0
+        return (metres / half.unsqueeze(-1).cpu()), -(middle / half).cpu()
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return what the hand-written player of the task reaches in an episode of five primitives."""

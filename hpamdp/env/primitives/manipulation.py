@@ -41,8 +41,8 @@ OBSERVED = (
     "time_left",
 )
 # The workspace of Meta-World's hand, in metres; `object` and `goal` are offsets, from the hand and from the object.
-_LOW = np.array([-0.5, 0.4, 0.0, 0.0, *[-0.5] * 3, *[-1.0] * 4, *[-0.5] * 3, 0.0], np.float32)
-_HIGH = np.array([0.5, 1.0, 0.5, 1.0, *[0.5] * 3, *[1.0] * 4, *[0.5] * 3, 1.0], np.float32)
+LOWEST = np.array([-0.5, 0.4, 0.0, 0.0, *[-0.5] * 3, *[-1.0] * 4, *[-0.5] * 3, 0.0], np.float32)
+HIGHEST = np.array([0.5, 1.0, 0.5, 1.0, *[0.5] * 3, *[1.0] * 4, *[0.5] * 3, 1.0], np.float32)
 
 _CAMERA, _PIXELS = "corner2", 320
 _NO_LIMIT = 2**62  # Meta-World refuses steps after its own limit; the episode's length is counted here
@@ -106,7 +106,7 @@ class Manipulation(gymnasium.Env):
         self._is_dense = reward == "dense"
         self._ticks = decisions * STEPS
         self._arm = _make_arm(task, render_mode)
-        self.observation_space = spaces.Box(_LOW, _HIGH, dtype=np.float32)
+        self.observation_space = spaces.Box(LOWEST, HIGHEST, dtype=np.float32)
         boxes = []
         for action in self.actions:
             largest = reach if action.reach is None else action.reach
@@ -168,7 +168,7 @@ class Manipulation(gymnasium.Env):
         hand, opening, place, rotation = seen[:3], seen[3:4], seen[4:7], seen[7:11]
         left = [self._ticks_left / self._ticks]
         observed = np.concatenate([hand, opening, place - hand, rotation, self._arm._target_pos - place, left])
-        return np.clip(observed, _LOW, _HIGH).astype(np.float32)
+        return np.clip(observed, LOWEST, HIGHEST).astype(np.float32)
 
     def render(self) -> np.ndarray | None:
         """Return a picture, uint8 `[320, 320, 3]`, if the `render_mode` is `rgb_array`."""

@@ -92,7 +92,8 @@ SMALL_POSITION_STEPS, LARGE_POSITION_STEPS = (
     for size, steps in (("small", SMALL_STEPS), ("large", LARGE_STEPS))
 )
 
-_AXES = {
+# Directions of the primitives along one axis, in x, y and z.
+AXES = {
     "lift": (0, 0, 1),
     "drop": (0, 0, -1),
     "left": (-1, 0, 0),
@@ -140,7 +141,7 @@ def phases(action: Action, arguments: np.ndarray) -> tuple[Phase, ...]:
         if action.name == "close":
             return (Phase((0.0, 0.0, 0.0), _CLOSE),)
         distance = max(float(arguments[0]), 0.0)
-        right, forward, up = (distance * part for part in _AXES[action.name])
+        right, forward, up = (distance * part for part in AXES[action.name])
         return (Phase((right, forward, up), _CLOSE),)
     effort = _OPEN if action.name.endswith("open") else _CLOSE
     return (Phase((x, y, z), effort, action.ticks, is_direct=True),)
