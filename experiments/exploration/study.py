@@ -1,0 +1,82 @@
+"""Gather and tabulate what each kind of exploration changes, for two learners on four problems.
+
+python experiments/exploration/study.py FOLDER...    adds the finished runs in these folders to results.csv, then tabulates
+python experiments/exploration/study.py              tabulates results.csv
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hpamdp.analysis.study import Rows, Run, add_to_tables, finished, first_at, groups, read_csv, spread
+from hpamdp.messages import exit_code
+
+HERE = Path(__file__).resolve().parent
+RUN = ("problem", "learner", "exploration", "seed")
+# A selector over options that last four steps is a kind of exploration, too; on Crossing every row has one.
+OPTIONS = "options"
+KINDS = ("none", "held", "counts", "novelty", OPTIONS)
+# The share of greedy episodes that succeed, from which on a problem counts as solved.
+SOLVED = 0.9
+
+
+def kind_of(run: Run) -> str:
+    """Return how a run explored."""
+    has_selector = run.summary["high"] != "none" and run.summary["env"] != "crossing"
+    return OPTIONS if has_selector else run.config["choices"]["exploration"]
+
+
+def gather(runs: Sequence[Run]) -> Rows:
+    """Return a row for each run: its last greedy evaluation, and the steps before the first one that solves."""
+    rows: Rows = []
+    for run in runs:
+        solved = first_at(run.evaluations(), "eval/success", SOLVED)
+        rows.append(
+            {
+                "problem": run.summary["env"],
+                "learner": run.summary["low"],
+                "exploration": kind_of(run),
+                "seed": run.summary["seed"],
+                "frames": run.summary["frames"],
+                "score": round(run.summary["score"], 4),
+                "success": round(run.summary["success"], 4),
+                "solved_after": int(solved["frames"]) if solved else "",
+                "cpu_s": round(run.summary["cpu_s"], 1),
+            }
+        )
+    return rows
+
+
+def table(rows: Rows) -> str:
+    """Return a line for each learner on each problem, with a column for each kind of exploration."""
+    lines = ["| problem | learner | steps | " + " | ".join(KINDS) + " |", "|---" * (3 + len(KINDS)) + "|"]
+    for (problem, learner, frames), of_pair in groups(rows, "problem", "learner", "frames").items():
+        kinds = groups(of_pair, "exploration")
+        cells = [cell(kinds[kind,]) if (kind,) in kinds else "" for kind in KINDS]
+        lines.append("| " + " | ".join([problem, learner, f"{frames:,}", *cells]) + " |")
+    return "\n".join(lines)
+
+
+def cell(rows: Rows) -> str:
+    """Return score, success, when each seed first solved the problem, and CPU time."""
+    scores = [row["score"] for row in rows]
+    digits = 0 if max(map(abs, scores)) > 100.0 else 3
+    firsts = [f"{row['solved_after'] / 1000:.0f}" if row["solved_after"] != "" else "–" for row in rows]
+    success = 100.0 * np.mean([row["success"] for row in rows])
+    seconds = np.mean([row["cpu_s"] for row in rows])
+    return f"{spread(scores, digits)}; {success:.0f} %; {', '.join(firsts)}; {seconds:.0f} s"
+
+
+def main(folders: Sequence[str]) -> None:
+    """Add the runs in the folders, if any are given, and tabulate."""
+    if folders:
+        add_to_tables(HERE, {"results": gather(finished(folders))}, RUN)
+    print(table(read_csv(HERE / "results.csv")))
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))
