@@ -451,6 +451,12 @@ def test_all_scripts_of_studies_print_to_streams_that_may_close():
         ),
         ("office", {"chooses_goal": True}, "office, chooses goal"),
         ("pinball", {"map": "hard", "start": "anywhere"}, "pinball hard, from anywhere"),
+        (
+            "pinball",
+            {"map": "hard", "start": "map", "training_start": "both"},
+            "pinball hard, training_start=both",
+        ),
+        ("primitives", {"task": "assembly", "reward": "sparse"}, "primitives assembly, sparse"),
         ("platform", {}, "platform"),
     ],
 )
