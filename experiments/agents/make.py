@@ -45,6 +45,10 @@ AGENTS = {
         *("high=none", "low=hppo", "env=office", "env.tiles=20", "exploration=counts", "exploration.resolution=1"),
         *("exploration.weight=50", "exploration.table_size=16381", "eval.layouts=100", "eval.seed=111", "seed=111"),
     ],
+    "hppo_primitives": [
+        *("experiment=primitives", "hydra.mode=RUN", "env.task=peg_unplug_side", "eval.seed=100", "seed=100"),
+    ],
+    "pdqn_traffic": ["high=none", "low=pdqn", "env=traffic", "eval.seed=118", "seed=118"],
     "hppo_boatdock_unseen": [
         *("high=none", "low=hppo", SMALL, "env=boatdock_unseen", "env.frame=first_press"),
         *("total_frames=6000000", "eval.every=1000000", "seed=911"),

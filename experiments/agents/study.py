@@ -17,7 +17,7 @@ from hpamdp.messages import exit_code
 
 AGENTS = Path(__file__).resolve().parents[2] / "agents"
 # Settings of problems in which agents differ.
-SHOWN_SETTINGS = ("controller", "n", "task")
+SHOWN_SETTINGS = ("controller", "n", "task", "demand")
 HEAD = ("agent", "problem", "selector", "learner", "score", "ceiling", "success", "length", "trained for", "CPU, s")
 
 
@@ -34,7 +34,7 @@ def row(folder: Path) -> list[str]:
         summary["low"],
         f"{summary['score']:.3f}",
         "" if ceiling is None else f"{ceiling:.3f}",
-        f"{100.0 * summary['success']:.1f} %",
+        f"{100.0 * summary['success']:.1f} %" if "success" in summary else "",
         f"{summary['steps']:.2f}",
         f"{summary['frames']:,}",
         f"{summary['cpu_s']:.0f}",
