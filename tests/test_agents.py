@@ -47,11 +47,16 @@ QUICK = ("linucb_hppo", "hppo_platform")
 SIMULATORS = {"hppo_primitives": "metaworld", "pdqn_traffic": "libsumo"}
 
 
-@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in AGENTS if n not in QUICK)])
-def test_an_agent_scores_as_its_summary_says(name):
+def skip_without_simulator(name: str) -> None:
     if name in SIMULATORS:
         pytest.importorskip(SIMULATORS[name])
-    player = load_player(str(FOLDER / name), ["eval.layouts=200", "film=false"])
+
+
+@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in AGENTS if n not in QUICK)])
+def test_an_agent_scores_as_its_summary_says(name):
+    skip_without_simulator(name)
+    num_layouts = min(200, config_of(name)["run"]["eval"]["layouts"])
+    player = load_player(str(FOLDER / name), [f"eval.layouts={num_layouts}", "film=false"])
     score = player.evaluation.run(player.agent.policy)["score"]
     summary = json.loads((FOLDER / name / "summary.json").read_text())
     # A subset of the episodes of the summary: four standard errors. Networks are stored in half precision after they
@@ -89,6 +94,7 @@ def test_the_networks_of_an_agent_start_a_run(tmp_path):
 def test_the_file_of_an_agent_has_todays_form_which_loads_without_further_compositions(name, monkeypatch):
     progress = checkpoint.progress_of(FOLDER / name / "policy.pt")
     assert progress["config"] == config_of(name) == upgraded(progress["config"])
+    skip_without_simulator(name)
     composing: list[object] = []
     compose = Hydra.compose_config
     monkeypatch.setattr(Hydra, "compose_config", lambda *args, **kw: composing.append(args) or compose(*args, **kw))

@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from hpamdp import keys
 from hpamdp.env.primitives import players
@@ -216,9 +217,22 @@ def test_initial_parameters_lead_grasps_to_the_object_and_pulls_towards_the_goal
     object_offset, goal_offset = seen[4:7] / 2.0, seen[11:14] / 2.0
     for first in (0, 3):
         torch.testing.assert_close(metres[first : first + 3], object_offset)
+    # A pull that leads away from the goal has a negative distance, which counts as 0.
     x, y, z = goal_offset.tolist()
     torch.testing.assert_close(metres[6:12], torch.tensor([z, -z, -x, x, y, -y]))
     assert not metres[12:].any()  # position steps begin at rest
+
+
+@needs_simulator
+def test_a_grasp_with_the_initial_parameters_holds_the_object():
+    env = PrimitivesEnv(4, task="soccer", reach=0.4, negative_distances=False)
+    state = env.reset()
+    weight, bias = env.initial_parameters()
+    specs = PAMDPSpecs.from_env(env)
+    parameters = specs.from_unit((state[keys.OBSERVATION] @ weight.T + bias).clamp(-1.0, 1.0))
+    action = TensorDict({"discrete": torch.ones(4, dtype=torch.long), "parameters": parameters}, batch_size=[4])
+    after = env.step(state.set("action", action))["next", keys.OBSERVATION]
+    assert (after[:, 4:7].norm(dim=-1) / 2.0 < 0.06).all()
 
 
 @needs_simulator

@@ -440,6 +440,17 @@ def test_all_scripts_of_studies_print_to_streams_that_may_close():
         assert "exit_code(" in text.rpartition('if __name__ == "__main__":')[2], script
 
 
+ARM = {
+    "task": "assembly",
+    "reward": "sparse",
+    "actions": "primitives",
+    "reach": 0.4,
+    "negative_distances": False,
+    "decisions": 5,
+}
+ALL_STEERING = "primitives assembly, sparse, actions=all, reach=1.0, negative_distances=True"
+
+
 @pytest.mark.parametrize(
     ("env", "settings", "name"),
     [
@@ -456,7 +467,8 @@ def test_all_scripts_of_studies_print_to_streams_that_may_close():
             {"map": "hard", "start": "map", "training_start": "both"},
             "pinball hard, training_start=both",
         ),
-        ("primitives", {"task": "assembly", "reward": "sparse"}, "primitives assembly, sparse"),
+        ("primitives", ARM, "primitives assembly, sparse"),
+        ("primitives", {**ARM, "reach": 1.0, "negative_distances": True, "actions": "all"}, ALL_STEERING),
         ("platform", {}, "platform"),
     ],
 )

@@ -26,8 +26,10 @@ SOLVED = 0.9
 
 def kind_of(run: Run) -> str:
     """Return how a run explored."""
-    has_selector = run.summary["high"] != "none" and run.summary["env"] != "crossing"
-    return OPTIONS if has_selector else run.config["choices"]["exploration"]
+    explored = run.config["choices"]["exploration"]
+    if run.summary["high"] == "none" or run.summary["env"] == "crossing":
+        return explored
+    return OPTIONS if explored == "none" else f"{OPTIONS} and {explored}"
 
 
 def gather(runs: Sequence[Run]) -> Rows:

@@ -60,7 +60,8 @@ BARS = {
     "circuit random_state, gate_set=choose": (0.862, "always ion"),
 }
 
-
+# What conf/experiment/primitives.yaml and the defaults set on primitives; other values make another problem.
+PRIMITIVES = {"reach": 0.4, "negative_distances": False, "decisions": 5}
 # The smallest standard deviation of H-PPO on circuits in the recipe's earlier form.
 EARLIER_NOISE = 0.003
 
@@ -76,7 +77,12 @@ def problem_of(run: Run) -> str:
     elif name == "office":
         others = ["chooses goal" if settings["chooses_goal"] else ""]
     elif name == "primitives":
-        name, others = f"{name} {settings['task']}", [settings["reward"]]
+        others = [
+            settings["reward"],
+            "" if settings["actions"] == "primitives" else f"actions={settings['actions']}",
+            *("" if settings[key] == value else f"{key}={settings[key]}" for key, value in PRIMITIVES.items()),
+        ]
+        name = f"{name} {settings['task']}"
     elif name == "traffic":
         others = [settings["network"] if settings["network"] != "crossing" else ""]
         others += ["strategies" if settings["strategies"] else ""]
@@ -110,7 +116,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
     traffic: Rows = []
     for run in runs:
         summary = run.summary
-        # Returns of primitives count how soon a task succeeds; what is asked for is success.
+        # On primitives success is asked for; returns also tell how soon it came.
         score = "success" if summary["env"] == "primitives" else "score"
         name = {
             "problem": problem_of(run),
