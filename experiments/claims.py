@@ -954,7 +954,7 @@ def agents() -> list[Claim]:
     return [
         Claim(
             page("agents"),
-            "{agents} agents: one for most problems, for each controller and for the whole task. LinUCB over H-PPO "
+            "{agents} agents: one for nearly every problem, for each controller and for the whole task. LinUCB over H-PPO "
             "scores {score:.3f} of {ceiling:.3f} on the whole task.",
             numbers,
         ),
@@ -1028,6 +1028,36 @@ def hybrid_control() -> list[Claim]:
     ]
 
 
+def exploration() -> list[Claim]:
+    def platform(kind: str) -> Rows:
+        return rows("exploration/results.csv", problem="platform", learner="hppo", exploration=kind)
+
+    counts = column(platform("counts"), "score")
+    return [
+        Claim(
+            page("exploration"),
+            "`held` and `novelty` do no harm ({seeds:word} seeds each).",
+            dict(seeds=seeds(platform("held"))),
+        ),
+        Claim(
+            page("exploration"),
+            "With `counts` {ending:word} of {seeds:word} seeds ends at {lowest:.3f} on Platform instead of "
+            "{others:.3f}.",
+            dict(
+                ending=sum(score < 0.99 for score in counts),
+                seeds=len(counts),
+                lowest=min(counts),
+                others=max(counts),
+            ),
+        ),
+        Claim(
+            page("exploration"),
+            "Options of four steps do harm there: {options:.3f} instead of {none:.3f}.",
+            dict(options=mean(platform("options")), none=mean(platform("none"))),
+        ),
+    ]
+
+
 def problems() -> list[Claim]:
     bars = study("problems").BARS
 
@@ -1061,7 +1091,32 @@ def problems() -> list[Claim]:
     near_target = "circuit random_state, one target, begin=near_target"
     states = rows("problems/results.csv", problem=near_target)
     toffoli = rows("problems/results.csv", problem="circuit toffoli, begin=known")
+
+    def success(task: str, reward: str = "dense", learner: str = "hppo") -> float:
+        return 100.0 * mean(rows("problems/results.csv", problem=f"primitives {task}, {reward}", learner=learner))
+
     return [
+        Claim(
+            page("problems"),
+            "With dense rewards, H-PPO succeeds in {drawer:.1f} % of the episodes of `drawer_close`, {peg:.1f} % of "
+            "`peg_unplug_side` and {wrench:.1f} % of `disassemble` after {steps:,.0f} primitives, and P-DQN in "
+            "{ball:.1f} % of `soccer` after {more:,.0f} ({seeds:word} seeds each).",
+            dict(
+                steps=mean(rows("problems/results.csv", problem="primitives disassemble, dense"), "frames"),
+                more=mean(rows("problems/results.csv", problem="primitives soccer, dense"), "frames"),
+                drawer=success("drawer_close"),
+                peg=success("peg_unplug_side"),
+                wrench=success("disassemble"),
+                ball=success("soccer", learner="pdqn"),
+                seeds=seeds(rows("problems/results.csv", problem="primitives soccer, dense", learner="pdqn")),
+            ),
+        ),
+        Claim(
+            page("problems"),
+            "With sparse rewards, H-PPO succeeds in {peg:.1f} % of `peg_unplug_side` and {drawer:.1f} % of "
+            "`drawer_close`.",
+            dict(peg=success("peg_unplug_side", "sparse"), drawer=success("drawer_close", "sparse")),
+        ),
         Claim(
             page("problems"),
             "On random states it scores {mean:.3f} ({seeds:word} seeds, each with a state of its own; "
@@ -1070,8 +1125,8 @@ def problems() -> list[Claim]:
         ),
         Claim(
             page("problems"),
-            "On Pinball's hard map H-PPO passes {bar:,.0f} with {reaching:word} of {seeds:word} seeds (mean {mean:,.0f}), "
-            "if half of the training episodes begin anywhere on the map",
+            "On Pinball's hard map H-PPO passes {bar:,.0f} with {reaching:word} of {seeds:word} seeds "
+            "(mean {mean:,.0f}), if half of the training episodes begin anywhere on the map",
             numbers_of("pinball hard, training_start=both", "hppo", 10_010_624),
         ),
         Claim(
@@ -1628,7 +1683,7 @@ STUDIES: list[Callable[[], list[Claim]]] = [
         lengths,
         offline,
     ),
-    *(options, peers, problems, quickstart, reliability, robustness, speed, throughput, intervals),
+    *(exploration, options, peers, problems, quickstart, reliability, robustness, speed, throughput, intervals),
 ]
 
 # Numbers of the covered parts that are no results of ours, and where they come from.

@@ -1,7 +1,7 @@
 """Gather and tabulate what each kind of exploration changes, for two learners on four problems.
 
-python experiments/exploration/study.py FOLDER...    adds the finished runs in these folders to results.csv, then tabulates
-python experiments/exploration/study.py              tabulates results.csv
+python experiments/exploration/study.py FOLDER...    adds the finished runs in these folders to results.csv
+python experiments/exploration/study.py              only tabulates results.csv
 """
 
 from __future__ import annotations
@@ -12,7 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from hpamdp.analysis.study import Rows, Run, add_to_tables, finished, first_at, groups, read_csv, spread
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    add_to_tables,
+    finished,
+    first_at,
+    groups,
+    read_csv,
+    spread,
+    with_enough_seeds,
+)
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -54,7 +64,8 @@ def gather(runs: Sequence[Run]) -> Rows:
 
 
 def table(rows: Rows) -> str:
-    """Return a line for each learner on each problem, with a column for each kind of exploration."""
+    """Return a line for each learner on each problem, with a column for each kind of exploration with enough seeds."""
+    rows = with_enough_seeds(rows, "problem", "learner", "exploration")
     lines = ["| problem | learner | steps | " + " | ".join(KINDS) + " |", "|---" * (3 + len(KINDS)) + "|"]
     for (problem, learner, frames), of_pair in groups(rows, "problem", "learner", "frames").items():
         kinds = groups(of_pair, "exploration")
@@ -67,7 +78,7 @@ def cell(rows: Rows) -> str:
     """Return score, success, when each seed first solved the problem, and CPU time."""
     scores = [row["score"] for row in rows]
     digits = 0 if max(map(abs, scores)) > 100.0 else 3
-    firsts = [f"{row['solved_after'] / 1000:.0f}" if row["solved_after"] != "" else "–" for row in rows]
+    firsts = [f"{row['solved_after'] / 1000:.0f}" if row["solved_after"] != "" else "never" for row in rows]
     success = 100.0 * np.mean([row["success"] for row in rows])
     seconds = np.mean([row["cpu_s"] for row in rows])
     return f"{spread(scores, digits)}; {success:.0f} %; {', '.join(firsts)}; {seconds:.0f} s"
