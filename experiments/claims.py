@@ -954,8 +954,8 @@ def agents() -> list[Claim]:
     return [
         Claim(
             page("agents"),
-            "{agents} agents: one for nearly every problem, for each controller and for the whole task. LinUCB over H-PPO "
-            "scores {score:.3f} of {ceiling:.3f} on the whole task.",
+            "{agents} agents: one for nearly every problem, for each controller and for the whole task. LinUCB over "
+            "H-PPO scores {score:.3f} of {ceiling:.3f} on the whole task.",
             numbers,
         ),
         Claim(
