@@ -55,7 +55,7 @@ def skip_without_simulator(name: str) -> None:
 @pytest.mark.parametrize("name", [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in AGENTS if n not in QUICK)])
 def test_an_agent_scores_as_its_summary_says(name):
     skip_without_simulator(name)
-    num_layouts = min(200, config_of(name)["run"]["eval"]["layouts"])
+    num_layouts = min(200, config_of(name)["eval"]["layouts"])
     player = load_player(str(FOLDER / name), [f"eval.layouts={num_layouts}", "film=false"])
     score = player.evaluation.run(player.agent.policy)["score"]
     summary = json.loads((FOLDER / name / "summary.json").read_text())
