@@ -1029,15 +1029,26 @@ def hybrid_control() -> list[Claim]:
 
 
 def exploration() -> list[Claim]:
-    def platform(kind: str) -> Rows:
-        return rows("exploration/results.csv", problem="platform", learner="hppo", exploration=kind)
+    def runs(problem: str, kind: str) -> Rows:
+        return rows("exploration/results.csv", problem=problem, learner="hppo", exploration=kind)
 
-    counts = column(platform("counts"), "score")
+    counts = column(runs("platform", "counts"), "score")
+    arriving = {
+        kind: sum(success == 1.0 for success in column(runs("pinball", kind), "success"))
+        for kind in ("none", "counts", "held", "novelty", "options")
+    }
     return [
         Claim(
             page("exploration"),
-            "`held` and `novelty` do no harm ({seeds:word} seeds each).",
-            dict(seeds=seeds(platform("held"))),
+            "With H-PPO and {seeds:word} seeds, no kind helps on Platform, Crossing or Pinball.",
+            dict(seeds=seeds(runs("platform", "held"))),
+        ),
+        Claim(
+            page("exploration"),
+            "On Pinball's simple map H-PPO with its recipe arrives with {none:word} of {seeds:word} seeds and no "
+            "further exploration, with {counts:word} by `counts`, with {held:word} by `held`, and with none by `novelty` or "
+            "options.",
+            dict(seeds=seeds(runs("pinball", "none")), **arriving),
         ),
         Claim(
             page("exploration"),
@@ -1053,7 +1064,7 @@ def exploration() -> list[Claim]:
         Claim(
             page("exploration"),
             "Options of four steps do harm there: {options:.3f} instead of {none:.3f}.",
-            dict(options=mean(platform("options")), none=mean(platform("none"))),
+            dict(options=mean(runs("platform", "options")), none=mean(runs("platform", "none"))),
         ),
     ]
 
