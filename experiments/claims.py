@@ -1046,8 +1046,8 @@ def exploration() -> list[Claim]:
         Claim(
             page("exploration"),
             "On Pinball's simple map H-PPO with its recipe arrives with {none:word} of {seeds:word} seeds and no "
-            "further exploration, with {counts:word} by `counts`, with {held:word} by `held`, and with none by `novelty` or "
-            "options.",
+            "further exploration, with {counts:word} by `counts`, with {held:word} by `held`, and with none by "
+            "`novelty` or options.",
             dict(seeds=seeds(runs("pinball", "none")), **arriving),
         ),
         Claim(
