@@ -1035,7 +1035,7 @@ def exploration() -> list[Claim]:
     counts = column(runs("platform", "counts"), "score")
     arriving = {
         kind: sum(success == 1.0 for success in column(runs("pinball", kind), "success"))
-        for kind in ("none", "counts", "held", "novelty", "options")
+        for kind in ("none", "counts", "held")
     }
     return [
         Claim(

@@ -175,10 +175,13 @@ def choices(group: str) -> list[str]:
     return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
 
 
+# The simulators of problems that need an extra that `dev` lacks.
+SIMULATORS = {"traffic": "libsumo", "primitives": "metaworld"}
+
+
 def buildable(problems: Iterable[str]) -> list:
-    """Return problems as parameters of a test that builds them. Those that need an extra that `dev` lacks may skip."""
-    needed = {"traffic": "libsumo", "primitives": "metaworld"}
-    missing = {name for name, module in needed.items() if find_spec(module) is None}
+    """Return problems as parameters of a test that builds them. Those whose simulator is not installed skip."""
+    missing = {name for name, module in SIMULATORS.items() if find_spec(module) is None}
     skip = pytest.mark.skipif(True, reason="needs the extra of its name")
     return [pytest.param(name, marks=skip if name in missing else ()) for name in problems]
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
-from conftest import choices, compose_config, make_config
+from conftest import SIMULATORS, choices, compose_config, make_config
 from hydra._internal.hydra import Hydra
 
 import hpamdp
@@ -44,12 +44,12 @@ def test_an_agent_is_small_complete_and_listed(name):
 
 
 QUICK = ("linucb_hppo", "hppo_platform")
-SIMULATORS = {"hppo_primitives": "metaworld", "pdqn_traffic": "libsumo"}
 
 
 def skip_without_simulator(name: str) -> None:
-    if name in SIMULATORS:
-        pytest.importorskip(SIMULATORS[name])
+    problem = config_of(name)["choices"]["env"]
+    if problem in SIMULATORS:
+        pytest.importorskip(SIMULATORS[problem])
 
 
 @pytest.mark.parametrize("name", [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in AGENTS if n not in QUICK)])

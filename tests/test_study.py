@@ -476,6 +476,17 @@ def test_runs_on_different_problems_have_different_names(tmp_path, env, settings
     assert study("problems").problem_of(Run(tmp_path, {"env": env}, {"env": settings})) == name
 
 
+def test_the_table_of_exploration_has_a_column_for_each_kind_even_for_options_with_a_bonus(tmp_path):
+    exploration = study("exploration")
+    row = {"problem": "office", "learner": "hppo", "frames": 1, "score": 0.5, "success": 0.5, "solved_after": ""}
+    config = {"choices": {"exploration": "counts"}}
+    kind = exploration.kind_of(Run(tmp_path, {"env": "office", "high": "meta_critic"}, config))
+    rows = [{**row, "exploration": kind, "seed": seed, "cpu_s": 2.0} for seed in range(3)]
+    head, _, line = exploration.table(rows).splitlines()
+    assert head.endswith(f"| novelty | options | {kind} |")
+    assert line.endswith("| 0.500 ± 0.000; 50 %; never, never, never; 2 s |")
+
+
 @pytest.mark.parametrize(
     ("high", "low", "name"),
     [("none", "pdqn", "pdqn"), ("ucb", "random", "ucb"), ("meta_critic", "planner", "meta_critic over planner")],

@@ -6,7 +6,7 @@
 # A finished run in FOLDER/PROBLEM/LEARNER/KIND/SEED is not made again. If they are set, $PROBLEMS, $LEARNERS and $KINDS
 # name those to train, and $PYTHON is the interpreter.
 set -u
-folder=$(realpath -m "$1")
+folder=$(realpath -m "${1:?give the folder of the runs, then seeds}")
 shift
 cd "$(dirname "$0")/../.."
 export PYTHONPATH=$PWD:$PWD/examples/crossing OMP_NUM_THREADS=1

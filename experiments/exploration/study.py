@@ -66,10 +66,11 @@ def gather(runs: Sequence[Run]) -> Rows:
 def table(rows: Rows) -> str:
     """Return a line for each learner on each problem, with a column for each kind of exploration with enough seeds."""
     rows = with_enough_seeds(rows, "problem", "learner", "exploration")
-    lines = ["| problem | learner | steps | " + " | ".join(KINDS) + " |", "|---" * (3 + len(KINDS)) + "|"]
+    columns = dict.fromkeys([*KINDS, *(row["exploration"] for row in rows)])
+    lines = ["| problem | learner | steps | " + " | ".join(columns) + " |", "|---" * (3 + len(columns)) + "|"]
     for (problem, learner, frames), of_pair in groups(rows, "problem", "learner", "frames").items():
         kinds = groups(of_pair, "exploration")
-        cells = [cell(kinds[kind,]) if (kind,) in kinds else "" for kind in KINDS]
+        cells = [cell(kinds[kind,]) if (kind,) in kinds else "" for kind in columns]
         lines.append("| " + " | ".join([problem, learner, f"{frames:,}", *cells]) + " |")
     return "\n".join(lines)
 

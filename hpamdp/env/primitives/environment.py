@@ -32,8 +32,7 @@ _GROUPED_PRIMITIVES = {
     "grasp": ["grasp", "close"],
     "pull": ["lift", "drop", "left", "right", "forward", "backward"],
 }
-
-
+# Places of these vectors in the observation.
 _OBJECT, _GOAL = (slice(first, first + 3) for first in map(OBSERVED.index, ("object_x", "goal_x")))
 
 
@@ -145,8 +144,9 @@ class PrimitivesEnv(GymnasiumEnv):
         # An offset of 1 in [-1, 1] is that many metres; offsets of 0 are in the middle.
         metres *= torch.as_tensor((HIGHEST - LOWEST) / 2.0)
         bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
-        middle, half = (bounds.high + bounds.low).flatten() / 2.0, (bounds.high - bounds.low).flatten() / 2.0
-        return (metres / half.unsqueeze(-1).cpu()), -(middle / half).cpu()
+        low, high = bounds.low.flatten().cpu(), bounds.high.flatten().cpu()
+        half = (high - low) / 2.0
+        return metres / half.unsqueeze(-1), -(high + low) / 2.0 / half
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return what the hand-written player of the task reaches in an episode of five primitives."""
