@@ -236,6 +236,23 @@ def test_a_grasp_with_the_initial_parameters_holds_the_object():
 
 
 @needs_simulator
+@pytest.mark.parametrize("task", ["soccer", "assembly"])
+def test_the_players_choices_with_the_initial_parameters_succeed(task):
+    env = PrimitivesEnv(1, task=task, reach=0.4, negative_distances=False)
+    specs = PAMDPSpecs.from_env(env)
+    weight, bias = env.initial_parameters()
+    state = env.reset()
+    for _ in range(5):
+        seen = state[keys.OBSERVATION]
+        name, _ = players.choose(task, seen[0].numpy() / 2.0)  # offsets in metres
+        parameters = specs.from_unit((seen @ weight.T + bias).clamp(-1.0, 1.0))
+        number = torch.tensor([env.discrete_names.index(name)])
+        action = TensorDict({"discrete": number, "parameters": parameters}, batch_size=[1])
+        state = env.step(state.set("action", action))["next"]
+    assert state["success"].item()
+
+
+@needs_simulator
 def test_a_small_step_is_a_step_of_metaworld():
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 

@@ -23,7 +23,7 @@ from hpamdp.env.primitives.manipulation import (
     Reward,
     Task,
 )
-from hpamdp.env.primitives.players import MEASURED
+from hpamdp.env.primitives.players import MEASURED, RING_FROM_HANDLE_M
 from hpamdp.env.primitives.primitives import AXES, PRIMITIVES
 from hpamdp.settings import OnlyWith, PositiveFraction, Settings
 
@@ -32,6 +32,8 @@ _GROUPED_PRIMITIVES = {
     "grasp": ["grasp", "close"],
     "pull": ["lift", "drop", "left", "right", "forward", "backward"],
 }
+# In assembly the hand holds a handle, and the ring beside it has to go over a peg: lifts and drops end so far past it.
+_CLEARANCE_M = 0.05
 # Places of these vectors in the observation.
 _OBJECT, _GOAL = (slice(first, first + 3) for first in map(OBSERVED.index, ("object_x", "goal_x")))
 
@@ -131,22 +133,29 @@ class PrimitivesEnv(GymnasiumEnv):
 
         Returns:
             Weights `[num_parameters, 15]` and bias `[num_parameters]`. A vector is the object's offset from the hand,
-            a distance is the goal's offset from the object along its axis. Position steps have the vector 0.
+            a distance is the goal's offset from the object along its axis. In assembly it is the goal's offset from the
+            ring, and lifts and drops are 5 cm longer. Position steps have the vector 0.
         """
         metres = torch.zeros(sum(self.parameter_dims), len(OBSERVED), dtype=torch.float32)
+        constant = torch.zeros(sum(self.parameter_dims), dtype=torch.float32)
+        is_assembly = self._given.task == "assembly"
         row = 0
         for action in ACTIONS[self._given.actions]:
             if action in PRIMITIVES and action.num_arguments == 3:
                 metres[row : row + 3, _OBJECT] = torch.eye(3, dtype=torch.float32)
             elif action.num_arguments == 1:
-                metres[row, _GOAL] = torch.tensor(AXES[action.name], dtype=torch.float32)
+                axis = torch.tensor(AXES[action.name], dtype=torch.float32)
+                metres[row, _GOAL] = axis
+                if is_assembly:
+                    clearance = _CLEARANCE_M * axis[2].abs()
+                    constant[row] = clearance - axis @ torch.tensor(RING_FROM_HANDLE_M, dtype=torch.float32)
             row += action.num_arguments
         # An offset of 1 in [-1, 1] is that many metres; offsets of 0 are in the middle.
         metres *= torch.as_tensor((HIGHEST - LOWEST) / 2.0)
         bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
         low, high = bounds.low.flatten().cpu(), bounds.high.flatten().cpu()
         half = (high - low) / 2.0
-        return metres / half.unsqueeze(-1), -(high + low) / 2.0 / half
+        return metres / half.unsqueeze(-1), (constant - (high + low) / 2.0) / half
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return what the hand-written player of the task reaches in an episode of five primitives."""

@@ -33,7 +33,8 @@ _GRIPS = {
     "assembly": (-0.02, 0.0, 0.03),
     "disassemble": (-0.02, 0.0, 0.02),
 }
-_NUT_FROM_HANDLE = np.array([-0.13, 0.0, 0.0])
+RING_FROM_HANDLE_M = (-0.13, 0.0, 0.0)
+"""Offset of assembly's ring from the handle that the hand grasps, in metres."""
 
 
 def choose(task: Task, observation: np.ndarray) -> Choice:
@@ -70,7 +71,7 @@ def _sweep(goal: np.ndarray) -> Choice:
 
 
 def _assemble(goal: np.ndarray) -> Choice:
-    right, forward, up = goal - _NUT_FROM_HANDLE
+    right, forward, up = goal - np.array(RING_FROM_HANDLE_M)
     if max(abs(right), abs(forward)) <= _ALIGNED_M:
         return "drop", (_FAR_M,)
     if up > 0.0:
