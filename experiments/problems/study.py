@@ -1,8 +1,8 @@
-"""Gather and tabulate what learners reach on the problems that people have, beside what others reached.
+"""Gather, draw and tabulate what learners reach on the problems that people have, beside what others reached.
 
 python experiments/problems/study.py FOLDER...    adds the finished runs in these folders to results.csv and curves.csv,
-                                                  those of traffic lights to traffic.csv, too, then tabulates
-python experiments/problems/study.py              tabulates the stored csv files
+                                                  those of traffic lights to traffic.csv, too, then draws and tabulates
+python experiments/problems/study.py              draws and tabulates the stored csv files
 """
 
 from __future__ import annotations
@@ -12,12 +12,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from hpamdp.analysis.study import (
     Rows,
     Run,
     add_to_tables,
+    curve,
     finished,
     first_at,
     groups,
@@ -26,8 +31,10 @@ from hpamdp.analysis.study import (
     spread,
     with_enough_seeds,
 )
-from hpamdp.env.primitives.manipulation import Reward, Task
+from hpamdp.env.primitives.manipulation import ACTIONS, Reward, Task
 from hpamdp.env.primitives.players import MEASURED
+from hpamdp.env.primitives.primitives import LARGE_STEPS, SMALL_STEPS, STEPS
+from hpamdp.figure_style import STYLE
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -45,9 +52,10 @@ BARS = {
     "pinball hard, training_start=anywhere": (9_000.0, "our aim; by hand 9,404"),
     "pinball hard, training_start=both": (9_000.0, "our aim; by hand 9,404"),
     **{
-        f"primitives {task}, {reward}": (0.9, f"our aim; by hand {MEASURED[task]['success']:.1f}")
+        f"primitives {task}, {reward}{way}": (0.9, f"our aim; by hand {MEASURED[task]['success']:.1f}")
         for reward in get_args(Reward)
         for task in get_args(Task)
+        for way in ("", *(f", actions={actions}" for actions in ACTIONS))
     },
     "office": (806.0, "PEARL's code"),
     "circuit hadamard": (0.88, "published"),
@@ -62,6 +70,8 @@ BARS = {
 
 # What conf/experiment/primitives.yaml and the defaults set on primitives; other values make another problem.
 PRIMITIVES = {"reach": 0.4, "negative_distances": False, "decisions": 5}
+# Low-level steps of an action; of a primitive nominally, as a grasp has more.
+LOW_LEVEL_STEPS = {"actions=small_steps": SMALL_STEPS, "actions=large_steps": LARGE_STEPS}
 # The smallest standard deviation of H-PPO on circuits in the recipe's earlier form.
 EARLIER_NOISE = 0.003
 
@@ -210,11 +220,45 @@ def traffic_table(rows: Rows) -> str:
     return "\n".join(lines)
 
 
+def draw(curves: Rows, path: Path) -> None:
+    """Draw a panel for each task of primitives with dense rewards: the mean over seeds, and one standard deviation."""
+    found = groups(with_enough_seeds(curves, *RUN[:-1]), "problem")
+    tasks = [task for task in get_args(Task) if (f"primitives {task}, dense",) in found]
+    columns = min(3, len(tasks))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.4 * columns, 3.2 * -(-len(tasks) // columns)), layout="constrained")
+        panels = figure.subplots(-(-len(tasks) // columns), columns, squeeze=False).flat
+        for axes, task in zip(panels, tasks, strict=False):
+            _draw_task(axes, task, found)
+        for axes in list(figure.axes)[len(tasks) :]:
+            axes.set_axis_off()
+        figure.savefig(path)
+
+
+def _draw_task(axes: Axes, task: str, found: dict[tuple[str, ...], Rows]) -> None:
+    for (problem,), rows in found.items():
+        name, _, way = problem.partition(", dense")
+        if name != f"primitives {task}" or problem == name:
+            continue
+        way = way.removeprefix(", ")
+        for (learner,), of_learner in groups(rows, "learner").items():
+            x, mean, deviation = curve(of_learner, "frames", "score")
+            x = x * LOW_LEVEL_STEPS.get(way, STEPS) / STEPS
+            label = learner if not way else f"{learner}, {way.removeprefix('actions=').replace('_', ' ')}"
+            line = axes.plot(x, mean, marker=".", label=label)[0]
+            axes.fill_between(x, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.15, linewidth=0)
+    axes.set(title=task, xlabel="primitives, or as much time", ylabel="success, greedy", ylim=(-0.02, 1.02))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.legend(frameon=False, fontsize=7)
+
+
 def main(folders: Sequence[str]) -> None:
-    """Add the runs in the folders, if any are given, and tabulate."""
+    """Add the runs in the folders, if any are given, then draw and tabulate."""
     if folders:
         add_to_tables(HERE, gather(finished(folders)), RUN)
-    print(table(read_csv(HERE / "results.csv"), read_csv(HERE / "curves.csv")))
+    curves = read_csv(HERE / "curves.csv")
+    draw(curves, HERE / "primitives.png")
+    print(table(read_csv(HERE / "results.csv"), curves))
     traffic = with_enough_seeds(read_csv(HERE / "traffic.csv"), *CELL)
     if traffic:
         print()
