@@ -251,6 +251,22 @@ def test_a_run_does_not_continue_on_a_map_that_was_edited_since(tmp_path):
     assert run(compose_config(resume), folder, resume) == 0
 
 
+def test_an_evaluation_on_a_map_that_was_edited_since_says_so(tmp_path, capfd):
+    file, folder = written(tmp_path, TABLE), tmp_path / "run"
+    words = ["env=pinball", "high=none", "low=hppo", f"env.map={file}", *SMALL, "total_frames=64", "low.minibatch_size=16"]
+    assert run(compose_config(words), folder, words) == 0
+    line = "the agent was trained on another env.map, or its file was edited since"
+    for table, is_other in ((TABLE, False), (TABLE | {"start": [0.2, 0.6]}, True)):
+        written(tmp_path, table)
+        for saved in ("policy.pt", "checkpoint.zip"):
+            capfd.readouterr()
+            evaluate = ["mode=eval", f"checkpoint={folder / saved}", "trust=true", "eval.layouts=2", "film=false"]
+            assert run(compose_config(evaluate), tmp_path / f"{saved}_{is_other}", evaluate) == 0
+            assert (f"{saved}: {line}" in capfd.readouterr().err) == is_other
+        hpamdp.load(folder, trust=True)
+        assert (line in capfd.readouterr().err) == is_other
+
+
 def test_a_run_names_the_setting_and_the_file(tmp_path):
     words = ["env=pinball", "high=none", "low=random", "env.map=nowhere.json", *SMALL]
     with pytest.raises(ConfigError, match=r"^env: map='nowhere.json': there is no such file; use simple, hard"):

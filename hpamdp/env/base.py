@@ -393,6 +393,13 @@ class PAMDPEnv(EnvBase):
     def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
         """Set only these scales, from `statistics` or a whole `env_state`, to use a saved agent."""
 
+    def file_checksums(self) -> dict[str, Tensor]:
+        """Return a number for each setting that names a file of one's own, which changes with the file.
+
+        They are part of `env_state` and of saved agents, under the name of the setting and `_checksum`.
+        """
+        return {}
+
     def set_scaling_from(self, other: PAMDPEnv) -> None:
         """Scale observations as the other environment does, now and later, if their scale is learned."""
 

@@ -107,6 +107,10 @@ class OptionChoiceEnv(PAMDPEnv):
         """Add statistics to the wrapped environment."""
         self.inner_env.add_statistics(columns)
 
+    def file_checksums(self) -> dict[str, Tensor]:
+        """Return the checksums of the wrapped environment."""
+        return self.inner_env.file_checksums()
+
     def _set_seed(self, seed: int | None) -> None:
         self.inner_env.set_seed(seed)
 

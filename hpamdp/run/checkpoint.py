@@ -143,13 +143,18 @@ class Saved:
     generators: Generators | None
 
     def set_statistics(self, env: PAMDPEnv) -> None:
-        """Make an environment scale its observations as in the saved run.
+        """Make an environment scale its observations as in the saved run, and warn if its files are others.
 
         Raises:
             ConfigError: the saved statistics are of another environment.
         """
+        columns = _strings(self.states.get("collection", {}).get("env", {}))
         with _explained(f"{self.file}: does not fit env"):
-            env.set_statistics(_strings(self.states.get("collection", {}).get("env", {})))
+            for name, checksum in env.file_checksums().items():
+                if name in columns and (columns[name] != checksum).any():
+                    setting = f"env.{name.removesuffix('_checksum')}"
+                    warn(f"{self.file}: the agent was trained on another {setting}, or its file was edited since")
+            env.set_statistics(columns)
 
 
 def save(
@@ -203,7 +208,7 @@ def save_policy(path: Path, agent: HierarchicalAgent, env: PAMDPEnv, progress: M
     Raises:
         OSError: see `save`.
     """
-    parts = {"agent": agent.acting_state(), "collection": {"env": env.statistics()}}
+    parts = {"agent": agent.acting_state(), "collection": {"env": env.statistics() | env.file_checksums()}}
     with replacing(path) as partial:
         torch.save({"format": _FORMAT, "progress": json.dumps(dict(progress)), **parts}, partial)
 

@@ -23,7 +23,6 @@ from hpamdp.env.pinball.planner import Planner
 from hpamdp.env.pinball.rules import PinballState
 from hpamdp.settings import SettingError, Settings
 
-_MAP = "map_checksum"  # in an `env_state`
 _GRID = 100  # places in a row from which a ball may start anywhere
 _SCRIPTED = {"simple": 9_837.0, "hard": 9_404.0}  # returns of the hand-written player from the start of the map
 
@@ -109,7 +108,8 @@ class PinballEnv(BatchedEnv[PinballState]):
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the columns of the state, `[N]` each, and the checksum of a map of one's own."""
-        return {**super().env_state(), **self._checksum()}
+        checksums = {name: checksum.repeat(self.num_envs) for name, checksum in self.file_checksums().items()}
+        return {**super().env_state(), **checksums}
 
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Refuse counters and outcomes that do not exist, and the state of another version of the map's file.
@@ -117,10 +117,11 @@ class PinballEnv(BatchedEnv[PinballState]):
         Raises:
             ValueError: a number is invalid.
         """
-        for name, checksum in self._checksum().items():
-            if (columns[name] != checksum[0]).any():
+        checksums = self.file_checksums()
+        for name, checksum in checksums.items():
+            if (columns[name] != checksum).any():
                 raise ValueError(f"the file env.map={self.options.map!r} is no longer the one of this state")
-        super().check_env_state({name: column for name, column in columns.items() if name != _MAP})
+        super().check_env_state({name: column for name, column in columns.items() if name not in checksums})
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue from an `env_state`.
@@ -128,14 +129,15 @@ class PinballEnv(BatchedEnv[PinballState]):
         Raises:
             ValueError: it is not the state of this many environments.
         """
-        super().set_env_state({name: column for name, column in columns.items() if name != _MAP})
+        checksums = self.file_checksums()
+        super().set_env_state({name: column for name, column in columns.items() if name not in checksums})
 
-    def _checksum(self) -> dict[str, Tensor]:
-        """Return the column that tells versions of a map's file apart; none for the maps of the source."""
+    def file_checksums(self) -> dict[str, Tensor]:
+        """Return the number of a map of one's own, `[1]`; none for the maps of the source."""
         if self.options.map in maps.OWN_MAPS:
             return {}
         checksum = zlib.crc32(self.map.model_dump_json().encode())
-        return {_MAP: torch.full((self.num_envs,), checksum, dtype=torch.int64, device=self.device)}
+        return {"map_checksum": torch.tensor([checksum], dtype=torch.int64, device=self.device)}
 
     def start(self, episode: Tensor, rng: RngKey) -> PinballState:
         """Return states with the balls at rest where episodes begin."""
