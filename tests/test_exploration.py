@@ -529,6 +529,10 @@ REFUSED = [
         "use low.augment=false, or exploration=novelty exploration.in_plans=disagreement",
     ),
     (
+        "env=catch_point high=none low=pets exploration=novelty exploration.lr=0.1",
+        "exploration: lr=0.1: the bonus is the disagreement of PETS's ensemble, which takes no networks; leave it out or",
+    ),
+    (
         "low=hppo +low.per_option={congruent:random} exploration=held",
         "exploration=held: changes actions, which low=random does not take",
     ),

@@ -16,6 +16,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.gymnasium.time_limit import limit_of
+from hpamdp.env.registration import register
 from hpamdp.run.train import run
 from hpamdp.settings import SettingError
 
@@ -126,10 +127,19 @@ def test_the_limit_of_a_spec_is_applied_if_no_wrapper_does_so(options, length):
     assert episode_length(GymnasiumEnv(observation_scaling="none", **options)) == length
 
 
-@pytest.mark.parametrize(("limits", "given", "length"), [([3], None, 3), ([5, 2], None, 2), ([3], 5, 3), ([3], 2, 2)])
+@pytest.mark.parametrize(("limits", "given", "length"), [([3], None, 3), ([5, 2], None, 2), ([3], 3, 3), ([3], 2, 2)])
 def test_the_lowest_of_several_limits_counts(limits, given, length, monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "made", lambda: wrapped(*limits), raising=False)
     assert episode_length(GymnasiumEnv(entry_point=f"{__name__}:made", max_steps=given)) == length
+
+
+def test_a_limit_above_the_environments_own_is_refused(monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "made", lambda: wrapped(5, 3), raising=False)
+    with pytest.raises(SettingError, match="max_steps=4: the environment ends its episodes after 3 steps"):
+        GymnasiumEnv(entry_point=f"{__name__}:made", max_steps=4)
+    register()
+    with pytest.raises(SettingError, match="max_steps=601: the environment ends its episodes after 600 steps"):
+        GymnasiumEnv(id="hpamdp/PinballSimple-v0", max_steps=601)
 
 
 @pytest.mark.parametrize("limit", [0, -5, "ten", 10.0, True, float("nan"), [3]])

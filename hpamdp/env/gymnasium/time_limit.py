@@ -18,10 +18,10 @@ def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
     Args:
         env: its own limit is the lowest one of its TimeLimit wrappers and, in a problem of this package, of the
             problem. An environment without these has the limit of its spec.
-        max_steps: a limit that counts if it is lower than the environment's own. If None, the latter.
+        max_steps: a limit of at most the environment's own. If None, the latter.
 
     Raises:
-        ValueError: the environment has no valid limit of its own, and none is given.
+        SettingError: the environment has no valid limit of its own, and none is given; or its own one is lower.
     """
     limits = _applied_limits(env)
     own = getattr(env.unwrapped, "own_time_limit", None)  # of this package's problems, which end their episodes
@@ -29,9 +29,11 @@ def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
         limits.append(own)
     if max_steps is None and not limits:
         max_steps = _limit_of_spec(env)
-    if max_steps is not None:
-        limits.append(max_steps)
-    return min(limits)
+    if max_steps is None:
+        return min(limits)
+    if min(limits, default=max_steps) < max_steps:
+        raise SettingError(f"max_steps={max_steps}: the environment ends its episodes after {min(limits)} steps")
+    return max_steps
 
 
 def _applied_limits(env: gymnasium.Env) -> list[int]:

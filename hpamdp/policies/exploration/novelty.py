@@ -158,11 +158,20 @@ class Novelty(RewardsNewStates):
         """Return whether the bonus is an ensemble's disagreement.
 
         Raises:
-            SettingError: it should be, but the learner has no such ensemble.
+            SettingError: it should be, but the learner has no such ensemble; or it is, and a setting of the networks differs.
         """
         if self.options.in_plans == "disagreement" and not learner.knows_disagreement:
             raise SettingError(f"in_plans=disagreement: {type(learner).__name__} has no ensemble that predicts states")
-        return learner.knows_disagreement and self.options.in_plans != "distillation"
+        asks_ensemble = learner.knows_disagreement and self.options.in_plans != "distillation"
+        defaults = NoveltyOptions().model_dump(exclude={"weight", "in_plans"})
+        for name, default in defaults.items() if asks_ensemble else ():
+            given = getattr(self.options, name)
+            if given != default:
+                raise SettingError(
+                    f"{name}={given}: the bonus is the disagreement of {type(learner).__name__}'s ensemble, which "
+                    "takes no networks; leave it out or set in_plans=distillation"
+                )
+        return asks_ensemble
 
     def acting_policy(self, learner: Learner) -> TensorDictModuleBase:
         """Return the learner's policy, with the network if its plans need it."""
