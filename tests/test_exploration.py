@@ -530,7 +530,7 @@ REFUSED = [
     ),
     (
         "env=catch_point high=none low=pets exploration=novelty exploration.lr=0.1",
-        "exploration: lr=0.1: the bonus is the disagreement of PETS's ensemble, which takes no networks; leave it out or",
+        "exploration: lr=0.1: the bonus is the disagreement of PETS's ensemble, which takes no networks; leave it out",
     ),
     (
         "low=hppo +low.per_option={congruent:random} exploration=held",

@@ -253,7 +253,8 @@ def test_a_run_does_not_continue_on_a_map_that_was_edited_since(tmp_path):
 
 def test_an_evaluation_on_a_map_that_was_edited_since_says_so(tmp_path, capfd):
     file, folder = written(tmp_path, TABLE), tmp_path / "run"
-    words = ["env=pinball", "high=none", "low=hppo", f"env.map={file}", *SMALL, "total_frames=64", "low.minibatch_size=16"]
+    words = ["env=pinball", "high=none", "low=hppo", "low.minibatch_size=16", f"env.map={file}", *SMALL]
+    words.append("total_frames=64")
     assert run(compose_config(words), folder, words) == 0
     line = "the agent was trained on another env.map, or its file was edited since"
     for table, is_other in ((TABLE, False), (TABLE | {"start": [0.2, 0.6]}, True)):

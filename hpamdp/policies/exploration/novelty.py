@@ -158,7 +158,8 @@ class Novelty(RewardsNewStates):
         """Return whether the bonus is an ensemble's disagreement.
 
         Raises:
-            SettingError: it should be, but the learner has no such ensemble; or it is, and a setting of the networks differs.
+            SettingError: it should be, but the learner has no such ensemble; or it is, and a setting of the
+                networks is given.
         """
         if self.options.in_plans == "disagreement" and not learner.knows_disagreement:
             raise SettingError(f"in_plans=disagreement: {type(learner).__name__} has no ensemble that predicts states")
