@@ -467,6 +467,11 @@ ALL_STEERING = "primitives assembly, sparse, actions=all, reach=1.0, negative_di
             {"map": "hard", "start": "map", "training_start": "both"},
             "pinball hard, training_start=both",
         ),
+        (
+            "pinball",
+            {"map": "simple", "start": "map", "grouping": {"a": [0, 1], "b": [0, 1]}},
+            "pinball simple, 2 options",
+        ),
         ("primitives", ARM, "primitives assembly, sparse"),
         ("primitives", {**ARM, "reach": 1.0, "negative_distances": True, "actions": "all"}, ALL_STEERING),
         ("platform", {}, "platform"),

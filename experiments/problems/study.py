@@ -49,6 +49,7 @@ AGENT = "agent"
 # figure.
 BARS = {
     "pinball simple": (9_343.0, "PEARL's code"),
+    "pinball simple, 4 options": (9_343.0, "PEARL's code"),
     "pinball hard, training_start=anywhere": (9_000.0, "our aim; by hand 9,404"),
     "pinball hard, training_start=both": (9_000.0, "our aim; by hand 9,404"),
     **{
@@ -58,6 +59,7 @@ BARS = {
         for way in ("", *(f", actions={actions}" for actions in ACTIONS))
     },
     "office": (806.0, "PEARL's code"),
+    "office, chooses goal": (806.0, "PEARL's code"),
     "circuit hadamard": (0.88, "published"),
     "circuit bell": (0.95, "published"),
     "circuit ghz": (0.68, "published"),
@@ -83,6 +85,8 @@ def problem_of(run: Run) -> str:
         others = ["from anywhere" if settings["start"] == "anywhere" else ""]
         begins = settings.get("training_start")
         others += ["" if begins in (None, settings["start"]) else f"training_start={begins}"]
+        options = settings.get("grouping") or ()
+        others += [f"{len(options)} options" if isinstance(options, dict) else "grouped axes" if options else ""]
         name = f"{name} {settings['map']}"
     elif name == "office":
         others = ["chooses goal" if settings["chooses_goal"] else ""]
