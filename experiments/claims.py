@@ -1000,17 +1000,18 @@ def hybrid_control() -> list[Claim]:
         independent=mean(independent),
         autoregressive=mean(autoregressive),
         seeds=seeds(independent),
+        solved=sum(score > 200 for score in column(autoregressive, "score")),
         below=100.0 - 100.0 * mean(runs("gymnasium", "autoregressive")) / best_return,
         reached=100.0 * mean(runs("gymnasium", "independent")) / best_return,
     )
     return [
         Claim(
             page("hybrid_control"),
-            "the mean return of both independent and autoregressive heads is above {bar} ({independent:.0f} and "
-            "{autoregressive:.0f}), the return of a solved episode. {seeds:Word} seeds show no difference between "
-            "them.",
+            "independent heads have a mean return of {independent:.0f}, with all {seeds:word} seeds above {bar}, the "
+            "return of a solved episode. Autoregressive heads end with a mean of {autoregressive:.0f}, and "
+            "{solved:word} of their {seeds:word} seeds are above {bar}. The difference is not clear.",
             numbers,
-            holds=min(mean(independent), mean(autoregressive)) > numbers["bar"]
+            holds=min(column(independent, "score")) > numbers["bar"]
             and not difference(column(autoregressive, "score"), column(independent, "score")).is_clear,
         ),
         Claim(

@@ -1,6 +1,6 @@
 """Gather, draw and tabulate H-PPO on two public problems whose actions have two components.
 
-python experiments/hybrid_control/study.py FOLDER...    reads the runs in these folders, writes results.csv and
+python experiments/hybrid_control/study.py FOLDER...    adds the runs in these folders to results.csv and
                                                         curves.csv, then draws and tabulates
 python experiments/hybrid_control/study.py heuristic    plays Gymnasium's hand-written player of LunarLander, and
                                                         prints its mean return
@@ -19,11 +19,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from hpamdp.analysis.study import Rows, Run, curve, difference, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, add_to_tables, curve, difference, finished, groups, read_csv, spread
 from hpamdp.figure_style import STYLE
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
+RUN = ("problem", "variant", "seed")
 PROBLEMS = {"lunar_lander": "Hybrid LunarLander", "gymnasium": "Hybrid-Shoot"}
 # What a score is compared with: Gymnasium's bar, and the best possible return.
 BARS = {"lunar_lander": 200.0, "gymnasium": 34.7}
@@ -153,7 +154,7 @@ def main(arguments: list[str]) -> None:
         print(play_heuristic())
         return
     if arguments:
-        write_tables(HERE, gather(finished(arguments)))
+        add_to_tables(HERE, gather(finished(arguments)), RUN)
     results, curves = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))
     print(table(results))
     print()
