@@ -427,6 +427,13 @@ def test_exploring_plans_seek_what_is_new_and_greedy_plans_do_not(kind):
     assert (greedy == action).float().mean() < (0.1 if kind is PETS else 0.9)
 
 
+def test_settings_of_networks_have_no_effect_on_an_ensemble_and_a_line_says_so(capfd):
+    words = ["env=catch_point", "high=none", "low=pets", "exploration=novelty", "total_frames=512"]
+    for more, is_told in (([], False), (["exploration.lr=0.1"], True)):
+        assemble(make_config([*words, *more]))
+        assert ("exploration.lr=0.1: has no effect on PETS," in capfd.readouterr().err) == is_told
+
+
 def test_pets_plans_before_it_has_seen_a_reward_if_disagreement_is_rewarded():
     for has_bonus in (False, True):
         torch.manual_seed(0)
@@ -527,10 +534,6 @@ REFUSED = [
     (
         "high=value low=pets exploration=novelty exploration.in_plans=distillation",
         "use low.augment=false, or exploration=novelty exploration.in_plans=disagreement",
-    ),
-    (
-        "env=catch_point high=none low=pets exploration=novelty exploration.lr=0.1",
-        "exploration: lr=0.1: the bonus is the disagreement of PETS's ensemble, which takes no networks; leave it out",
     ),
     (
         "low=hppo +low.per_option={congruent:random} exploration=held",

@@ -135,10 +135,10 @@ def test_the_lowest_of_several_limits_counts(limits, given, length, monkeypatch)
 
 def test_a_limit_above_the_environments_own_is_refused(monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "made", lambda: wrapped(5, 3), raising=False)
-    with pytest.raises(SettingError, match="max_steps=4: the environment ends its episodes after 3 steps"):
+    with pytest.raises(SettingError, match="max_steps=4: the environment ends its episodes after 3; give less or null"):
         GymnasiumEnv(entry_point=f"{__name__}:made", max_steps=4)
     register()
-    with pytest.raises(SettingError, match="max_steps=601: the environment ends its episodes after 600 steps"):
+    with pytest.raises(SettingError, match="max_steps=601: the environment ends its episodes after 600; give"):
         GymnasiumEnv(id="hpamdp/PinballSimple-v0", max_steps=601)
 
 

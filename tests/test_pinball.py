@@ -251,12 +251,13 @@ def test_a_run_does_not_continue_on_a_map_that_was_edited_since(tmp_path):
     assert run(compose_config(resume), folder, resume) == 0
 
 
-def test_an_evaluation_on_a_map_that_was_edited_since_says_so(tmp_path, capfd):
+@pytest.mark.parametrize("grouping", [["high=none"], ["high=uniform", "env.grouping=default"]])
+def test_an_evaluation_on_a_map_that_was_edited_since_says_so(grouping, tmp_path, capfd):
     file, folder = written(tmp_path, TABLE), tmp_path / "run"
-    words = ["env=pinball", "high=none", "low=hppo", "low.minibatch_size=16", f"env.map={file}", *SMALL]
+    words = ["env=pinball", *grouping, "low=hppo", "low.minibatch_size=16", f"env.map={file}", *SMALL]
     words.append("total_frames=64")
     assert run(compose_config(words), folder, words) == 0
-    line = "the agent was trained on another env.map, or its file was edited since"
+    line = "the agent was trained with another file of env.map, or it was edited since"
     for table, is_other in ((TABLE, False), (TABLE | {"start": [0.2, 0.6]}, True)):
         written(tmp_path, table)
         for saved in ("policy.pt", "checkpoint.zip"):
@@ -266,6 +267,17 @@ def test_an_evaluation_on_a_map_that_was_edited_since_says_so(tmp_path, capfd):
             assert (f"{saved}: {line}" in capfd.readouterr().err) == is_other
         hpamdp.load(folder, trust=True)
         assert (line in capfd.readouterr().err) == is_other
+
+
+@pytest.mark.parametrize("env_part", [[1], {1: 2}, {"map_checksum": True}, {"map_checksum": torch.zeros(2, 3)}])
+def test_a_saved_agent_whose_checksum_is_damaged_is_refused_in_one_line(env_part, tmp_path):
+    file, folder = written(tmp_path, TABLE), tmp_path / "run"
+    words = ["env=pinball", "high=none", "low=random", f"env.map={file}", *SMALL, "total_frames=64"]
+    assert run(compose_config(words), folder, words) == 0
+    saved = torch.load(folder / "policy.pt")
+    torch.save(saved | {"collection": {"env": env_part}}, folder / "policy.pt")
+    with pytest.raises(ConfigError, match=r"policy\.pt: does not fit env"):
+        hpamdp.load(folder / "policy.pt", trust=True)
 
 
 def test_a_run_names_the_setting_and_the_file(tmp_path):

@@ -14,7 +14,6 @@ from typing import get_args
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
@@ -33,8 +32,7 @@ from hpamdp.analysis.study import (
 )
 from hpamdp.env.primitives.manipulation import ACTIONS, Reward, Task
 from hpamdp.env.primitives.players import MEASURED
-from hpamdp.env.primitives.primitives import LARGE_STEPS, SMALL_STEPS, STEPS
-from hpamdp.figure_style import STYLE
+from hpamdp.figure_style import LEARNER_COLOURS, STYLE
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -72,8 +70,6 @@ BARS = {
 
 # What conf/experiment/primitives.yaml and the defaults set on primitives; other values make another problem.
 PRIMITIVES = {"reach": 0.4, "negative_distances": False, "decisions": 5}
-# Low-level steps of an action; of a primitive nominally, as a grasp has more.
-LOW_LEVEL_STEPS = {"actions=small_steps": SMALL_STEPS, "actions=large_steps": LARGE_STEPS}
 # The smallest standard deviation of H-PPO on circuits in the recipe's earlier form.
 EARLIER_NOISE = 0.003
 
@@ -227,33 +223,23 @@ def traffic_table(rows: Rows) -> str:
 def draw(curves: Rows, path: Path) -> None:
     """Draw a panel for each task of primitives with dense rewards: the mean over seeds, and one standard deviation."""
     found = groups(with_enough_seeds(curves, *RUN[:-1]), "problem")
-    tasks = [task for task in get_args(Task) if (f"primitives {task}, dense",) in found]
-    columns = min(3, len(tasks))
+    shown = {task: found[problem] for task in get_args(Task) if (problem := (f"primitives {task}, dense",)) in found}
+    if not shown:
+        return
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.4 * columns, 3.2 * -(-len(tasks) // columns)), layout="constrained")
-        panels = figure.subplots(-(-len(tasks) // columns), columns, squeeze=False).flat
-        for axes, task in zip(panels, tasks, strict=False):
-            _draw_task(axes, task, found)
-        for axes in list(figure.axes)[len(tasks) :]:
-            axes.set_axis_off()
+        figure = Figure(figsize=(3.6 * len(shown), 3.2), layout="constrained")
+        panels = figure.subplots(1, len(shown), squeeze=False)[0]
+        for axes, (task, rows) in zip(panels, shown.items(), strict=True):
+            for (learner, exploration), runs in groups(rows, *RUN[1:-1]).items():
+                x, mean, deviation = curve(runs, "frames", "score")
+                label = learner if exploration == "none" else f"{learner}, {exploration}"
+                axes.plot(x, mean, marker=".", label=label, color=LEARNER_COLOURS[learner])
+                ends = mean - deviation, mean + deviation
+                axes.fill_between(x, *ends, color=LEARNER_COLOURS[learner], alpha=0.15, linewidth=0)
+            axes.set(title=task, xlabel="primitives", ylabel="success, greedy", ylim=(-0.02, 1.02))
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.legend(frameon=False, fontsize=7)
         figure.savefig(path)
-
-
-def _draw_task(axes: Axes, task: str, found: dict[tuple[str, ...], Rows]) -> None:
-    for (problem,), rows in found.items():
-        name, _, way = problem.partition(", dense")
-        if name != f"primitives {task}" or problem == name:
-            continue
-        way = way.removeprefix(", ")
-        for (learner,), of_learner in groups(rows, "learner").items():
-            x, mean, deviation = curve(of_learner, "frames", "score")
-            x = x * LOW_LEVEL_STEPS.get(way, STEPS) / STEPS
-            label = learner if not way else f"{learner}, {way.removeprefix('actions=').replace('_', ' ')}"
-            line = axes.plot(x, mean, marker=".", label=label)[0]
-            axes.fill_between(x, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.15, linewidth=0)
-    axes.set(title=task, xlabel="primitives, or as much time", ylabel="success, greedy", ylim=(-0.02, 1.02))
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.legend(frameon=False, fontsize=7)
 
 
 def main(folders: Sequence[str]) -> None:

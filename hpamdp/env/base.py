@@ -394,9 +394,10 @@ class PAMDPEnv(EnvBase):
         """Set only these scales, from `statistics` or a whole `env_state`, to use a saved agent."""
 
     def file_checksums(self) -> dict[str, Tensor]:
-        """Return a number for each setting that names a file of one's own, which changes with the file.
+        """Return the checksum int64 `[1]` of each file of one's own that describes the problem.
 
-        They are part of `env_state` and of saved agents, under the name of the setting and `_checksum`.
+        The name is that of the setting that gives the file, and `_checksum`. Saved agents and `env_state` hold the
+        checksums, so that an edited file is noticed.
         """
         return {}
 

@@ -143,17 +143,23 @@ class Saved:
     generators: Generators | None
 
     def set_statistics(self, env: PAMDPEnv) -> None:
-        """Make an environment scale its observations as in the saved run, and warn if its files are others.
+        """Make an environment scale its observations as in the saved run.
+
+        A line warns if a file that describes the problem differs from that of the saved run.
 
         Raises:
             ConfigError: the saved statistics are of another environment.
         """
-        columns = _strings(self.states.get("collection", {}).get("env", {}))
         with _explained(f"{self.file}: does not fit env"):
+            columns = _strings(self.states.get("collection", {}).get("env", {}))
             for name, checksum in env.file_checksums().items():
-                if name in columns and (columns[name] != checksum).any():
+                if name not in columns:
+                    continue
+                if not torch.is_tensor(columns[name]) or columns[name].dtype != checksum.dtype:
+                    raise ValueError(f"{name} is no checksum")
+                if (columns[name].to(checksum.device) != checksum.item()).any():
                     setting = f"env.{name.removesuffix('_checksum')}"
-                    warn(f"{self.file}: the agent was trained on another {setting}, or its file was edited since")
+                    warn(f"{self.file}: the agent was trained with another file of {setting}, or it was edited since")
             env.set_statistics(columns)
 
 

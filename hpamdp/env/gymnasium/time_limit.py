@@ -21,7 +21,7 @@ def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
         max_steps: a limit of at most the environment's own. If None, the latter.
 
     Raises:
-        SettingError: the environment has no valid limit of its own, and none is given; or its own one is lower.
+        SettingError: the environment has no valid limit of its own and none is given, or `max_steps` is above its own.
     """
     limits = _applied_limits(env)
     own = getattr(env.unwrapped, "own_time_limit", None)  # of this package's problems, which end their episodes
@@ -32,7 +32,9 @@ def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
     if max_steps is None:
         return min(limits)
     if min(limits, default=max_steps) < max_steps:
-        raise SettingError(f"max_steps={max_steps}: the environment ends its episodes after {min(limits)} steps")
+        raise SettingError(
+            f"max_steps={max_steps}: the environment ends its episodes after {min(limits)}; give less or null"
+        )
     return max_steps
 
 

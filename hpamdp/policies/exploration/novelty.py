@@ -36,6 +36,7 @@ from torchrl.envs.transforms import RunningMeanStd
 from torchrl.objectives import RNDLoss
 
 from hpamdp import keys
+from hpamdp.messages import warn
 from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.encoders.base import JoinedEncoders
 from hpamdp.policies.exploration.base import Explored
@@ -158,20 +159,17 @@ class Novelty(RewardsNewStates):
         """Return whether the bonus is an ensemble's disagreement.
 
         Raises:
-            SettingError: it should be, but the learner has no such ensemble; or it is, and a setting of the
-                networks is given.
+            SettingError: it should be, but the learner has no such ensemble.
         """
         if self.options.in_plans == "disagreement" and not learner.knows_disagreement:
             raise SettingError(f"in_plans=disagreement: {type(learner).__name__} has no ensemble that predicts states")
         asks_ensemble = learner.knows_disagreement and self.options.in_plans != "distillation"
-        defaults = NoveltyOptions().model_dump(exclude={"weight", "in_plans"})
-        for name, default in defaults.items() if asks_ensemble else ():
-            given = getattr(self.options, name)
-            if given != default:
-                raise SettingError(
-                    f"{name}={given}: the bonus is the disagreement of {type(learner).__name__}'s ensemble, which "
-                    "takes no networks; leave it out or set in_plans=distillation"
-                )
+        if asks_ensemble:  # no error, since the learner of another option may have the networks
+            for name, default in NoveltyOptions().model_dump(exclude={"weight", "in_plans"}).items():
+                value = getattr(self.options, name)
+                if value != default:
+                    bonus = f"{type(learner).__name__}, whose bonus is the disagreement of its ensemble"
+                    warn(f"exploration.{name}={value}: has no effect on {bonus}; in_plans=distillation has networks")
         return asks_ensemble
 
     def acting_policy(self, learner: Learner) -> TensorDictModuleBase:
