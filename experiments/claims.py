@@ -1092,6 +1092,8 @@ def problems() -> list[Claim]:
 
     hppo, pdqn = numbers_of("pinball simple", "hppo", 606_208), numbers_of("pinball simple", "pdqn", 120_832)
     office = numbers_of("office", "hppo", 1_510_400)
+    four_options = rows("problems/results.csv", problem="pinball simple, 4 options")
+    goals = groups(rows("problems/results.csv", problem="office, chooses goal"), "learner")
     circuits: dict[str, float] = {}
     for task in ("hadamard", "bell", "ghz"):
         of_task = rows("problems/results.csv", problem=f"circuit {task}", learner="hppo")
@@ -1114,7 +1116,7 @@ def problems() -> list[Claim]:
             "`peg_unplug_side` and {wrench:.1f} % of `disassemble` after {steps:,.0f} primitives, and P-DQN in "
             "{ball:.1f} % of `soccer` after {more:,.0f} ({seeds:word} seeds each).",
             dict(
-                steps=mean(rows("problems/results.csv", problem="primitives disassemble, dense"), "frames"),
+                steps=mean(rows("problems/results.csv", problem="primitives disassemble, dense", learner="hppo"), "frames"),
                 more=mean(rows("problems/results.csv", problem="primitives soccer, dense"), "frames"),
                 drawer=success("drawer_close"),
                 peg=success("peg_unplug_side"),
@@ -1187,6 +1189,31 @@ def problems() -> list[Claim]:
             pdqn,
         ),
         Claim(page("problems"), "H-PPO passes it with {reaching:word} of {seeds:word}.", hppo),
+        Claim(
+            page("problems"),
+            "With four options that learn where to end, the option-critic over P-DQN arrives with {arriving:word} of "
+            "{seeds:word} seeds (mean {mean:,.0f}), so options do not help there.",
+            dict(
+                arriving=sum(score > 0.0 for score in column(four_options, "score")),
+                seeds=seeds(four_options),
+                mean=mean(four_options),
+            ),
+            holds=mean(four_options) < pdqn["mean"],
+        ),
+        Claim(
+            page("problems"),
+            "A level above that chooses what to fetch first returns {first:.0f} (UCB, {seeds:word} seeds). One that "
+            "chooses the next goal every {length} steps returns {next:.0f} (meta-critic, {seeds:word} seeds, one of them "
+            "{lowest:.0f}). So options do not help there either.",
+            dict(
+                length=20,  # agent.option_length of the command
+                first=mean(goals["ucb over hppo",]),
+                next=mean(goals["meta_critic over hppo",]),
+                lowest=min(column(goals["meta_critic over hppo",], "score")),
+                seeds=seeds(goals["meta_critic over hppo",]),
+            ),
+            holds=max(map(mean, goals.values())) < office["mean"],
+        ),
     ]
 
 
