@@ -1109,6 +1109,8 @@ def problems() -> list[Claim]:
     def success(task: str, reward: str = "dense", learner: str = "hppo") -> float:
         return 100.0 * mean(rows("problems/results.csv", problem=f"primitives {task}, {reward}", learner=learner))
 
+    steering = rows("problems/results.csv", problem="primitives drawer_close, dense, actions=all")
+
     return [
         Claim(
             page("problems"),
@@ -1116,7 +1118,9 @@ def problems() -> list[Claim]:
             "`peg_unplug_side` and {wrench:.1f} % of `disassemble` after {steps:,.0f} primitives, and P-DQN in "
             "{ball:.1f} % of `soccer` after {more:,.0f} ({seeds:word} seeds each).",
             dict(
-                steps=mean(rows("problems/results.csv", problem="primitives disassemble, dense", learner="hppo"), "frames"),
+                steps=mean(
+                    rows("problems/results.csv", problem="primitives disassemble, dense", learner="hppo"), "frames"
+                ),
                 more=mean(rows("problems/results.csv", problem="primitives soccer, dense"), "frames"),
                 drawer=success("drawer_close"),
                 peg=success("peg_unplug_side"),
@@ -1130,6 +1134,35 @@ def problems() -> list[Claim]:
             "With sparse rewards, H-PPO succeeds in {peg:.1f} % of `peg_unplug_side` and {drawer:.1f} % of "
             "`drawer_close`.",
             dict(peg=success("peg_unplug_side", "sparse"), drawer=success("drawer_close", "sparse")),
+        ),
+        Claim(
+            page("problems"),
+            "On `drawer_close` PETS and DLPA reach {drawer[0]:.1f} and {drawer[1]:.1f} % after {few:,.0f} primitives. "
+            "On `disassemble` they reach {wrench[0]:.1f} and {wrench[1]:.1f} %, and HyAR {hyar:.1f} % after "
+            "{more:,.0f}.",
+            dict(
+                drawer=[success("drawer_close", learner=low) for low in ("pets", "dlpa")],
+                wrench=[success("disassemble", learner=low) for low in ("pets", "dlpa")],
+                few=mean(
+                    rows("problems/results.csv", problem="primitives disassemble, dense", learner="pets"), "frames"
+                ),
+                hyar=success("disassemble", learner="hyar"),
+                more=mean(
+                    rows("problems/results.csv", problem="primitives disassemble, dense", learner="hyar"), "frames"
+                ),
+            ),
+        ),
+        Claim(
+            page("problems"),
+            "By position steps, H-PPO succeeds in {drawer:.1f} % of `drawer_close` and {wrench:.1f} % of "
+            "`disassemble`, with about as many of the simulator's steps. A selector that learns how to steer the arm "
+            "on `drawer_close` succeeds with {steering:word} of {seeds:word} seeds.",
+            dict(
+                drawer=success("drawer_close", "dense, actions=large_steps"),
+                wrench=success("disassemble", "dense, actions=large_steps"),
+                steering=sum(share == 1.0 for share in column(steering, "success")),
+                seeds=seeds(steering),
+            ),
         ),
         Claim(
             page("problems"),
@@ -1203,8 +1236,8 @@ def problems() -> list[Claim]:
         Claim(
             page("problems"),
             "A level above that chooses what to fetch first returns {first:.0f} (UCB, {seeds:word} seeds). One that "
-            "chooses the next goal every {length} steps returns {next:.0f} (meta-critic, {seeds:word} seeds, one of them "
-            "{lowest:.0f}). So options do not help there either.",
+            "chooses the next goal every {length} steps returns {next:.0f} (meta-critic, {seeds:word} seeds, one of "
+            "them {lowest:.0f}). So options do not help there either.",
             dict(
                 length=20,  # agent.option_length of the command
                 first=mean(goals["ucb over hppo",]),
