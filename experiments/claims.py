@@ -1109,14 +1109,21 @@ def problems() -> list[Claim]:
     def success(task: str, reward: str = "dense", learner: str = "hppo") -> float:
         return 100.0 * mean(rows("problems/results.csv", problem=f"primitives {task}, {reward}", learner=learner))
 
+    def of_wrench(learner: str) -> Rows:
+        return rows("problems/results.csv", problem="primitives disassemble, dense", learner=learner)
+
+    def each_success(runs: Rows) -> str:
+        *first, last = (f"{100.0 * share:.0f}" for share in column(runs, "success"))
+        return f"{', '.join(first)} and {last}"
+
     steering = rows("problems/results.csv", problem="primitives drawer_close, dense, actions=all")
 
     return [
         Claim(
             page("problems"),
             "With dense rewards, H-PPO succeeds in {drawer:.1f} % of the episodes of `drawer_close`, {peg:.1f} % of "
-            "`peg_unplug_side` and {wrench:.1f} % of `disassemble` after {steps:,.0f} primitives, and P-DQN in "
-            "{ball:.1f} % of `soccer` after {more:,.0f} ({seeds:word} seeds each).",
+            "`peg_unplug_side` and {wrench:.1f} % of `disassemble` after {steps:,.0f} primitives. P-DQN succeeds "
+            "in {ball:.1f} % of `soccer` after {more:,.0f} ({seeds:word} seeds each).",
             dict(
                 steps=mean(
                     rows("problems/results.csv", problem="primitives disassemble, dense", learner="hppo"), "frames"
@@ -1137,29 +1144,32 @@ def problems() -> list[Claim]:
         ),
         Claim(
             page("problems"),
-            "On `drawer_close` PETS and DLPA reach {drawer[0]:.1f} and {drawer[1]:.1f} % after {few:,.0f} primitives. "
-            "On `disassemble` they reach {wrench[0]:.1f} and {wrench[1]:.1f} %, and HyAR {hyar:.1f} % after "
-            "{more:,.0f}.",
+            "On `drawer_close` PETS succeeds in {drawer[0]:.1f} % and DLPA in {drawer[1]:.1f} % after {few:,.0f} "
+            "primitives. On `disassemble` PETS succeeds in {wrench[pets]} %, DLPA in {wrench[dlpa]} %, and HyAR in "
+            "{wrench[hyar]} % after {more:,.0f}.",
             dict(
                 drawer=[success("drawer_close", learner=low) for low in ("pets", "dlpa")],
-                wrench=[success("disassemble", learner=low) for low in ("pets", "dlpa")],
-                few=mean(
-                    rows("problems/results.csv", problem="primitives disassemble, dense", learner="pets"), "frames"
-                ),
-                hyar=success("disassemble", learner="hyar"),
-                more=mean(
-                    rows("problems/results.csv", problem="primitives disassemble, dense", learner="hyar"), "frames"
-                ),
+                few=mean(of_wrench("pets"), "frames"),
+                wrench={low: each_success(of_wrench(low)) for low in ("pets", "dlpa", "hyar")},
+                more=mean(of_wrench("hyar"), "frames"),
             ),
         ),
         Claim(
             page("problems"),
-            "By position steps, H-PPO succeeds in {drawer:.1f} % of `drawer_close` and {wrench:.1f} % of "
-            "`disassemble`, with about as many of the simulator's steps. A selector that learns how to steer the arm "
-            "on `drawer_close` succeeds with {steering:word} of {seeds:word} seeds.",
+            "With position steps, H-PPO succeeds in {drawer:.1f} % of `drawer_close` and {wrench:.1f} % of "
+            "`disassemble`.",
             dict(
                 drawer=success("drawer_close", "dense, actions=large_steps"),
                 wrench=success("disassemble", "dense, actions=large_steps"),
+            ),
+        ),
+        Claim(
+            page("problems"),
+            "It has as many of the simulator's steps as {steps:,.0f} primitives of the hand-written player take. A "
+            "selector that learns how to steer the arm on `drawer_close` succeeds with {steering:word} of "
+            "{seeds:word} seeds.",
+            dict(
+                steps=mean(of_wrench("hppo"), "frames"),
                 steering=sum(share == 1.0 for share in column(steering, "success")),
                 seeds=seeds(steering),
             ),
@@ -1224,8 +1234,8 @@ def problems() -> list[Claim]:
         Claim(page("problems"), "H-PPO passes it with {reaching:word} of {seeds:word}.", hppo),
         Claim(
             page("problems"),
-            "With four options that learn where to end, the option-critic over P-DQN arrives with {arriving:word} of "
-            "{seeds:word} seeds (mean {mean:,.0f}), so options do not help there.",
+            "Four options with learned terminations do not help: the option-critic over P-DQN arrives with "
+            "{arriving:word} of {seeds:word} seeds (mean {mean:,.0f}).",
             dict(
                 arriving=sum(score > 0.0 for score in column(four_options, "score")),
                 seeds=seeds(four_options),
@@ -1235,9 +1245,9 @@ def problems() -> list[Claim]:
         ),
         Claim(
             page("problems"),
-            "A level above that chooses what to fetch first returns {first:.0f} (UCB, {seeds:word} seeds). One that "
-            "chooses the next goal every {length} steps returns {next:.0f} (meta-critic, {seeds:word} seeds, one of "
-            "them {lowest:.0f}). So options do not help there either.",
+            "With a selector (UCB) that chooses what to fetch first, the mean return is {first:.0f} ({seeds:word} "
+            "seeds). With a meta-critic that chooses the next goal every {length} steps, it is {next:.0f} "
+            "({seeds:word} seeds, one of them {lowest:.0f}). So options do not help there either.",
             dict(
                 length=20,  # agent.option_length of the command
                 first=mean(goals["ucb over hppo",]),
