@@ -1030,42 +1030,76 @@ def hybrid_control() -> list[Claim]:
 
 
 def exploration() -> list[Claim]:
-    def runs(problem: str, kind: str) -> Rows:
-        return rows("exploration/results.csv", problem=problem, learner="hppo", exploration=kind)
+    def runs(problem: str, kind: str, learner: str = "hppo") -> Rows:
+        return rows("exploration/results.csv", problem=problem, learner=learner, exploration=kind)
 
-    counts = column(runs("platform", "counts"), "score")
+    def successful(problem: str, kind: str, learner: str = "hppo") -> list[Any]:
+        return [row["score"] for row in runs(problem, kind, learner) if row["success"] >= 0.99]
+
+    kinds = ("none", "held", "counts", "novelty", "options")
     arriving = {
-        kind: sum(success == 1.0 for success in column(runs("pinball", kind), "success"))
-        for kind in ("none", "counts", "held")
+        learner: {kind: len(successful("pinball", kind, learner)) for kind in kinds} for learner in ("hppo", "pdqn")
     }
+    platform = {learner: [mean(runs("platform", kind, learner)) for kind in kinds] for learner in ("hppo", "pdqn")}
+    counts = column(runs("platform", "counts"), "score")
+    held = sorted(successful("office", "held"))
+    num = seeds(runs("office", "counts"))
     return [
         Claim(
             page("exploration"),
-            "With H-PPO and {seeds:word} seeds, no kind helps on Platform, Crossing or Pinball.",
-            dict(seeds=seeds(runs("platform", "held"))),
+            "With `counts` {counts:word} of {seeds:word} seeds deliver in at least {least:.0f} % of the episodes (mean "
+            "return {mean:.0f}). With `held` {held:word} of them do ({returns}), and the third never arrives. Without "
+            "further exploration, with `novelty` and with options none does.",
+            dict(
+                counts=len(successful("office", "counts")),
+                seeds=num,
+                least=100.0 * min(column(runs("office", "counts"), "success")),
+                mean=mean(runs("office", "counts")),
+                held=len(held),
+                returns=" and ".join(f"{score:.0f}" for score in held),
+            ),
+            holds=not any(successful("office", kind) for kind in ("none", "novelty", "options"))
+            and min(column(runs("office", "held"), "success")) == 0.0,
+        ),
+        Claim(page("exploration"), "no kind helps there. {seeds:Word} seeds each:", dict(seeds=num)),
+        Claim(
+            page("exploration"),
+            "**Crossing.** No kind does harm, with either learner.",
+            {},
+            holds=all(
+                min(column(runs("crossing", kind, learner), "success")) == 1.0
+                for learner in ("hppo", "pdqn")
+                for kind in kinds[:-1]
+            ),
         ),
         Claim(
             page("exploration"),
-            "On Pinball's simple map H-PPO with its recipe arrives with {none:word} of {seeds:word} seeds and no "
-            "further exploration, with {counts:word} by `counts`, with {held:word} by `held`, and with none by "
-            "`novelty` or options.",
-            dict(seeds=seeds(runs("pinball", "none")), **arriving),
+            "H-PPO returns {hppo[0]:.3f} without, and {hppo[1]:.3f}, {hppo[2]:.3f} and {hppo[3]:.3f} with `held`, "
+            "`counts` and `novelty`. P-DQN returns {pdqn[0]:.3f} without, and {pdqn[1]:.3f}, {pdqn[2]:.3f} and "
+            "{pdqn[3]:.3f} with them.",
+            platform,
         ),
         Claim(
             page("exploration"),
-            "With `counts` {ending:word} of {seeds:word} seeds ends at {lowest:.3f} on Platform instead of "
-            "{others:.3f}.",
+            "With `counts` {ending:word} of {seeds:word} seeds of H-PPO ends at {lowest:.3f} instead of {others:.3f}. "
+            "Options of four steps do harm: {hppo:.3f} (H-PPO) and {pdqn:.3f} (P-DQN).",
             dict(
                 ending=sum(score < 0.99 for score in counts),
                 seeds=len(counts),
                 lowest=min(counts),
                 others=max(counts),
+                **{learner: of_kinds[-1] for learner, of_kinds in platform.items()},
             ),
         ),
         Claim(
             page("exploration"),
-            "Options of four steps do harm there: {options:.3f} instead of {none:.3f}.",
-            dict(options=mean(runs("platform", "options")), none=mean(runs("platform", "none"))),
+            "H-PPO arrives with {hppo[none]:word} of {seeds:word} seeds and no further exploration, with "
+            "{hppo[counts]:word} by `counts`, with {hppo[held]:word} by `held`, and with none by `novelty` or options. "
+            "P-DQN arrives with {pdqn[none]:word} of {seeds:word} seeds without, by `held` and by `counts`, with "
+            "{pdqn[novelty]:word} by `novelty`, and with none by options.",
+            dict(seeds=seeds(runs("pinball", "none")), **arriving),
+            holds=arriving["hppo"]["novelty"] == arriving["hppo"]["options"] == arriving["pdqn"]["options"] == 0
+            and arriving["pdqn"]["held"] == arriving["pdqn"]["counts"] == arriving["pdqn"]["none"],
         ),
     ]
 
