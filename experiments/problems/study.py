@@ -233,9 +233,9 @@ def draw(curves: Rows, path: Path) -> None:
             for (learner, exploration), runs in groups(rows, *RUN[1:-1]).items():
                 x, mean, deviation = curve(runs, "frames", "score")
                 label = learner if exploration == "none" else f"{learner}, {exploration}"
-                axes.plot(x, mean, marker=".", label=label, color=LEARNER_COLOURS[learner])
+                axes.plot(x, mean, marker=".", label=label, color=LEARNER_COLOURS.get(learner))
                 ends = mean - deviation, mean + deviation
-                axes.fill_between(x, *ends, color=LEARNER_COLOURS[learner], alpha=0.15, linewidth=0)
+                axes.fill_between(x, *ends, color=LEARNER_COLOURS.get(learner), alpha=0.15, linewidth=0)
             axes.set(title=task, xlabel="primitives", ylabel="success, greedy", ylim=(-0.02, 1.02))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.legend(frameon=False, fontsize=7)
