@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
 
 # Colours of Okabe and Ito and of Tol, which colour-blind people can tell apart. Each has one meaning in all figures.
 AGENT, INK, FAINT = "#0072B2", "#2b2b2b", "#8c8c8c"
@@ -48,6 +50,12 @@ STYLE: Any = {
     "text.color": INK,
     "savefig.dpi": 160,
 }
+
+
+def draw_spread(axes: Axes, x: ArrayLike, mean: np.ndarray, deviation: np.ndarray, *style: str, **line: Any) -> None:
+    """Draw a line, and a band of one deviation in its colour; the other arguments are those of `Axes.plot`."""
+    colour = axes.plot(x, mean, *style, **line)[0].get_color()
+    axes.fill_between(x, mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
 
 
 def label_ends(axes: Axes, labels: list[tuple[float, str, str]], ends: float = 1.0) -> None:

@@ -33,6 +33,7 @@ from hpamdp.analysis.study import (
     with_enough_seeds,
 )
 from hpamdp.env.boatdock.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
+from hpamdp.figure_style import draw_spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -174,9 +175,7 @@ def draw_curves(curves: Rows, column: str, label: str, path: Path) -> None:
             rows = [row for row in curves if row["low"] == low and row["high"] == high]
             if not rows:
                 continue
-            x, mean, deviation = curve(rows, "frames", column)
-            axes.plot(x, mean, color=colour, linewidth=1.5, label=high)
-            axes.fill_between(x, mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
+            draw_spread(axes, *curve(rows, "frames", column), color=colour, linewidth=1.5, label=high)
         _label(axes, low, "presses", label)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.legend(fontsize=7, frameon=False, ncols=2)

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from hpamdp.analysis.study import Rows, Run, add_to_tables, curve, difference, finished, groups, read_csv, spread
-from hpamdp.figure_style import STYLE
+from hpamdp.figure_style import STYLE, draw_spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -118,9 +118,7 @@ def _draw_panel(axes: Axes, rows: Rows, bar: float) -> None:
     found = groups(rows, "variant")
     for name, label in VARIANTS.items():
         if (name,) in found:
-            x, mean, deviation = curve(found[name,], "frames", "score")
-            axes.plot(x, mean, color=COLOURS[name], label=label)
-            axes.fill_between(x, mean - deviation, mean + deviation, color=COLOURS[name], alpha=0.15, linewidth=0)
+            draw_spread(axes, *curve(found[name,], "frames", "score"), color=COLOURS[name], label=label)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.legend(frameon=False, fontsize=7, loc="lower right")
 

@@ -28,6 +28,7 @@ from hpamdp.analysis.study import (
     write_tables,
 )
 from hpamdp.env.boatdock.reference import HUMAN
+from hpamdp.figure_style import draw_spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -157,9 +158,7 @@ def draw(curves: Rows, path: Path) -> None:
 
 
 def _draw_curve(axes: Axes, rows: Rows, label: str, colour: str, style: str) -> None:
-    x, mean, deviation = curve(rows, "frames", "score")
-    axes.plot(x, mean, style, color=colour, linewidth=1.6, label=label)
-    axes.fill_between(x, mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
+    draw_spread(axes, *curve(rows, "frames", "score"), style, color=colour, linewidth=1.6, label=label)
 
 
 def main(folders: Sequence[str]) -> None:

@@ -32,7 +32,7 @@ from hpamdp.analysis.study import (
 )
 from hpamdp.env.primitives.manipulation import ACTIONS, Reward, Task
 from hpamdp.env.primitives.players import MEASURED
-from hpamdp.figure_style import LEARNER_COLOURS, STYLE
+from hpamdp.figure_style import LEARNER_COLOURS, STYLE, draw_spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -231,11 +231,9 @@ def draw(curves: Rows, path: Path) -> None:
         panels = figure.subplots(1, len(shown), squeeze=False)[0]
         for axes, (task, rows) in zip(panels, shown.items(), strict=True):
             for (learner, exploration), runs in groups(rows, *RUN[1:-1]).items():
-                x, mean, deviation = curve(runs, "frames", "score")
                 label = learner if exploration == "none" else f"{learner}, {exploration}"
-                axes.plot(x, mean, marker=".", label=label, color=LEARNER_COLOURS.get(learner))
-                ends = mean - deviation, mean + deviation
-                axes.fill_between(x, *ends, color=LEARNER_COLOURS.get(learner), alpha=0.15, linewidth=0)
+                drawn = curve(runs, "frames", "score")
+                draw_spread(axes, *drawn, marker=".", label=label, color=LEARNER_COLOURS.get(learner))
             axes.set(title=task, xlabel="primitives", ylabel="success, greedy", ylim=(-0.02, 1.02))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.legend(frameon=False, fontsize=7)
