@@ -223,15 +223,20 @@ def test_initial_parameters_lead_grasps_to_the_object_and_pulls_towards_the_goal
     assert not metres[12:].any()  # position steps begin at rest
 
 
+def with_initial_parameters(env, state, name):
+    """Return the states after every arm takes this primitive with its initial parameters."""
+    weight, bias = env.initial_parameters()
+    unit = (state[keys.OBSERVATION] @ weight.T + bias).clamp(-1.0, 1.0)
+    number = torch.full((env.num_envs,), env.discrete_names.index(name))
+    parameters = PAMDPSpecs.from_env(env).from_unit(unit)
+    action = TensorDict({"discrete": number, "parameters": parameters}, batch_size=env.batch_size)
+    return env.step(state.set("action", action))["next"]
+
+
 @needs_simulator
 def test_a_grasp_with_the_initial_parameters_holds_the_object():
     env = PrimitivesEnv(4, task="soccer", reach=0.4, negative_distances=False)
-    state = env.reset()
-    weight, bias = env.initial_parameters()
-    specs = PAMDPSpecs.from_env(env)
-    parameters = specs.from_unit((state[keys.OBSERVATION] @ weight.T + bias).clamp(-1.0, 1.0))
-    action = TensorDict({"discrete": torch.ones(4, dtype=torch.long), "parameters": parameters}, batch_size=[4])
-    after = env.step(state.set("action", action))["next", keys.OBSERVATION]
+    after = with_initial_parameters(env, env.reset(), "grasp")[keys.OBSERVATION]
     assert (after[:, 4:7].norm(dim=-1) / 2.0 < 0.06).all()
 
 
@@ -239,16 +244,10 @@ def test_a_grasp_with_the_initial_parameters_holds_the_object():
 @pytest.mark.parametrize("task", ["soccer", "assembly"])
 def test_the_players_choices_with_the_initial_parameters_succeed(task):
     env = PrimitivesEnv(1, task=task, reach=0.4, negative_distances=False)
-    specs = PAMDPSpecs.from_env(env)
-    weight, bias = env.initial_parameters()
     state = env.reset()
     for _ in range(5):
-        seen = state[keys.OBSERVATION]
-        name, _ = players.choose(task, seen[0].numpy() / 2.0)  # offsets in metres
-        parameters = specs.from_unit((seen @ weight.T + bias).clamp(-1.0, 1.0))
-        number = torch.tensor([env.discrete_names.index(name)])
-        action = TensorDict({"discrete": number, "parameters": parameters}, batch_size=[1])
-        state = env.step(state.set("action", action))["next"]
+        name, _ = players.choose(task, state[keys.OBSERVATION][0].numpy() / 2.0)  # offsets in metres
+        state = with_initial_parameters(env, state, name)
     assert state["success"].item()
 
 

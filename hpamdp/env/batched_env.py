@@ -355,20 +355,26 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         return {}
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return the columns of the state, `[N]` each."""
-        return self.state._asdict()
+        """Return the columns of the state and the checksums of files, `[N]` each."""
+        checksums = {name: checksum.repeat(self.num_envs) for name, checksum in self.file_checksums().items()}
+        return self.state._asdict() | checksums
 
     def film_state(self, num: int) -> dict[str, Tensor]:
         """Return the columns of the state alone, of the first `num` environments."""
         return {name: column[:num].cpu().clone() for name, column in self.state._asdict().items()}
 
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Refuse counters and outcomes that do not exist.
+        """Refuse counters and outcomes that do not exist, and the state of another version of a file.
 
         Raises:
-            ValueError: a number is invalid.
+            ValueError: a number is invalid, or a file was edited since.
         """
         super().check_env_state(columns)
+        for name, checksum in self.file_checksums().items():
+            if (columns[name] != checksum).any():
+                setting = name.removesuffix("_checksum")
+                file = getattr(self.options, setting)
+                raise ValueError(f"the file env.{setting}={file!r} is no longer the one of this state")
         steps, outcome, episode = self._state._fields[-3:]
         check_range(columns, {steps: (0, 2**30), outcome: (0, len(self.outcomes)), episode: (-1, 2**30)})
 
@@ -381,7 +387,9 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         if not columns:
             self._reset()
             return
-        self.state = restored(columns, self._state, type(self).__name__)
+        checksums = self.file_checksums()
+        own = {name: column for name, column in columns.items() if name not in checksums}
+        self.state = restored(own, self._state, type(self).__name__)
 
     def seed_evaluation(self, seed: int) -> None:
         """Begin with the episodes of an evaluation, which no training meets, whatever its seed."""

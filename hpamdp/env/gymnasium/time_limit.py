@@ -27,11 +27,9 @@ def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
     own = getattr(env.unwrapped, "own_time_limit", None)  # of this package's problems, which end their episodes
     if _is_whole(own) and own >= 1:
         limits.append(own)
-    if max_steps is None and not limits:
-        max_steps = _limit_of_spec(env)
     if max_steps is None:
-        return min(limits)
-    if min(limits, default=max_steps) < max_steps:
+        return min(limits) if limits else _limit_of_spec(env)
+    if limits and min(limits) < max_steps:
         raise SettingError(
             f"max_steps={max_steps}: the environment ends its episodes after {min(limits)}; give less or null"
         )

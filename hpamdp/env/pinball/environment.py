@@ -106,32 +106,6 @@ class PinballEnv(BatchedEnv[PinballState]):
         """The balls' positions, `[N, 2]`."""
         return torch.stack([self.state.x, self.state.y], -1)
 
-    def env_state(self) -> dict[str, Tensor]:
-        """Return the columns of the state, `[N]` each, and the checksum of a map of one's own."""
-        checksums = {name: checksum.repeat(self.num_envs) for name, checksum in self.file_checksums().items()}
-        return {**super().env_state(), **checksums}
-
-    def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Refuse counters and outcomes that do not exist, and the state of another version of the map's file.
-
-        Raises:
-            ValueError: a number is invalid.
-        """
-        checksums = self.file_checksums()
-        for name, checksum in checksums.items():
-            if (columns[name] != checksum).any():
-                raise ValueError(f"the file env.map={self.options.map!r} is no longer the one of this state")
-        super().check_env_state({name: column for name, column in columns.items() if name not in checksums})
-
-    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Continue from an `env_state`.
-
-        Raises:
-            ValueError: it is not the state of this many environments.
-        """
-        checksums = self.file_checksums()
-        super().set_env_state({name: column for name, column in columns.items() if name not in checksums})
-
     def file_checksums(self) -> dict[str, Tensor]:
         """Return the number of a map of one's own, `[1]`; none for the maps of the source."""
         if self.options.map in maps.OWN_MAPS:

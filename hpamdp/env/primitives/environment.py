@@ -138,7 +138,7 @@ class PrimitivesEnv(GymnasiumEnv):
         """
         metres = torch.zeros(sum(self.parameter_dims), len(OBSERVED), dtype=torch.float32)
         constant = torch.zeros(sum(self.parameter_dims), dtype=torch.float32)
-        is_assembly = self._given.task == "assembly"
+        ring = torch.tensor(RING_FROM_HANDLE_M, dtype=torch.float32)
         row = 0
         for action in ACTIONS[self._given.actions]:
             if action in PRIMITIVES and action.num_arguments == 3:
@@ -146,9 +146,8 @@ class PrimitivesEnv(GymnasiumEnv):
             elif action.num_arguments == 1:
                 axis = torch.tensor(AXES[action.name], dtype=torch.float32)
                 metres[row, _GOAL] = axis
-                if is_assembly:
-                    clearance = _CLEARANCE_M * axis[2].abs()
-                    constant[row] = clearance - axis @ torch.tensor(RING_FROM_HANDLE_M, dtype=torch.float32)
+                if self._given.task == "assembly":
+                    constant[row] = _CLEARANCE_M * axis[2].abs() - axis @ ring
             row += action.num_arguments
         # An offset of 1 in [-1, 1] is that many metres; offsets of 0 are in the middle.
         metres *= torch.as_tensor((HIGHEST - LOWEST) / 2.0)

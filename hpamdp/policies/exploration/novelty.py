@@ -165,9 +165,9 @@ class Novelty(RewardsNewStates):
             raise SettingError(f"in_plans=disagreement: {type(learner).__name__} has no ensemble that predicts states")
         asks_ensemble = learner.knows_disagreement and self.options.in_plans != "distillation"
         if asks_ensemble:  # no error, since the learner of another option may have the networks
-            for name, default in NoveltyOptions().model_dump(exclude={"weight", "in_plans"}).items():
+            for name, setting in NoveltyOptions.model_fields.items():
                 value = getattr(self.options, name)
-                if value != default:
+                if _OfNetworks in setting.metadata and value != setting.default:
                     bonus = f"{type(learner).__name__}, whose bonus is the disagreement of its ensemble"
                     warn(f"exploration.{name}={value}: has no effect on {bonus}; in_plans=distillation has networks")
         return asks_ensemble
