@@ -91,7 +91,7 @@ def test_a_time_limit_counts_the_time_before_a_resumption_and_is_followed_by_an_
     words = [
         f"resume={tmp_path / 'a'}",
         "total_frames=6400000",
-        f"callbacks=[{{name:time_limit,minutes:{wall_s / 60}}}]",
+        f"callbacks=[{{name:time_limit,minutes:{0.99 * wall_s / 60}}}]",
     ]
     assert run(compose_config(words), tmp_path / "b", words) == 0
     assert json.loads((tmp_path / "b/summary.json").read_text())["frames"] == 64
@@ -99,7 +99,7 @@ def test_a_time_limit_counts_the_time_before_a_resumption_and_is_followed_by_an_
     assert run(compose_config(words), tmp_path / "c", words) == 0
     last = rows_of(tmp_path / "c")[-1]
     assert 64 < float(last["frames"]) < 6400000 and last["eval/score"]
-    assert wall_s + 0.2 <= float(last["wall_s"]) < wall_s + 2.0
+    assert wall_s + 0.2 <= float(last["wall_s"]) < wall_s + 30.0  # even on a busy machine
 
 
 def test_the_best_agent_is_kept_and_can_be_scored_and_watched(scores, tmp_path):
