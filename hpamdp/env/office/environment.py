@@ -7,11 +7,11 @@ differences.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import Field, PositiveInt
+from pydantic import PositiveInt
 from torch import Tensor
 from torchrl.data import Binary, TensorSpec
 
@@ -23,6 +23,7 @@ from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.office import kernel, player, rendering, rules
 from hpamdp.env.office.rules import OfficeState
 from hpamdp.env.state_columns import check_range
+from hpamdp.env.tiles import NumTiles, tile_names
 from hpamdp.settings import Fraction, Settings
 
 # Expected return and success of the player that knows the map, with the default settings.
@@ -36,7 +37,7 @@ class OfficeOptions(Settings):
     """Steps after which an episode is truncated."""
     slip: Fraction = 0.1
     """Probability that a move slips to the other axis."""
-    tiles: Annotated[int, Field(ge=0, le=100)] = 0
+    tiles: NumTiles = 0
     """Numbers of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
 
     From them a network tells places apart more easily, as from the one-hot coordinates of Rooms.
@@ -84,8 +85,7 @@ class OfficeEnv(BatchedEnv[OfficeState]):
         return ProblemFacts(title=cls.__name__, default_options=axes, has_oracle=True)
 
     def _prepare(self) -> None:
-        tiles = tuple(f"{axis}_{i}" for axis in "xy" for i in range(self.options.tiles))
-        self.observation_names = rules.OBSERVATION_NAMES + tiles
+        self.observation_names = rules.OBSERVATION_NAMES + tile_names(self.options.tiles)
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the probability of a slip and the number of tiles."""

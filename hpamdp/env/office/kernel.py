@@ -12,7 +12,6 @@ import numpy as np
 from hpamdp.env import kernels
 from hpamdp.env.kernels import (
     EPISODE_ROW,
-    HALF,
     NUM_OPTIONS,
     ONE,
     OUTCOME_ROW,
@@ -24,6 +23,7 @@ from hpamdp.env.kernels import (
     part,
 )
 from hpamdp.env.office import rules
+from hpamdp.env.tiles import write_tiles
 
 SLIP, TILES = range(kernels.OWN, kernels.OWN + 2)  # the problem's own settings
 
@@ -98,10 +98,7 @@ def _observe(floats: Any, integers: Any, row: Any, tiles: Any, observation: Any)
     observation[0], observation[1] = TWO * y - ONE, TWO * x - ONE
     observation[2] = TWO * _F(integers[_COFFEE, row]) - ONE
     observation[3] = TWO * _F(integers[_MAIL, row]) - ONE
-    for tile in range(tiles):
-        middle = _F(tile) + HALF
-        observation[4 + tile] = max(ONE - abs(x * _F(tiles) - middle), ZERO)
-        observation[4 + tiles + tile] = max(ONE - abs(y * _F(tiles) - middle), ZERO)
+    write_tiles(x, y, tiles, observation, 4)
 
 
 @kernel

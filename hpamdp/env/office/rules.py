@@ -18,6 +18,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hpamdp.env.tiles import tiles_of
+
 UP, DOWN, LEFT, RIGHT = range(4)
 ACTIONS = ("up", "down", "left", "right")
 LONGEST = 0.05  # the longest move
@@ -140,11 +142,8 @@ def goal_in_mind(is_open: Tensor, option: Tensor) -> Tensor:
 def observe(state: OfficeState, tiles: int = 0) -> Tensor:
     """Return the observation `[N, 4 + 2 tiles]`.
 
-    It has the entries OBSERVATION_NAMES, scaled to [-1, 1], then x and y again as `tiles` numbers in [0, 1] each. A
-    number is 1 in the middle of its tile and falls linearly to 0 in the middle of the next one.
+    It has the entries OBSERVATION_NAMES, scaled to [-1, 1], then x and y again as tiles, see `hpamdp.env.tiles`.
     """
     flags = (state.coffee.to(state.x.dtype), state.mail.to(state.x.dtype))
-    seen = [2.0 * torch.stack([state.y, state.x, *flags], -1) - 1.0]
-    middle = torch.arange(tiles, dtype=state.x.dtype, device=state.x.device) + 0.5
-    seen += [(1.0 - (at.unsqueeze(-1) * tiles - middle).abs()).clamp(min=0.0) for at in (state.x, state.y)]
-    return torch.cat(seen, -1)
+    seen = 2.0 * torch.stack([state.y, state.x, *flags], -1) - 1.0
+    return torch.cat([seen, tiles_of(state.x, state.y, tiles)], -1)

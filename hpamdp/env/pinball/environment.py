@@ -21,6 +21,7 @@ from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.pinball import kernel, maps, rendering, rules
 from hpamdp.env.pinball.planner import Planner
 from hpamdp.env.pinball.rules import PinballState
+from hpamdp.env.tiles import NumTiles, tile_names
 from hpamdp.settings import SettingError, Settings
 
 _GRID = 100  # places in a row from which a ball may start anywhere
@@ -41,6 +42,11 @@ class PinballOptions(Settings):
     """
     max_steps: PositiveInt = 600
     """Steps after which an episode is truncated."""
+    tiles: NumTiles = 0
+    """Numbers of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
+
+    From them a network tells the two sides of a thin wall apart more easily.
+    """
 
 
 class PinballEnv(BatchedEnv[PinballState]):
@@ -64,7 +70,6 @@ class PinballEnv(BatchedEnv[PinballState]):
     unguarded_values: ClassVar[Mapping[str, tuple[object, ...]]] = {"map": maps.OWN_MAPS}
     discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
-    observation_names = rules.OBSERVATION_NAMES
     parameter_dims = rules.PARAMETER_DIMS
     parameter_low = rules.PARAMETER_LOW
     parameter_high = rules.PARAMETER_HIGH
@@ -85,6 +90,7 @@ class PinballEnv(BatchedEnv[PinballState]):
             self._planner = Planner(self.map, self.device) if self._has_oracle else None
         except maps.MapError as error:
             raise SettingError(f"map={self.options.map!r}: {error}") from error
+        self.observation_names = rules.OBSERVATION_NAMES + tile_names(self.options.tiles)
         self._table = rules.make_table(self.map, (self._training_places, self._places), self.device)
 
     @property
@@ -93,13 +99,14 @@ class PinballEnv(BatchedEnv[PinballState]):
         return self.options.training_start not in (None, self.options.start)
 
     def kernel_settings(self) -> Sequence[float]:
-        """Return the map in numbers."""
-        return kernel.settings_of(self.map, (self._training_places, self._places))
+        """Return the tiles and the map in numbers."""
+        return kernel.settings_of(self.map, (self._training_places, self._places), self.options.tiles)
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
-        """The lowest and the highest observation, `[4]` each."""
-        return [-1.0] * 4, [1.0] * 4
+        """The lowest and the highest observation, `[4 + 2 tiles]` each."""
+        num, tiles = len(rules.OBSERVATION_NAMES), 2 * self.options.tiles
+        return [-1.0] * num + [0.0] * tiles, [1.0] * (num + tiles)
 
     @property
     def position(self) -> Tensor:
@@ -122,8 +129,8 @@ class PinballEnv(BatchedEnv[PinballState]):
         return rules.act(state, action.discrete, action.parameters.squeeze(-1), self._table)
 
     def observe(self, state: PinballState) -> Tensor:
-        """Return the observations `[N, 4]`."""
-        return rules.observe(state)
+        """Return the observations `[N, 4 + 2 tiles]`."""
+        return rules.observe(state, self.options.tiles)
 
     def scripted_action(self, state: PinballState) -> tuple[Tensor, Tensor]:
         """Return the action of the hand-written player and its strength, `[N]` each."""

@@ -15,13 +15,14 @@ from hpamdp.env.kernels import ONE, OUTCOME_ROW, TWO, ZERO, kernel, part
 from hpamdp.env.pinball import rules
 from hpamdp.env.pinball.maps import PinballMap
 from hpamdp.env.rng_streams import TRAINING
+from hpamdp.env.tiles import write_tiles
 
-# The problem's own settings: the map. After these numbers follow the polygons, the edges, and the places to start:
-# those of training, then those of evaluation.
-BALL, TARGET_X, TARGET_Y, TARGET_RADIUS, NUM_POLYGONS, NUM_EDGES, NUM_TRAINING, NUM_PLACES = range(
-    kernels.OWN, kernels.OWN + 8
+# The problem's own settings: the tiles that are observed, and the map. After these numbers follow the polygons, the
+# edges, and the places to start: those of training, then those of evaluation.
+TILES, BALL, TARGET_X, TARGET_Y, TARGET_RADIUS, NUM_POLYGONS, NUM_EDGES, NUM_TRAINING, NUM_PLACES = range(
+    kernels.OWN, kernels.OWN + 9
 )
-_FIRST = kernels.OWN + 8
+_FIRST = kernels.OWN + 9
 
 _X, _Y, _VX, _VY = range(4)
 # Columns of a polygon: its edges, and the box around it.
@@ -36,8 +37,8 @@ _MOVES = _F((rules.TICKS + 1.0) / rules.TICKS)  # of a step, with that after a t
 _SLACK = _F(1e-4)  # for rounding
 
 
-def settings_of(found: PinballMap, places: tuple[np.ndarray, np.ndarray]) -> list[float]:
-    """Return a map and the places to start as the kernel's own settings; see `rules.Table`."""
+def settings_of(found: PinballMap, places: tuple[np.ndarray, np.ndarray], tiles: int = 0) -> list[float]:
+    """Return the number of tiles, a map and the places to start as the kernel's own settings; see `rules.Table`."""
     edges = found.edges()
     polygons, begin = [], 0
     for polygon in found.polygons:
@@ -46,6 +47,7 @@ def settings_of(found: PinballMap, places: tuple[np.ndarray, np.ndarray]) -> lis
         begin += len(polygon)
     columns = [*edges.corner.T, *edges.side.T, (edges.side**2).sum(-1), edges.polygon]
     return [
+        tiles,
         found.ball,
         *found.target,
         len(polygons),
@@ -173,6 +175,7 @@ def advance(
         begin, end = end_edges, end_training
     starts = settings[begin:end].reshape((-1, 2))
     near = np.empty(len(edges), np.int64)
+    tiles = int(settings[TILES])
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.ROLLING
         if mode != kernels.RESTART and mask[row] and not was_over:
@@ -194,5 +197,6 @@ def advance(
             observations[reading, row, 1] = TWO * floats[_Y, row] - ONE
             observations[reading, row, 2] = floats[_VX, row] / _MAX_SPEED
             observations[reading, row, 3] = floats[_VY, row] / _MAX_SPEED
+            write_tiles(floats[_X, row], floats[_Y, row], tiles, observations[reading, row], 4)
             kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
     return -1

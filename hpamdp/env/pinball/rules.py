@@ -8,6 +8,7 @@ Differs from the source:
   source does both with angles, which is equal up to rounding.
 - Strengths outside their bounds are clipped.
 - The time limit truncates.
+- With `tiles` the observation also has the position as tiles.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from torch import Tensor
 from hpamdp.env import counter_rng
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.pinball.maps import PinballMap
+from hpamdp.env.tiles import tiles_of
 
 RIGHT, UP, LEFT, DOWN, NONE = range(5)
 ACTIONS = ("right", "up", "left", "down", "none")
@@ -186,8 +188,11 @@ def _put_back(place: Tensor) -> Tensor:
     return torch.where(place < 0.0, LOW_PLACE, place)
 
 
-def observe(state: PinballState) -> Tensor:
-    """Return the observation `[N, 4]` with the entries OBSERVATION_NAMES, scaled to [-1, 1]."""
+def observe(state: PinballState, tiles: int = 0) -> Tensor:
+    """Return the observation `[N, 4 + 2 tiles]`.
+
+    It has the entries OBSERVATION_NAMES, scaled to [-1, 1], then x and y again as tiles, see `hpamdp.env.tiles`.
+    """
     place = torch.stack([state.x, state.y], -1)
     speed = torch.stack([state.vx, state.vy], -1)
-    return torch.cat([2.0 * place - 1.0, speed / MAX_SPEED], -1)
+    return torch.cat([2.0 * place - 1.0, speed / MAX_SPEED, tiles_of(state.x, state.y, tiles)], -1)

@@ -1,0 +1,121 @@
+"""Train PEARL with its authors' code and settings on their own Pinball or Office.
+
+python experiments/peers/pearl.py PEARL_FOLDER pinball|office SEED FILE [EPISODES]
+    writes the curve to a csv file after each evaluation. PEARL_FOLDER is a clone of the authors' repository.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import runpy
+import subprocess
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# Episodes of training, and of an evaluation. Nothing is random in a greedy episode on Pinball, and it takes seconds.
+TRAINING = {"pinball": 1000, "office": 2100}
+EVALUATION = {"pinball": 1, "office": 100}
+
+
+class NoWriter:
+    """Stands for TensorBoard's writer, so that logs need no installation and no time."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        pass
+
+    def add_scalar(self, *args: Any) -> None:
+        """Ignore a value."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def cpu_seconds() -> float:
+    """Return the CPU seconds of this process."""
+    return sum(os.times()[:2])
+
+
+def keep_curve(name: dict[str, Any], file: Path) -> None:
+    """Replace the evaluation of PEARL's code by one that is kept in the file and costs no CPU time of training.
+
+    The code's pictures and files are left out.
+    """
+    from src.agents.pearl import PEARL
+    from src.data_structures.cat import CAT
+    from src.misc.log import LogExperiments
+
+    def ignore(*args: Any, **kwargs: Any) -> None:
+        pass
+
+    for owner, method in (
+        (CAT, "plot_cat"),
+        (LogExperiments, "plot_result"),
+        (LogExperiments, "print_qtable"),
+        (LogExperiments, "save_execution"),
+    ):
+        if not hasattr(owner, method):
+            raise SystemExit(f"{owner.__name__}.{method}: this version of PEARL's code does not have it")
+        setattr(owner, method, ignore)
+
+    evaluate = PEARL.evaluate_policy
+    rows: list[dict[str, Any]] = []
+    evaluations_cpu_s = 0.0
+    began = cpu_seconds()
+
+    def evaluate_and_keep(self, episode, *args: Any, **kwargs: Any) -> float:
+        nonlocal evaluations_cpu_s
+        now = cpu_seconds()
+        success = evaluate(self, episode, *args, **kwargs)
+        returns = self.log._evaluation_data["reward_list"][-1]
+        rows.append(
+            {
+                **name,
+                "episodes": episode,
+                "steps": sum(self.log._learning_data["steps"]),
+                "cpu_s": round(now - began - evaluations_cpu_s, 1),
+                "score": round(float(np.mean(returns)), 1),
+                "success": round(float(success), 4),
+            }
+        )
+        with file.open("w", newline="") as opened:
+            writer = csv.DictWriter(opened, rows[0])
+            writer.writeheader()
+            writer.writerows(rows)
+        print(rows[-1], flush=True)
+        evaluations_cpu_s += cpu_seconds() - now
+        return success
+
+    PEARL.evaluate_policy = evaluate_and_keep
+
+
+def main(folder: Path, problem: str, seed: int, file: Path, episodes: int) -> None:
+    """Train and score."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    os.chdir(folder)
+    sys.path.insert(0, str(folder))
+    version = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+    tensorboard = types.ModuleType("torch.utils.tensorboard")
+    tensorboard.SummaryWriter = NoWriter
+    sys.modules["torch.utils.tensorboard"] = tensorboard
+    name = {"problem": problem, "library": "pearl", "version": version.stdout.strip(), "learner": "pearl", "seed": seed}
+    words = f"--yaml yamls/{problem}_flexible_0.yaml --trial {seed} --result_dir results --method_dir {os.getpid()}"
+    words += f" --episode_max {episodes} --eval_episodes {EVALUATION[problem]}"
+    sys.argv = ["main.py", *words.split()]
+    keep_curve(name, file)
+    runpy.run_path("main.py", run_name="__main__")
+
+
+if __name__ == "__main__":
+    clone, problem, seed, target, *others = sys.argv[1:]
+    main(
+        Path(clone).absolute(),
+        problem,
+        int(seed),
+        Path(target).absolute(),
+        int(others[0]) if others else TRAINING[problem],
+    )
