@@ -62,6 +62,7 @@ PROBLEMS = {
             "map": st.sampled_from(["simple", "hard"]),
             "start": st.sampled_from(["map", "anywhere"]),
             "training_start": st.sampled_from([None, "map", "anywhere", "both"]),
+            "tiles": st.sampled_from([0, 3]),
             "max_steps": st.sampled_from([3, 600]),
         },
         1e-4,
@@ -73,6 +74,7 @@ PROBLEMS = {
         {
             "slip": st.sampled_from([0.0, 0.1, 1.0]),
             "chooses_goal": st.booleans(),
+            "tiles": st.sampled_from([0, 3]),
             "max_steps": st.sampled_from([3, 400]),
         },
         1e-5,

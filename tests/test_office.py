@@ -252,18 +252,6 @@ def test_an_episode_begins_at_the_start_and_lasts_400_steps():
     assert last[keys.TRUNCATED].all() and not last[keys.TERMINATED].any()
 
 
-def test_tiles_say_where_the_agent_is():
-    state = state_of([(0.075, 0.5), (0.31, 0.98)], [False] * 2, [False] * 2)
-    seen = rules.observe(state, 20)
-    assert torch.equal(seen[:, :4], rules.observe(state)) and seen.shape == (2, 44)
-    x, y = seen[:, 4:24], seen[:, 24:]
-    torch.testing.assert_close(x[0, 9:11], torch.full((2,), 0.5, dtype=torch.float64))
-    assert y[0, 1].item() == pytest.approx(1.0)
-    middles = (torch.arange(20, dtype=torch.float64) + 0.5) / 20
-    assert (y @ middles).tolist() == pytest.approx([0.075, 0.31])
-    assert OfficeEnv(1, tiles=20).observation_names[4:6] == ("x_0", "x_1")
-
-
 def test_the_bounds_of_a_length_have_the_moves_sign():
     space = OfficeEnv(1).full_action_spec_unbatched[keys.PARAMETERS].space
     torch.testing.assert_close(space.low, torch.tensor([-0.05, 0.0, -0.05, 0.0]))

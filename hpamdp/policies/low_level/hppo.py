@@ -84,12 +84,6 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     """
     epochs: Annotated[int, Field(ge=1, le=1000)] = 5
     """Passes over the collected steps in an update."""
-    target_kl: PositiveFloat | None = None
-    """An update ends early once its policy is this far from the one it began with. None: it never does.
-
-    The distance is the estimated divergence of discrete actions and parameters together. With little noise on the
-    parameters, a few gradient steps may go further than an update should.
-    """
     gamma: Fraction = 0.99
     """Discount of a step."""
     gae_lambda: Fraction = 0.95
@@ -235,13 +229,7 @@ class HPPO(OnPolicy, Learner):
         # A tensor, since code would be compiled again for another number.
         left = 1.0 + progress * (options.entropy_final - 1.0)
         entropy_weight = torch.tensor(left, device=rows.device, dtype=torch.float32)
-        steps = []
-        for minibatch in self.minibatches(rows):
-            steps.append(self.gradient_step(self.loss, minibatch, entropy_weight))
-            if options.target_kl is not None:
-                moved = steps[-1]["discrete_kl"] + steps[-1]["parameter_kl"]
-                if moved > options.target_kl:
-                    break
+        steps = [self.gradient_step(self.loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]
         self.actor.set_min_scale(options.min_scale * (options.min_scale_final / options.min_scale) ** progress)
         self._limit_scale()
         return mean_scalars(steps)

@@ -1,6 +1,6 @@
 """Train PEARL with its authors' code and settings on their own Pinball or Office.
 
-python experiments/peers/pearl.py PEARL_FOLDER pinball|office SEED FILE [EPISODES]
+python experiments/pearl/pearl.py PEARL_FOLDER pinball|office SEED FILE [EPISODES]
     writes the curve to a csv file after each evaluation. PEARL_FOLDER is a clone of the authors' repository.
 """
 

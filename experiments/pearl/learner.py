@@ -1,0 +1,84 @@
+"""Train hpamdp's learner on Pinball's simple map or on Office, with the settings of `experiments/problems`.
+
+python experiments/pearl/learner.py pinball|office SEED FILE    writes the curve to a csv file
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import hpamdp
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "pinball": {"low": "pdqn", "eval.every": 5_000, "eval.layouts": 1},
+    "office": {
+        "low": "hppo",
+        "env.tiles": 20,
+        "exploration": "counts",
+        "exploration.resolution": 1.0,
+        "exploration.weight": 50.0,
+        "eval.every": 50_000,
+        "eval.layouts": 100,
+    },
+}
+
+
+class Curve(hpamdp.Callback):
+    """Keeps the evaluations with the episodes and the CPU seconds of training before them.
+
+    Episodes are the steps over the mean length of the episodes that ended. CPU seconds include the evaluations.
+    """
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._episodes = 0.0
+
+    def on_evaluation(self, trainer, row: Mapping[str, float]) -> None:
+        """Keep an evaluation."""
+        before = self.rows[-1]["steps"] if self.rows else 0
+        if "train/steps" in row:
+            self._episodes += (trainer.frames - before) / row["train/steps"]
+        self.rows.append(
+            {
+                "episodes": round(self._episodes),
+                "steps": trainer.frames,
+                "cpu_s": round(trainer.cpu_s, 1),
+                "score": round(row["eval/score"], 1),
+                "success": round(row["eval/success"], 4),
+            }
+        )
+
+
+def main(problem: str, seed: int, file: Path) -> None:
+    """Train and score."""
+    curve = Curve()
+    settings = SETTINGS[problem]
+    hpamdp.train(
+        problem,
+        high=None,
+        seed=seed,
+        threads=1,
+        progress=False,
+        callbacks=[curve],
+        **{"eval.seed": seed, "compile_updates": False, "film": False, **settings},
+    )
+    name = {
+        "problem": problem,
+        "library": "hpamdp",
+        "version": hpamdp.__version__,
+        "learner": settings["low"],
+        "seed": seed,
+    }
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("w", newline="") as opened:
+        writer = csv.DictWriter(opened, [*name, *curve.rows[0]])
+        writer.writeheader()
+        writer.writerows(name | row for row in curve.rows)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))

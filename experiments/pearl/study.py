@@ -1,0 +1,98 @@
+"""Draw and tabulate PEARL's code beside hpamdp's learners on Pinball and Office, by episodes and by CPU seconds.
+
+python experiments/pearl/study.py FOLDER    gathers the curves in the folder into curves.csv, then draws and tabulates
+python experiments/pearl/study.py           draws and tabulates the stored curves
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hpamdp.analysis.study import Rows, first_at, groups, mean_interval, read_csv, spread, write_tables
+from hpamdp.figure_style import INK, LEARNER_COLOURS, STYLE
+from hpamdp.messages import exit_code
+
+HERE = Path(__file__).resolve().parent
+PROBLEMS = {"pinball": "Pinball, simple map", "office": "Office"}
+AXES = {"episodes": "episodes of training", "cpu_s": "CPU seconds of training"}
+REACHED = 0.95  # success of a greedy evaluation
+LEARNER = ("problem", "library", "version", "learner")
+
+
+def gather(folder: Path) -> Rows:
+    """Return the rows of all curves, in the order of problems, libraries and seeds."""
+    rows = [row for file in sorted(folder.glob("*.csv")) for row in read_csv(file)]
+    order = list(PROBLEMS)
+    return sorted(rows, key=lambda row: (order.index(row["problem"]), row["library"], row["seed"]))
+
+
+def table(curves: Rows) -> str:
+    """Return a line for each learner: its last returns, and when its runs first succeeded."""
+    head = ["problem", "library", "learner", "seeds", "episodes", "steps", "CPU of a run", "return", "95 %", "success"]
+    head += ["seeds that reached 95 %", "after episodes", "after steps", "after CPU"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for (problem, library, version, learner), rows in groups(curves, *LEARNER).items():
+        runs = list(groups(rows, "seed").values())
+        ends = [run[-1] for run in runs]
+        firsts = [first for run in runs if (first := first_at(run, "success", REACHED))]
+        low, high = mean_interval([end["score"] for end in ends])
+        cells = [PROBLEMS[problem], f"{library} {version}", learner, str(len(runs))]
+        cells += [f"{_mean(ends, 'episodes'):,.0f}", f"{_mean(ends, 'steps'):,.0f}", f"{_mean(ends, 'cpu_s'):,.0f} s"]
+        cells += [spread([end["score"] for end in ends], 0), f"{low:,.0f} to {high:,.0f}"]
+        cells += [f"{100.0 * _mean(ends, 'success'):.1f} %", f"{len(firsts)} of {len(runs)}"]
+        cells += [_range(firsts, "episodes"), _range(firsts, "steps"), _range(firsts, "cpu_s", " s")]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _mean(rows: Rows, name: str) -> float:
+    return sum(row[name] for row in rows) / len(rows)
+
+
+def _range(rows: Rows, name: str, unit: str = "") -> str:
+    values = [row[name] for row in rows]
+    return f"{min(values):,.0f} to {max(values):,.0f}{unit}" if values else ""
+
+
+def draw(curves: Rows, path: Path) -> None:
+    """Draw the returns of each problem, by episodes and by CPU seconds, with a line for each seed."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(9.2, 6.4), layout="constrained")
+        panels = figure.subplots(len(PROBLEMS), len(AXES))
+        for row, (problem, title) in zip(panels, PROBLEMS.items(), strict=True):
+            for axes, (column, label) in zip(row, AXES.items(), strict=True):
+                _draw_panel(axes, [each for each in curves if each["problem"] == problem], column)
+                axes.set(title=title, xlabel=label, ylabel="return, greedy")
+        figure.savefig(path)
+
+
+def _draw_panel(axes: Axes, curves: Rows, column: str) -> None:
+    for (library, learner), rows in groups(curves, "library", "learner").items():
+        colour = LEARNER_COLOURS.get(learner, INK)
+        style = "-" if library == "hpamdp" else "--"
+        for number, run in enumerate(groups(rows, "seed").values()):
+            label = f"{library}: {learner}" if number == 0 else None
+            after = [row for row in run if row[column] > 0]  # the axis is logarithmic
+            x, y = [row[column] for row in after], [row["score"] for row in after]
+            axes.plot(x, y, color=colour, linestyle=style, linewidth=1.1, label=label)
+    axes.set_xscale("log")
+    axes.legend(frameon=False, fontsize=8, loc="best")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Gather, draw, tabulate."""
+    if arguments:
+        write_tables(HERE, {"curves": gather(Path(arguments[0]))})
+    curves = read_csv(HERE / "curves.csv")
+    draw(curves, HERE / "curves.png")
+    print(table(curves))
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))
