@@ -50,6 +50,7 @@ BARS = {
     "pinball simple, 4 options": (9_343.0, "PEARL's code"),
     "pinball hard, training_start=anywhere": (9_000.0, "our aim; by hand 9,404"),
     "pinball hard, training_start=both": (9_000.0, "our aim; by hand 9,404"),
+    "pinball hard, training_start=both, tiles=20": (9_000.0, "our aim; by hand 9,404"),
     **{
         f"primitives {task}, {reward}{way}": (0.9, f"our aim; by hand {MEASURED[task]['success']:.1f}")
         for reward in get_args(Reward)
@@ -72,6 +73,8 @@ BARS = {
 PRIMITIVES = {"reach": 0.4, "negative_distances": False, "decisions": 5}
 # The smallest standard deviation of H-PPO on circuits in the recipe's earlier form.
 EARLIER_NOISE = 0.003
+# The learning rate of H-PPO on primitives in its recipe's earlier form.
+EARLIER_LR = 0.001
 
 
 def problem_of(run: Run) -> str:
@@ -81,6 +84,7 @@ def problem_of(run: Run) -> str:
         others = ["from anywhere" if settings["start"] == "anywhere" else ""]
         begins = settings.get("training_start")
         others += ["" if begins in (None, settings["start"]) else f"training_start={begins}"]
+        others += [f"tiles={settings['tiles']}" if settings.get("tiles") else ""]
         options = settings.get("grouping") or ()
         others += [f"{len(options)} options" if isinstance(options, dict) else "grouped axes" if options else ""]
         name = f"{name} {settings['map']}"
@@ -114,6 +118,9 @@ def learner_of(run: Run) -> str:
     high, low = run.summary["high"], run.summary["low"]
     if run.summary["env"] == "circuit" and run.config["low"].get("min_scale_final") == EARLIER_NOISE:
         low = f"{low}, noise to {EARLIER_NOISE}"
+    is_of_primitives = run.config["env"].get("actions") == "primitives"
+    if is_of_primitives and low == "hppo" and run.config["low"]["lr"] == EARLIER_LR:
+        low = f"{low}, lr={EARLIER_LR}"
     if high == "none":
         return low
     return high if low == "random" else f"{high} over {low}"
