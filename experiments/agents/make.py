@@ -46,7 +46,7 @@ AGENTS = {
         *("exploration.weight=50", "exploration.table_size=16381", "eval.layouts=100", "eval.seed=111", "seed=111"),
     ],
     "hppo_primitives": [
-        *("experiment=primitives", "hydra.mode=RUN", "env.task=peg_unplug_side", "eval.seed=100", "seed=100"),
+        *("experiment=primitives", "hydra.mode=RUN", "env.task=peg_unplug_side", "eval.seed=105", "seed=105"),
     ],
     "pdqn_traffic": ["high=none", "low=pdqn", "env=traffic", "eval.seed=118", "seed=118"],
     "hppo_boatdock_unseen": [
@@ -71,6 +71,9 @@ def make(name: str) -> None:
 
 def keep(name: str, run: Path) -> None:
     """Put a run's agent into agents/."""
+    missing = [file for file in KEPT if not (run / file).is_file()]
+    if missing:
+        raise SystemExit(f"{run}: no finished run, {missing[0]} is not there")
     target = ROOT / "agents" / name
     target.mkdir(parents=True, exist_ok=True)
     for file in KEPT:
