@@ -28,23 +28,17 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 class Curve(hpamdp.Callback):
-    """Keeps the evaluations with the episodes and the CPU seconds of training before them.
-
-    Episodes are the steps over the mean length of the episodes that ended. CPU seconds include the evaluations.
-    """
+    """Keeps the evaluations with the episodes that had ended and the CPU seconds, which include the evaluations."""
 
     def __init__(self) -> None:
         self.rows: list[dict[str, Any]] = []
-        self._episodes = 0.0
 
     def on_evaluation(self, trainer, row: Mapping[str, float]) -> None:
-        """Keep an evaluation."""
-        before = self.rows[-1]["steps"] if self.rows else 0
-        if "train/steps" in row:
-            self._episodes += (trainer.frames - before) / row["train/steps"]
+        """Keep an evaluation. Each environment numbers its episodes from 0."""
+        episodes = trainer.parts.env.state.episode.sum().item() if trainer.frames else 0
         self.rows.append(
             {
-                "episodes": round(self._episodes),
+                "episodes": episodes,
                 "steps": trainer.frames,
                 "cpu_s": round(trainer.cpu_s, 1),
                 "score": round(row["eval/score"], 1),
