@@ -1044,6 +1044,10 @@ def exploration() -> list[Claim]:
     counts = column(runs("platform", "counts"), "score")
     held = sorted(successful("office", "held"))
     num = seeds(runs("office", "counts"))
+    # Of P-DQN on Office: the returns of the seeds that deliver.
+    arrivals = {
+        kind: [f"{score:.0f}" for score in sorted(successful("office", kind, "pdqn"), reverse=True)] for kind in kinds
+    }
     return [
         Claim(
             page("exploration"),
@@ -1064,11 +1068,18 @@ def exploration() -> list[Claim]:
         Claim(page("exploration"), "no kind helps there. {seeds:Word} seeds each:", dict(seeds=num)),
         Claim(
             page("exploration"),
-            "It delivers with none of {seeds:word} seeds and no kind, in {steps:,.0f} steps.",
+            "With `counts` {counts:word} of {seeds:word} seeds deliver after {steps:,.0f} steps (returns {returns}), and "
+            "with `novelty` {novelty:word} does ({other}). Without further exploration, with `held` and with options "
+            "none does.",
             dict(
-                seeds=seeds(runs("office", "none", "pdqn")), steps=mean(runs("office", "none", "pdqn"), "frames")
+                counts=len(arrivals["counts"]),
+                seeds=seeds(runs("office", "counts", "pdqn")),
+                steps=mean(runs("office", "counts", "pdqn"), "frames"),
+                returns=" and ".join(arrivals["counts"]),
+                novelty=len(arrivals["novelty"]),
+                other=" and ".join(arrivals["novelty"]),
             ),
-            holds=not any(successful("office", kind, "pdqn") for kind in kinds),
+            holds=not any(arrivals[kind] for kind in ("none", "held", "options")),
         ),
         Claim(
             page("exploration"),
