@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
+from torchrl.envs import EnvBase
 
 import hpamdp
 from hpamdp import keys
@@ -19,10 +21,16 @@ def test_tiles_say_where_a_place_is():
     assert (of_y @ middles).tolist() == pytest.approx([0.075, 0.31])
 
 
+def after_random_steps(env: EnvBase) -> Tensor:
+    torch.manual_seed(0)
+    return env.rollout(30)["next", keys.OBSERVATION][:, -1]
+
+
 @pytest.mark.parametrize("problem", ["office", "pinball"])
 def test_tiles_stand_behind_what_is_observed_anyway(problem):
     env, plain = hpamdp.make(problem, num_envs=2, tiles=20), hpamdp.make(problem, num_envs=2)
-    seen, expected = env.reset()[keys.OBSERVATION], plain.reset()[keys.OBSERVATION]
+    seen, expected = (after_random_steps(each) for each in (env, plain))
+    assert (env.position[:, 0] - env.position[:, 1]).abs().min() > 0.01
     assert torch.equal(seen[:, :4], expected)
     torch.testing.assert_close(seen[:, 4:], tiles_of(*env.position.unbind(-1), 20))
     assert env.observation_names[3:6] == (plain.observation_names[3], "x_0", "x_1")

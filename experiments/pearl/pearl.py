@@ -1,7 +1,7 @@
 """Train PEARL with its authors' code and settings on their own Pinball or Office.
 
 python experiments/pearl/pearl.py PEARL_FOLDER pinball|office SEED FILE [EPISODES]
-    writes the curve to a csv file after each evaluation. PEARL_FOLDER is a clone of the authors' repository.
+    writes the curve to a csv file. PEARL_FOLDER is a clone of the authors' repository.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-# Episodes of training, and of an evaluation. Nothing is random in a greedy episode on Pinball, and it takes seconds.
+# Episodes of training, and of an evaluation. Pinball's environment has no randomness, and an episode takes seconds.
 TRAINING = {"pinball": 1000, "office": 2100}
 EVALUATION = {"pinball": 1, "office": 100}
 
@@ -41,9 +41,9 @@ def cpu_seconds() -> float:
 
 
 def keep_curve(name: dict[str, Any], file: Path) -> None:
-    """Replace the evaluation of PEARL's code by one that is kept in the file and costs no CPU time of training.
+    """Have each evaluation of PEARL's code kept in the file; it costs no CPU time of training.
 
-    The code's pictures and files are left out.
+    Pictures and tables of values are left out.
     """
     from src.agents.pearl import PEARL
     from src.data_structures.cat import CAT
@@ -106,8 +106,10 @@ def main(folder: Path, problem: str, seed: int, file: Path, episodes: int) -> No
     words = f"--yaml yamls/{problem}_flexible_0.yaml --trial {seed} --result_dir results --method_dir {os.getpid()}"
     words += f" --episode_max {episodes} --eval_episodes {EVALUATION[problem]}"
     sys.argv = ["main.py", *words.split()]
-    keep_curve(name, file)
+    unfinished = file.with_suffix(".part")
+    keep_curve(name, unfinished)
     runpy.run_path("main.py", run_name="__main__")
+    unfinished.rename(file)
 
 
 if __name__ == "__main__":

@@ -9,13 +9,18 @@ here=$(cd "$(dirname "$0")" && pwd)
 mkdir -p "$1"
 folder=$(realpath "$1") clone=$(realpath "$2") pearl=$3 hpamdp=$4
 export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+run() {  # run NAME COMMAND...: the command's last argument is the file of the curve
+    file=$folder/$1.csv
+    [ -e "$file" ] && return
+    shift
+    "$@" "$file" > "${file%.csv}.log" 2>&1 || echo "$file: failed, see ${file%.csv}.log"
+}
+
 for problem in pinball office; do
     for seed in 120 121 122; do
-        file=$folder/hpamdp_${problem}_$seed.csv
-        [ -e "$file" ] || PYTHONPATH=$here/../.. "$hpamdp" "$here/learner.py" $problem $seed "$file" > "${file%.csv}.log" 2>&1
+        PYTHONPATH=$here/../.. run hpamdp_${problem}_$seed "$hpamdp" "$here/learner.py" $problem $seed
     done
     for seed in 1 2 3; do
-        file=$folder/pearl_${problem}_$seed.csv
-        [ -e "$file" ] || "$pearl" "$here/pearl.py" "$clone" $problem $seed "$file" > "${file%.csv}.log" 2>&1
+        run pearl_${problem}_$seed "$pearl" "$here/pearl.py" "$clone" $problem $seed
     done
 done

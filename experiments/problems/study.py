@@ -41,9 +41,9 @@ RUN = ("problem", "learner", "exploration", "seed")
 # Results of traffic lights that traffic.csv has of the agent and of the players by hand, on the same demands.
 TRAFFIC = ("delay", "queue", "stops", "throughput")
 AGENT = "agent"
-# What the mean return of a run should reach, by problem, and whose return that is. PEARL's code was run once on each
-# problem. Pinball's simple map: its first evaluation that arrives, after 800 episodes and 36 minutes. Office: its last
-# evaluation, after 2,100 episodes and 43 minutes. The published scores of circuits are means of 8 seeds, read off a
+# What the mean return of a run should reach, by problem, and whose return that is. PEARL's code, with seed 1 of
+# experiments/pearl: on Pinball's simple map its first and highest evaluation that arrives, after 800 episodes, on Office
+# its last evaluation, after 2,100 episodes. The published scores of circuits are means of 8 seeds, read off a
 # figure.
 BARS = {
     "pinball simple": (9_343.0, "PEARL's code"),

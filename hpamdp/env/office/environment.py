@@ -23,7 +23,7 @@ from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.office import kernel, player, rendering, rules
 from hpamdp.env.office.rules import OfficeState
 from hpamdp.env.state_columns import check_range
-from hpamdp.env.tiles import NumTiles, tile_names
+from hpamdp.env.tiles import NumTiles, bounds_with_tiles, tile_names
 from hpamdp.settings import Fraction, Settings
 
 # Expected return and success of the player that knows the map, with the default settings.
@@ -38,9 +38,9 @@ class OfficeOptions(Settings):
     slip: Fraction = 0.1
     """Probability that a move slips to the other axis."""
     tiles: NumTiles = 0
-    """Numbers of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
+    """Number of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
 
-    From them a network tells places apart more easily, as from the one-hot coordinates of Rooms.
+    From them a network may tell places apart more easily, as from the one-hot coordinates of Rooms.
     """
     chooses_goal: bool = False
     """Whether the agent chooses what it goes for next, as an option: coffee, mail or target. It takes nothing else.
@@ -94,8 +94,7 @@ class OfficeEnv(BatchedEnv[OfficeState]):
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
         """The lowest and the highest observation, `[4 + 2 tiles]` each."""
-        num, tiles = len(rules.OBSERVATION_NAMES), 2 * self.options.tiles
-        return [-1.0] * num + [0.0] * tiles, [1.0] * (num + tiles)
+        return bounds_with_tiles(len(rules.OBSERVATION_NAMES), self.options.tiles)
 
     @property
     def position(self) -> Tensor:

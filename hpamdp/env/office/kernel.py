@@ -37,6 +37,7 @@ _PLACES, _WALLS = np.array(rules.PLACES, np.float32), np.array(rules.WALLS, np.f
 _REACH = _F(rules.REACH)
 _STEP, _REFUSED, _TAKEN = _F(rules.STEP_REWARD), _F(rules.REFUSED_REWARD), _F(rules.TAKEN_REWARD)
 _DELIVERED = _F(rules.DELIVERED_REWARD)
+_NUM_PLAIN = len(rules.OBSERVATION_NAMES)
 
 
 @part
@@ -98,7 +99,7 @@ def _observe(floats: Any, integers: Any, row: Any, tiles: Any, observation: Any)
     observation[0], observation[1] = TWO * y - ONE, TWO * x - ONE
     observation[2] = TWO * _F(integers[_COFFEE, row]) - ONE
     observation[3] = TWO * _F(integers[_MAIL, row]) - ONE
-    write_tiles(x, y, tiles, observation, 4)
+    write_tiles(x, y, tiles, observation, _NUM_PLAIN)
 
 
 @kernel

@@ -21,7 +21,7 @@ from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.pinball import kernel, maps, rendering, rules
 from hpamdp.env.pinball.planner import Planner
 from hpamdp.env.pinball.rules import PinballState
-from hpamdp.env.tiles import NumTiles, tile_names
+from hpamdp.env.tiles import NumTiles, bounds_with_tiles, tile_names
 from hpamdp.settings import SettingError, Settings
 
 _GRID = 100  # places in a row from which a ball may start anywhere
@@ -43,9 +43,9 @@ class PinballOptions(Settings):
     max_steps: PositiveInt = 600
     """Steps after which an episode is truncated."""
     tiles: NumTiles = 0
-    """Numbers of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
+    """Number of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
 
-    From them a network tells the two sides of a thin wall apart more easily.
+    From them a network may tell the two sides of a thin wall apart more easily.
     """
 
 
@@ -105,8 +105,7 @@ class PinballEnv(BatchedEnv[PinballState]):
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
         """The lowest and the highest observation, `[4 + 2 tiles]` each."""
-        num, tiles = len(rules.OBSERVATION_NAMES), 2 * self.options.tiles
-        return [-1.0] * num + [0.0] * tiles, [1.0] * (num + tiles)
+        return bounds_with_tiles(len(rules.OBSERVATION_NAMES), self.options.tiles)
 
     @property
     def position(self) -> Tensor:

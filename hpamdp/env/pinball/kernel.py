@@ -22,7 +22,7 @@ from hpamdp.env.tiles import write_tiles
 TILES, BALL, TARGET_X, TARGET_Y, TARGET_RADIUS, NUM_POLYGONS, NUM_EDGES, NUM_TRAINING, NUM_PLACES = range(
     kernels.OWN, kernels.OWN + 9
 )
-_FIRST = kernels.OWN + 9
+_FIRST = NUM_PLACES + 1
 
 _X, _Y, _VX, _VY = range(4)
 # Columns of a polygon: its edges, and the box around it.
@@ -35,9 +35,10 @@ _TICKS, _PUSH, _DRAG, _MAX_SPEED = _F(rules.TICKS), _F(rules.PUSH), _F(rules.DRA
 _TOUCHING, _LOW, _HIGH = _F(rules.TOUCHING), _F(rules.LOW_PLACE), _F(rules.HIGH_PLACE)
 _MOVES = _F((rules.TICKS + 1.0) / rules.TICKS)  # of a step, with that after a touch in its last tick
 _SLACK = _F(1e-4)  # for rounding
+_NUM_PLAIN = len(rules.OBSERVATION_NAMES)
 
 
-def settings_of(found: PinballMap, places: tuple[np.ndarray, np.ndarray], tiles: int = 0) -> list[float]:
+def settings_of(found: PinballMap, places: tuple[np.ndarray, np.ndarray], tiles: int) -> list[float]:
     """Return the number of tiles, a map and the places to start as the kernel's own settings; see `rules.Table`."""
     edges = found.edges()
     polygons, begin = [], 0
@@ -197,6 +198,6 @@ def advance(
             observations[reading, row, 1] = TWO * floats[_Y, row] - ONE
             observations[reading, row, 2] = floats[_VX, row] / _MAX_SPEED
             observations[reading, row, 3] = floats[_VY, row] / _MAX_SPEED
-            write_tiles(floats[_X, row], floats[_Y, row], tiles, observations[reading, row], 4)
+            write_tiles(floats[_X, row], floats[_Y, row], tiles, observations[reading, row], _NUM_PLAIN)
             kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
     return -1
