@@ -41,10 +41,11 @@ def table(curves: Rows) -> str:
         runs = list(groups(rows, "seed").values())
         ends = [run[-1] for run in runs]
         firsts = [first for run in runs if (first := first_at(run, "success", REACHED))]
-        low, high = mean_interval([end["score"] for end in ends])
+        scores = [end["score"] for end in ends]
+        interval = "{:,.0f} to {:,.0f}".format(*mean_interval(scores)) if len(scores) > 1 else ""
         cells = [PROBLEMS[problem], f"{library} {version}", learner, str(len(runs))]
         cells += [f"{_mean(ends, 'episodes'):,.0f}", f"{_mean(ends, 'steps'):,.0f}", f"{_mean(ends, 'cpu_s'):,.0f} s"]
-        cells += [spread([end["score"] for end in ends], 0), f"{low:,.0f} to {high:,.0f}"]
+        cells += [spread(scores, 0), interval]
         cells += [f"{100.0 * _mean(ends, 'success'):.1f} %", f"{len(firsts)} of {len(runs)}"]
         cells += [_range(firsts, "episodes"), _range(firsts, "steps"), _range(firsts, "cpu_s", " s")]
         lines.append(f"| {' | '.join(cells)} |")
@@ -57,7 +58,8 @@ def _mean(rows: Rows, name: str) -> float:
 
 def _range(rows: Rows, name: str, unit: str = "") -> str:
     values = [row[name] for row in rows]
-    return f"{min(values):,.0f} to {max(values):,.0f}{unit}" if values else ""
+    # One number if there is one run.
+    return " to ".join(dict.fromkeys(f"{value:,.0f}" for value in (min(values), max(values)))) + unit if values else ""
 
 
 def draw(curves: Rows, path: Path) -> None:

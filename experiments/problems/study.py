@@ -42,9 +42,8 @@ RUN = ("problem", "learner", "exploration", "seed")
 TRAFFIC = ("delay", "queue", "stops", "throughput")
 AGENT = "agent"
 # What the mean return of a run should reach, by problem, and whose return that is. PEARL's code, with seed 1 of
-# experiments/pearl: on Pinball's simple map its first and highest evaluation that arrives, after 800 episodes, on Office
-# its last evaluation, after 2,100 episodes. The published scores of circuits are means of 8 seeds, read off a
-# figure.
+# experiments/pearl: on Pinball's simple map its first and highest evaluation that arrives, after 800 episodes; on
+# Office its last evaluation, after 2,100. The published scores of circuits are means of 8 seeds, read off a figure.
 BARS = {
     "pinball simple": (9_343.0, "PEARL's code"),
     "pinball simple, 4 options": (9_343.0, "PEARL's code"),
