@@ -432,7 +432,7 @@ def test_the_list_of_runs_ends_quietly_when_its_reader_has_seen_enough(tmp_path,
 
 
 def test_all_scripts_of_studies_print_to_streams_that_may_close():
-    """Those in `peers` that run other libraries print nothing."""
+    """Those that run other libraries print nothing."""
     scripts = {script: script.read_text() for script in sorted(EXPERIMENTS.rglob("*.py"))}
     printing = {script: text for script, text in scripts.items() if "print(" in text and "__main__" in text}
     assert len(printing) > 30

@@ -86,7 +86,6 @@ def keep_curve(name: dict[str, Any], file: Path) -> None:
             writer = csv.DictWriter(opened, rows[0])
             writer.writeheader()
             writer.writerows(rows)
-        print(rows[-1], flush=True)
         evaluations_cpu_s += cpu_seconds() - now
         return success
 
