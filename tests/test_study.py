@@ -504,3 +504,17 @@ def test_a_learner_under_a_selector_has_another_name_than_alone(tmp_path, high, 
 def test_circuits_of_the_earlier_recipe_are_told_apart(tmp_path, least, name):
     run = Run(tmp_path, {"env": "circuit", "high": "none", "low": "hppo"}, {"low": {"min_scale_final": least}})
     assert study("problems").learner_of(run) == name
+
+
+@pytest.mark.parametrize(
+    ("rate", "actions", "name"),
+    [
+        (1e-3, "primitives", "hppo, lr=0.001"),
+        (3e-4, "primitives", "hppo"),
+        (1e-3, "large_steps", "hppo"),
+    ],
+)
+def test_primitives_of_the_earlier_recipe_are_told_apart(tmp_path, rate, actions, name):
+    summary = {"env": "primitives", "high": "none", "low": "hppo"}
+    run = Run(tmp_path, summary, {"low": {"lr": rate}, "env": {"actions": actions}})
+    assert study("problems").learner_of(run) == name

@@ -114,12 +114,13 @@ def problem_of(run: Run) -> str:
 
 def learner_of(run: Run) -> str:
     """Return the learner of a run and the selector above it; the selector alone over random play in the options."""
-    high, low = run.summary["high"], run.summary["low"]
-    if run.summary["env"] == "circuit" and run.config["low"].get("min_scale_final") == EARLIER_NOISE:
+    env, high, low = (run.summary[name] for name in ("env", "high", "low"))
+    settings = run.config["low"]
+    if env == "circuit" and settings.get("min_scale_final") == EARLIER_NOISE:
         low = f"{low}, noise to {EARLIER_NOISE}"
-    is_of_primitives = run.config["env"].get("actions") == "primitives"
-    if is_of_primitives and low == "hppo" and run.config["low"]["lr"] == EARLIER_LR:
-        low = f"{low}, lr={EARLIER_LR}"
+    if (env, low) == ("primitives", "hppo") and settings["lr"] == EARLIER_LR:
+        # Position steps never had another rate.
+        low = f"{low}, lr={EARLIER_LR}" if run.config["env"]["actions"] == "primitives" else low
     if high == "none":
         return low
     return high if low == "random" else f"{high} over {low}"
