@@ -240,7 +240,9 @@ def draw(curves: Rows, path: Path) -> None:
             for (learner, exploration), runs in groups(rows, *RUN[1:-1]).items():
                 label = learner if exploration == "none" else f"{learner}, {exploration}"
                 drawn = curve(runs, "frames", "score")
-                draw_spread(axes, *drawn, marker=".", label=label, color=LEARNER_COLOURS.get(learner))
+                name, _, earlier = learner.partition(", ")
+                line = "--" if earlier else "-"
+                draw_spread(axes, *drawn, line, marker=".", label=label, color=LEARNER_COLOURS.get(name))
             axes.set(title=task, xlabel="primitives", ylabel="success, greedy", ylim=(-0.02, 1.02))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.legend(frameon=False, fontsize=7)
