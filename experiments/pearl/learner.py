@@ -32,9 +32,11 @@ class Curve(hpamdp.Callback):
 
     def __init__(self) -> None:
         self.rows: list[dict[str, Any]] = []
+        self.is_finished = False
 
     def on_evaluation(self, trainer, row: Mapping[str, float]) -> None:
         """Keep an evaluation. Each environment numbers its episodes from 0."""
+        self.is_finished = trainer.frames >= trainer.config.run.num_frames
         episodes = trainer.parts.env.state.episode.sum().item() if trainer.frames else 0
         self.rows.append(
             {
@@ -60,6 +62,8 @@ def main(problem: str, seed: int, file: Path) -> None:
         callbacks=[curve],
         **{"eval.seed": seed, "compile_updates": False, "film": False, **settings},
     )
+    if not curve.is_finished:
+        raise SystemExit(f"{problem}, seed {seed}: stopped before its end")
     name = {
         "problem": problem,
         "library": "hpamdp",

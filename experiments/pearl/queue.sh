@@ -9,6 +9,7 @@ here=$(cd "$(dirname "$0")" && pwd)
 mkdir -p "$1"
 folder=$(realpath "$1") clone=$(realpath "$2") pearl=$3 hpamdp=$4
 export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+
 run() {  # run NAME COMMAND...: the command's last argument is the file of the curve
     file=$folder/$1.csv
     [ -e "$file" ] && return
