@@ -5,13 +5,13 @@ python experiments/pearl/learner.py pinball|office SEED FILE    writes the curve
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import hpamdp
+from hpamdp.analysis.study import write_tables
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "pinball": {"low": "pdqn", "eval.every": 5_000, "eval.layouts": 1},
@@ -72,10 +72,7 @@ def main(problem: str, seed: int, file: Path) -> None:
         "seed": seed,
     }
     file.parent.mkdir(parents=True, exist_ok=True)
-    with file.open("w", newline="") as opened:
-        writer = csv.DictWriter(opened, [*name, *curve.rows[0]])
-        writer.writeheader()
-        writer.writerows(name | row for row in curve.rows)
+    write_tables(file.parent, {file.stem: [name | row for row in curve.rows]})
 
 
 if __name__ == "__main__":

@@ -84,7 +84,7 @@ def _draw_panel(axes: Axes, curves: Rows, column: str) -> None:
             x, y = [row[column] for row in after], [row["score"] for row in after]
             axes.plot(x, y, color=colour, linestyle=style, linewidth=1.1, label=label)
     axes.set_xscale("log")
-    axes.legend(frameon=False, fontsize=8, loc="best")
+    axes.legend(frameon=False, fontsize=8, loc="upper left")
 
 
 def main(arguments: Sequence[str]) -> None:
