@@ -500,6 +500,17 @@ def test_a_learner_under_a_selector_has_another_name_than_alone(tmp_path, high, 
     assert study("problems").learner_of(Run(tmp_path, {"env": "office", "high": high, "low": low}, {"low": {}})) == name
 
 
+@pytest.mark.parametrize(
+    ("pinball_map", "weight", "name"),
+    [("hard", 0.01, "hppo, discrete_entropy=0.01"), ("hard", 0.03, "hppo"), ("simple", 0.01, "hppo")],
+)
+def test_the_smaller_entropy_bonus_is_told_apart_on_the_hard_map_alone(tmp_path, pinball_map, weight, name):
+    config = {"env": {"map": pinball_map}, "low": {"discrete_entropy": weight}}
+    run = Run(tmp_path, {"env": "pinball", "high": "none", "low": "hppo"}, config)
+
+    assert study("problems").learner_of(run) == name
+
+
 @pytest.mark.parametrize(("least", "name"), [(0.003, "hppo, noise to 0.003"), (0.015, "hppo")])
 def test_circuits_of_the_earlier_recipe_are_told_apart(tmp_path, least, name):
     run = Run(tmp_path, {"env": "circuit", "high": "none", "low": "hppo"}, {"low": {"min_scale_final": least}})
