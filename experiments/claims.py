@@ -1150,6 +1150,7 @@ def problems() -> list[Claim]:
     earlier_hard = [numbers_of(tiles, "hppo, discrete_entropy=0.01", steps) for steps in (6_012_928, 10_010_624)]
     without_tiles = rows("problems/results.csv", problem="pinball hard, training_start=both")
     four_options = rows("problems/results.csv", problem="pinball simple, 4 options")
+    office_pdqn = numbers_of("office", "pdqn", 120_832)
     goals = groups(rows("problems/results.csv", problem="office, chooses goal"), "learner")
     circuits: dict[str, float] = {}
     for task in ("hadamard", "bell", "ghz"):
@@ -1299,6 +1300,11 @@ def problems() -> list[Claim]:
             "return of {mean:.0f} ({seeds:word} seeds, {cpu:.0f} s of CPU time; PEARL's code {bar:.0f}).",
             office,
             holds=office["reaching"] == office["seeds"],
+        ),
+        Claim(
+            page("problems"),
+            "P-DQN with counted visits reaches that with {reaching:word} of {seeds:word} seeds, after {steps} steps",
+            office_pdqn,
         ),
         Claim(
             page("problems"),
