@@ -124,9 +124,10 @@ def learner_of(run: Run) -> str:
     is_hard_map = env == "pinball" and run.config["env"]["map"] == "hard"
     if is_hard_map and settings.get("discrete_entropy") == EARLIER_ENTROPY:
         low = f"{low}, discrete_entropy={EARLIER_ENTROPY}"
-    if (env, low) == ("primitives", "hppo") and settings["lr"] == EARLIER_LR:
-        # Position steps never had another rate.
-        low = f"{low}, lr={EARLIER_LR}" if run.config["env"]["actions"] == "primitives" else low
+    # Position steps never had another rate.
+    takes_primitives = env == "primitives" and run.config["env"]["actions"] == "primitives"
+    if takes_primitives and low == "hppo" and settings["lr"] == EARLIER_LR:
+        low = f"{low}, lr={EARLIER_LR}"
     if high == "none":
         return low
     return high if low == "random" else f"{high} over {low}"
