@@ -31,6 +31,8 @@ options=([pinball]=yes [office]=yes [platform]=yes [crossing]="")
 run() {  # run PROBLEM LEARNER KIND SEED
     local settings="${problem[$1]} low=$2"
     case $1-$2 in
+        office-hppo) settings+=" num_envs=32 total_frames=1500000 eval.every=100000 low.discrete_entropy=0.02 low.gae_lambda=0.95
+            low.epochs=4 low.anneal_steps=200000 low.greedy_discrete=most_probable" ;;
         office-pdqn) settings+=" recipe=pinball_pdqn low.reward_scale=0.01" ;;
         crossing-hppo) settings+=" steps_per_batch=16 low.minibatch_size=256 low.critic_hidden_dims=[64]" ;;
         crossing-pdqn) settings+=" steps_per_batch=4 low.warmup_steps=1000 low.batch_size=128 low.updates_per_step=0.1

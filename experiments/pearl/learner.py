@@ -20,7 +20,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "env.tiles": 20,
         "exploration": "counts",
         "exploration.resolution": 1.0,
-        "exploration.weight": 50.0,
+        "exploration.weight": 25.0,
         "eval.every": 50_000,
         "eval.layouts": 100,
     },
