@@ -511,6 +511,15 @@ def test_the_smaller_entropy_bonus_is_told_apart_on_the_hard_map_alone(tmp_path,
     assert study("problems").learner_of(run) == name
 
 
+@pytest.mark.parametrize(
+    ("env", "weight", "name"),
+    [("office", 50.0, "counts, weight=50"), ("office", 25.0, "counts"), ("pinball", 50.0, "counts")],
+)
+def test_other_weights_of_counted_visits_are_told_apart_on_office(tmp_path, env, weight, name):
+    config = {"choices": {"exploration": "counts"}, "exploration": {"weight": weight}}
+    assert study("problems").exploration_of(Run(tmp_path, {"env": env}, config)) == name
+
+
 @pytest.mark.parametrize(("least", "name"), [(0.003, "hppo, noise to 0.003"), (0.015, "hppo")])
 def test_circuits_of_the_earlier_recipe_are_told_apart(tmp_path, least, name):
     run = Run(tmp_path, {"env": "circuit", "high": "none", "low": "hppo"}, {"low": {"min_scale_final": least}})

@@ -77,6 +77,8 @@ EARLIER_NOISE = 0.003
 EARLIER_LR = 0.001
 # The weight of H-PPO's entropy bonus on Pinball's hard map in the earlier form of conf/experiment/pinball_hard.yaml.
 EARLIER_ENTROPY = 0.01
+# The weight of counted visits for H-PPO on Office. P-DQN has another one, and so had an earlier recipe of H-PPO.
+OFFICE_WEIGHT = 25
 
 
 def problem_of(run: Run) -> str:
@@ -133,6 +135,15 @@ def learner_of(run: Run) -> str:
     return high if low == "random" else f"{high} over {low}"
 
 
+def exploration_of(run: Run) -> str:
+    """Return the exploration of a run; on Office with the weight of counted visits, if it is not that of H-PPO."""
+    kind: str = run.config["choices"]["exploration"]
+    if run.summary["env"] == "office" and kind == "counts":
+        weight = run.config["exploration"]["weight"]
+        return kind if weight == OFFICE_WEIGHT else f"{kind}, weight={weight:g}"
+    return kind
+
+
 def gather(runs: Sequence[Run]) -> dict[str, Rows]:
     """Return a row for each run, a row for each evaluation, and one for each player of a run on traffic lights."""
     results: Rows = []
@@ -145,7 +156,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
         name = {
             "problem": problem_of(run),
             "learner": learner_of(run),
-            "exploration": run.config["choices"]["exploration"],
+            "exploration": exploration_of(run),
             "seed": summary["seed"],
         }
         results.append(
