@@ -1100,8 +1100,8 @@ def exploration() -> list[Claim]:
         ),
         Claim(
             page("exploration"),
-            "With `counts` {ending:word} of {seeds:word} seeds of H-PPO ends at {lowest:.3f} instead of {without:.3f}, and "
-            "no episode of it succeeds. Options of four steps do harm: {hppo:.3f} (H-PPO) and {pdqn:.3f} (P-DQN).",
+            "With `counts` {ending:word} of {seeds:word} seeds of H-PPO ends at {lowest:.3f} instead of {without:.3f}, "
+            "and no episode of it succeeds. Options of four steps do harm: {hppo:.3f} (H-PPO) and {pdqn:.3f} (P-DQN).",
             dict(
                 ending=sum(score < 0.99 for score in counts),
                 seeds=len(counts),
@@ -1251,8 +1251,8 @@ def problems() -> list[Claim]:
         Claim(
             page("problems"),
             "On random states it scores {mean:.3f} ({seeds:word} seeds, each with a state of its own; "
-            "published {bar:.2f}). There training circuits begin near the target, and training has {millions:.1f} million "
-            "steps instead of 1.05.",
+            "published {bar:.2f}). There training circuits begin near the target, and training has {millions:.1f} "
+            "million steps instead of 1.05.",
             dict(
                 mean=mean(states), seeds=seeds(states), bar=bars[near_target][0], millions=mean(states, "frames") / 1e6
             ),
