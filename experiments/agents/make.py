@@ -43,7 +43,7 @@ AGENTS = {
     "pdqn_pinball": ["high=none", "low=pdqn", "env=pinball", "eval.layouts=10", "eval.seed=110", "seed=110"],
     "hppo_office": [
         *("high=none", "low=hppo", "env=office", "env.tiles=20", "exploration=counts", "exploration.resolution=1"),
-        *("exploration.weight=25", "exploration.table_size=16381", "eval.layouts=100", "eval.seed=135", "seed=135"),
+        *("exploration.weight=25", "exploration.table_size=16381", "eval.layouts=100", "eval.seed=130", "seed=130"),
     ],
     "hppo_primitives": [
         *("experiment=primitives", "hydra.mode=RUN", "env.task=peg_unplug_side", "eval.seed=105", "seed=105"),

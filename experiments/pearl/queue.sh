@@ -1,5 +1,5 @@
 #!/bin/bash
-# Train PEARL with seeds 1 to 3 on Pinball and Office, and hpamdp's learners with seeds 120 to 122 on Pinball and 130 to 134 on Office.
+# Train PEARL with seeds 1 to 3 on Pinball and Office, and hpamdp's learners with seeds 120 to 122 on Pinball and 130 to 139 on Office.
 #
 #   experiments/pearl/queue.sh FOLDER PEARL_FOLDER PEARL_PYTHON HPAMDP_PYTHON
 #
@@ -17,7 +17,7 @@ run() {  # run NAME COMMAND...: the command's last argument is the file of the c
     "$@" "$file" > "${file%.csv}.log" 2>&1 || echo "$file: failed, see ${file%.csv}.log"
 }
 
-declare -A seeds=([pinball]="120 121 122" [office]="130 131 132 133 134")
+declare -A seeds=([pinball]="120 121 122" [office]="130 131 132 133 134 135 136 137 138 139")
 for problem in pinball office; do
     for seed in ${seeds[$problem]}; do
         PYTHONPATH=$here/../.. run hpamdp_${problem}_$seed "$hpamdp" "$here/learner.py" $problem $seed
