@@ -1362,8 +1362,8 @@ def problems() -> list[Claim]:
         Claim(
             page("problems"),
             "With a selector (UCB) that chooses what to fetch first, the mean return is {first:.0f}. With a "
-            "meta-critic that chooses the next goal every {length} steps, it is {next:.0f} ({seeds:word} seeds each). So "
-            "options show no gain there either.",
+            "meta-critic that chooses the next goal every {length} steps, it is {next:.0f} ({seeds:word} seeds each). "
+            "So options show no gain there either.",
             dict(
                 length=20,  # agent.option_length of the command
                 first=mean(goals["ucb over hppo",]),

@@ -76,15 +76,17 @@ def draw(curves: Rows, path: Path) -> None:
 
 def _draw_panel(axes: Axes, curves: Rows, column: str) -> None:
     for (library, learner), rows in groups(curves, "library", "learner").items():
-        colour = LEARNER_COLOURS.get(learner, INK)
-        style = "-" if library == "hpamdp" else "--"
+        name, _, earlier = learner.partition(", ")
+        colour = LEARNER_COLOURS.get(name, INK)
+        style = "--" if library != "hpamdp" else ":" if earlier else "-"
         for number, run in enumerate(groups(rows, "seed").values()):
             label = f"{library}: {learner}" if number == 0 else None
             after = [row for row in run if row[column] > 0]  # the axis is logarithmic
             x, y = [row[column] for row in after], [row["score"] for row in after]
             axes.plot(x, y, color=colour, linestyle=style, linewidth=1.1, label=label)
     axes.set_xscale("log")
-    axes.legend(frameon=False, fontsize=8, loc="upper left")
+    if column == "cpu_s":  # one legend for both panels, where no line is
+        axes.legend(frameon=False, fontsize=8, loc="center left")
 
 
 def main(arguments: Sequence[str]) -> None:
