@@ -65,7 +65,7 @@ def _range(rows: Rows, name: str, unit: str = "") -> str:
 def draw(curves: Rows, path: Path) -> None:
     """Draw the returns of each problem, by episodes and by CPU seconds, with a line for each seed."""
     with rc_context(STYLE):
-        figure = Figure(figsize=(9.2, 6.4), layout="constrained")
+        figure = Figure(figsize=(10.6, 6.4), layout="constrained")
         panels = figure.subplots(len(PROBLEMS), len(AXES))
         for row, (problem, title) in zip(panels, PROBLEMS.items(), strict=True):
             for axes, (column, label) in zip(row, AXES.items(), strict=True):
@@ -85,8 +85,8 @@ def _draw_panel(axes: Axes, curves: Rows, column: str) -> None:
             x, y = [row[column] for row in after], [row["score"] for row in after]
             axes.plot(x, y, color=colour, linestyle=style, linewidth=1.1, label=label)
     axes.set_xscale("log")
-    if column == "cpu_s":  # one legend for both panels, where no line is
-        axes.legend(frameon=False, fontsize=8, loc="center left")
+    if column == "cpu_s":  # one legend for both panels, beside them
+        axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def main(arguments: Sequence[str]) -> None:
