@@ -65,6 +65,11 @@ def leave_run(folder, low="hppo", seed=0, scores=(-0.9, 1.5, 2.5), high="none", 
     np.savez(folder / "evaluation.npz", score=np.array([1.0, 2.0]))
 
 
+def test_a_folder_without_runs_is_named(tmp_path, capsys):
+    assert finished([tmp_path, tmp_path]) == []
+    assert capsys.readouterr().err == f"{tmp_path}: has no runs\n"
+
+
 def test_finished_runs_are_found_at_any_depth_and_unfinished_ones_left_out(tmp_path):
     leave_run(tmp_path / "b/deep/er", seed=1)
     leave_run(tmp_path / "a", seed=2)

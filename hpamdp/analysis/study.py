@@ -54,7 +54,13 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
     Links to folders are followed. A run that is found twice counts once.
     """
     runs, seen = [], set[str]()
-    found = [run for folder in folders for run in sorted(run_folders(Path(folder), seen))]
+    found: list[Path] = []
+    for given in folders:
+        is_new = os.path.realpath(given) not in seen
+        of_given = sorted(run_folders(Path(given), seen))
+        if is_new and not of_given and os.path.isdir(given):
+            warn(f"{given}: has no runs")
+        found += of_given
     for folder in found:
         summary, config = saved_summary(folder), saved_config(folder)
         if not summary or not config:
