@@ -78,7 +78,7 @@ class OfficeEnv(BatchedEnv[OfficeState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem; options to begin with are the axes."""
+        """Return what these settings tell of the problem; the default options are the axes."""
         if options.chooses_goal:
             return ProblemFacts(title=cls.__name__, option_names=rules.GOALS, has_choice=True, has_oracle=True)
         axes = {"upright": ["up", "down"], "level": ["left", "right"]}

@@ -78,7 +78,7 @@ class PinballEnv(BatchedEnv[PinballState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem; options to begin with are the two axes and none."""
+        """Return what these settings tell of the problem; the default options are the two axes and none."""
         groups = {"horizontal": ["right", "left"], "vertical": ["up", "down"], "none": ["none"]}
         return ProblemFacts(title=cls.__name__, default_options=groups, has_oracle=True)
 

@@ -59,7 +59,10 @@ class TrafficOptions(Settings):
     If None, rewards are not scaled.
     """
     num_workers: NonNegativeInt = 0
-    """Processes that step the environments in parallel. If 0, this process steps them one after another."""
+    """Worker processes that call the simulations. If 0, this process calls one after another.
+
+    Each simulation has a process of its own in any case.
+    """
 
 
 class TrafficEnv(GymnasiumEnv):

@@ -42,11 +42,11 @@ class CountsOptions(Settings):
     resolution: PositiveFloat | Annotated[tuple[NonNegativeFloat, ...], FromList, Field(min_length=1)] = 10.0
     """Cells in a unit of each entry of the observation: entries are multiplied by it and rounded.
 
-    With 1, an entry that is 0 or 1, such as a tile, has two cells, and an entry in [-1, 1] has three. A list has a
-    number for each entry, and 0 leaves an entry out: `[10,10,0,0]` counts the places of a ball at any speed.
+    With 1, an entry in [0, 1], such as a tile, has two cells, and an entry in [-1, 1] has three. A list has a number
+    for each entry, and 0 leaves an entry out: `[10,10,0,0]` counts the places of a ball at any speed.
     """
     table_size: Annotated[int, Field(ge=1, le=10_000_000)] = 262_139
-    """Places in the table of counts, best a prime. Cells that share a place share their count."""
+    """Slots in the table of counts, best a prime. Cells that share a slot share their count."""
 
 
 class VisitTable(nn.Module):

@@ -68,7 +68,8 @@ class HeldPolicy(TensorDictModuleBase):
     """Acts by a learner's policy, except where a random action is held.
 
     The learner's policy is called at held steps, too, since it may have a memory. What is held travels in the
-    tensordict. A hold ends where the option begins, if each option has its own learner, else where the episode begins.
+    tensordict. If each option has its own learner, a hold ends when a new option begins. Else it ends with the
+    episode.
 
     Args:
         policy: the learner's.

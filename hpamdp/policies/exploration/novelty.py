@@ -67,7 +67,7 @@ class NoveltyOptions(Settings):
     batch_size: Annotated[PositiveInt, _OfNetworks] = 128
     """Steps in an update of the predicting network, which learns from each collected step once."""
     largest: Annotated[PositiveFloat, _OfNetworks] = 5.0
-    """Largest bonus before it is weighted."""
+    """Largest bonus before it is weighted, and largest normalised entry of an observation."""
     in_plans: Literal["auto", "disagreement", "distillation"] = "auto"
     """Bonus of learners that plan: an ensemble's `disagreement` about the next state, or random network `distillation`.
 
