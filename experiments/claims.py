@@ -1605,7 +1605,7 @@ def pearl() -> list[Claim]:
         ),
         Claim(
             page("pearl"),
-            "From {episodes} episodes and {cpu} CPU seconds on, all arrive.",
+            "In every evaluation they arrive from {episodes} episodes and {cpu} CPU seconds on.",
             dict(episodes=span(column(kept, "episodes")), cpu=span(column(kept, "cpu_s"))),
         ),
         Claim(

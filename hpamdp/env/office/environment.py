@@ -40,7 +40,8 @@ class OfficeOptions(Settings):
     tiles: NumTiles = 0
     """Number of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
 
-    From them a network may tell places apart more easily, as from the one-hot coordinates of Rooms.
+    A tile is 1 in its middle and falls to 0 at the middle of its neighbours. With them a network may tell places apart
+    more easily.
     """
     chooses_goal: bool = False
     """Whether the agent chooses what it goes for next, as an option: coffee, mail or target. It takes nothing else.
@@ -58,8 +59,8 @@ class OfficeEnv(BatchedEnv[OfficeState]):
     right; with `chooses_goal` also `option` int64 `[N]`: 0 coffee, 1 mail, 2 target. Only the parameter of the chosen
     action counts; outside its bounds it is clipped, NaN and infinity are refused.
 
-    A move costs 1, and one that is refused, because it would touch a wall, costs 2. Taking coffee or mail costs
-    nothing. The delivery is rewarded with 1000 and terminates the episode.
+    A move costs 1, and one that is refused, because it would touch a wall, costs 2. The step that takes coffee or mail
+    costs nothing. The step that delivers has the reward 1000 instead, and terminates the episode.
 
     Only the slips are random. The player of `oracle` is `hpamdp.env.office.player`. For the constructor's arguments and
     errors see `BatchedEnv`.
@@ -78,7 +79,7 @@ class OfficeEnv(BatchedEnv[OfficeState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem; the default options are the axes."""
+        """Return the facts about the problem under these settings; the default options are the axes."""
         if options.chooses_goal:
             return ProblemFacts(title=cls.__name__, option_names=rules.GOALS, has_choice=True, has_oracle=True)
         axes = {"upright": ["up", "down"], "level": ["left", "right"]}

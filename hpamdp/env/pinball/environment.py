@@ -45,7 +45,8 @@ class PinballOptions(Settings):
     tiles: NumTiles = 0
     """Number of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
 
-    From them a network may tell the two sides of a thin wall apart more easily.
+    A tile is 1 in its middle and falls to 0 at the middle of its neighbours. With them a network may tell the
+    two sides of a thin wall apart more easily.
     """
 
 
@@ -78,7 +79,7 @@ class PinballEnv(BatchedEnv[PinballState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem; the default options are the two axes and none."""
+        """Return the facts about the problem under these settings; the default options are the two axes and none."""
         groups = {"horizontal": ["right", "left"], "vertical": ["up", "down"], "none": ["none"]}
         return ProblemFacts(title=cls.__name__, default_options=groups, has_oracle=True)
 

@@ -129,32 +129,32 @@ class PrimitivesEnv(GymnasiumEnv):
         return _default_options(self._given.actions)
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
-        """Return where an arm would begin to search: moves and grasps go to the object, and pulls as far as the goal.
+        """Return the linear map from observations to initial arguments: to the object, and as far as the goal.
 
         Returns:
-            Weights `[num_parameters, 15]` and bias `[num_parameters]`. A vector is the object's offset from the hand,
-            a distance is the goal's offset from the object along its axis. In assembly it is the goal's offset from the
-            ring, and lifts and drops are 5 cm longer. Position steps have the vector 0.
+            Weights `[num_parameters, 15]` and bias `[num_parameters]`, all scaled to [-1, 1]. A vector is the object's
+            offset from the hand, a distance is the goal's offset from the object along its axis. In assembly it is the
+            goal's offset from the ring, and lifts and drops are 5 cm longer. Position steps have the vector 0.
         """
-        metres = torch.zeros(sum(self.parameter_dims), len(OBSERVED), dtype=torch.float32)
-        constant = torch.zeros(sum(self.parameter_dims), dtype=torch.float32)
+        weights = torch.zeros(sum(self.parameter_dims), len(OBSERVED), dtype=torch.float32)
+        bias = torch.zeros(sum(self.parameter_dims), dtype=torch.float32)
         ring = torch.tensor(RING_FROM_HANDLE_M, dtype=torch.float32)
         row = 0
         for action in ACTIONS[self._given.actions]:
             if action in PRIMITIVES and action.num_arguments == 3:
-                metres[row : row + 3, _OBJECT] = torch.eye(3, dtype=torch.float32)
+                weights[row : row + 3, _OBJECT] = torch.eye(3, dtype=torch.float32)
             elif action.num_arguments == 1:
                 axis = torch.tensor(AXES[action.name], dtype=torch.float32)
-                metres[row, _GOAL] = axis
+                weights[row, _GOAL] = axis
                 if self._given.task == "assembly":
-                    constant[row] = _CLEARANCE_M * axis[2].abs() - axis @ ring
+                    bias[row] = _CLEARANCE_M * axis[2].abs() - axis @ ring
             row += action.num_arguments
-        # An offset of 1 in [-1, 1] is that many metres; offsets of 0 are in the middle.
-        metres *= torch.as_tensor((HIGHEST - LOWEST) / 2.0)
+        # Offsets are observed in [-1, 1], with 0 in the middle, so they need no bias.
+        weights *= torch.as_tensor((HIGHEST - LOWEST) / 2.0)
         bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
         low, high = bounds.low.flatten().cpu(), bounds.high.flatten().cpu()
         half = (high - low) / 2.0
-        return metres / half.unsqueeze(-1), (constant - (high + low) / 2.0) / half
+        return weights / half.unsqueeze(-1), (bias - (high + low) / 2.0) / half
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return what the hand-written player of the task reaches in an episode of five primitives."""

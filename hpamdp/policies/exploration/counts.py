@@ -37,7 +37,7 @@ class CountsOptions(Settings):
     weight: PositiveFloat = 0.01
     """Reward of a bonus of 1, in the unit of the problem's rewards. A bonus is n^-1/2 after n visits of a cell.
 
-    The visits of a batch count before its bonuses: ten environments that enter a cell together share its novelty.
+    A batch is counted before its bonuses: if ten environments enter a new cell in one batch, each gets 10^-1/2.
     """
     resolution: PositiveFloat | Annotated[tuple[NonNegativeFloat, ...], FromList, Field(min_length=1)] = 10.0
     """Cells in a unit of each entry of the observation: entries are multiplied by it and rounded.
