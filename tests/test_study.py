@@ -18,6 +18,7 @@ from hpamdp.analysis.study import (
     add_to_tables,
     curve,
     difference,
+    evaluated,
     finished,
     groups,
     interquartile_mean,
@@ -320,6 +321,38 @@ def test_a_run_that_is_found_twice_is_refused_and_nothing_is_written(tmp_path):
     with pytest.raises(SystemExit, match="two runs of goal, pdqn, 2; nothing was written"):
         add_to_tables(tmp_path, {"results": [_row("pdqn", 2)] * 2}, ("domain", "learner", "seed"))
     assert len(read_csv(tmp_path / "results.csv")) == 1
+
+
+def test_a_run_of_another_length_does_not_replace_a_stored_one(tmp_path):
+    write_tables(tmp_path, {"results": [{**_row("pdqn", 2), "frames": 800_000}]})
+    with pytest.raises(SystemExit, match=r"the given run has 2,000 steps .* results.csv 800,000; nothing"):
+        add_to_tables(tmp_path, {"results": [{**_row("pdqn", 2), "frames": 2_000}]}, ("domain", "learner", "seed"))
+    assert read_csv(tmp_path / "results.csv")[0]["frames"] == 800_000
+
+
+def test_nothing_is_written_if_there_are_no_new_runs(tmp_path):
+    write_tables(tmp_path, {"results": [_row("pdqn", 0)]})
+    with pytest.raises(SystemExit, match="no finished runs; nothing was written"):
+        add_to_tables(tmp_path, {"results": []}, ("domain", "learner", "seed"))
+
+
+@pytest.mark.parametrize("cut", ["a,b\r\n1,2\r\n3", "a,b\r\n1,2,3\r\n"])
+def test_a_csv_file_that_was_cut_is_refused_in_one_line(tmp_path, cut):
+    (tmp_path / "cut.csv").write_text(cut)
+    with pytest.raises(SystemExit, match=r"cut.csv: line \d has not as many cells as the first line"):
+        read_csv(tmp_path / "cut.csv")
+
+
+def test_a_run_without_evaluations_is_left_out_of_tables_with_curves(tmp_path, capsys):
+    assert evaluated([Run(tmp_path, {}, {})]) == []
+    assert capsys.readouterr().err == f"{tmp_path}: metrics.csv is missing or has no evaluations, left out\n"
+
+
+@pytest.mark.parametrize("text", ["x,y\r\n1,2\r\n", "problem,library,version,learner,seed\r\nfoo,a,b,c,1\r\n"])
+def test_pearls_study_refuses_a_file_that_is_no_curve_of_it(tmp_path, text):
+    (tmp_path / "other.csv").write_text(text)
+    with pytest.raises(SystemExit, match=r"other\.csv: is no curve of this study; nothing was written"):
+        study("pearl").gather(tmp_path)
 
 
 def test_runs_are_added_to_a_csv_file_in_the_place_of_repeated_ones(tmp_path):

@@ -19,7 +19,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from hpamdp.analysis.study import Rows, Run, add_to_tables, curve, difference, finished, groups, read_csv, spread
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    add_to_tables,
+    curve,
+    difference,
+    evaluated,
+    finished,
+    groups,
+    read_csv,
+    spread,
+)
 from hpamdp.figure_style import STYLE, draw_spread
 from hpamdp.messages import exit_code
 
@@ -152,7 +163,7 @@ def main(arguments: list[str]) -> None:
         print(play_heuristic())
         return
     if arguments:
-        add_to_tables(HERE, gather(finished(arguments)), RUN)
+        add_to_tables(HERE, gather(evaluated(finished(arguments))), RUN)
     results, curves = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))
     print(table(results))
     print()

@@ -27,7 +27,12 @@ LEARNER = ("problem", "library", "version", "learner")
 
 def gather(folder: Path) -> Rows:
     """Return the rows of all curves, in the order of problems, libraries and seeds."""
-    rows = [row for file in sorted(folder.glob("*.csv")) for row in read_csv(file)]
+    rows: Rows = []
+    for file in sorted(folder.glob("*.csv")):
+        of_file = read_csv(file)
+        if any(not {*LEARNER, "seed"} <= row.keys() or row["problem"] not in PROBLEMS for row in of_file):
+            raise SystemExit(f"{file}: is no curve of this study; nothing was written")
+        rows += of_file
     order = list(PROBLEMS)
     return sorted(rows, key=lambda row: (order.index(row["problem"]), row["library"], row["seed"]))
 
@@ -91,6 +96,8 @@ def _draw_panel(axes: Axes, curves: Rows, column: str) -> None:
 
 def main(arguments: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
+    if len(arguments) > 1:
+        raise SystemExit(f"give one folder with all curves, not {len(arguments)}")
     if arguments:
         write_tables(HERE, {"curves": gather(Path(arguments[0]))})
     curves = read_csv(HERE / "curves.csv")

@@ -22,6 +22,7 @@ from hpamdp.analysis.study import (
     Run,
     add_to_tables,
     curve,
+    evaluated,
     finished,
     first_at,
     groups,
@@ -270,7 +271,7 @@ def draw(curves: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Add the runs in the folders, if any are given, then draw and tabulate."""
     if folders:
-        add_to_tables(HERE, gather(finished(folders)), RUN)
+        add_to_tables(HERE, gather(evaluated(finished(folders))), RUN)
     curves = read_csv(HERE / "curves.csv")
     draw(curves, HERE / "primitives.png")
     print(table(read_csv(HERE / "results.csv"), curves))

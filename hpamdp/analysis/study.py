@@ -72,6 +72,17 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
     return runs
 
 
+def evaluated(runs: Iterable[Run]) -> list[Run]:
+    """Return the runs whose metrics have evaluations, and warn about the others."""
+    kept = []
+    for run in runs:
+        if run.evaluations():
+            kept.append(run)
+        else:
+            warn(f"{run.folder}: metrics.csv is missing or has no evaluations, left out")
+    return kept
+
+
 def run_folders(folder: Path, seen: set[str], marks: Collection[str] = (SUMMARY_NAME,)) -> Iterator[Path]:
     """Yield the folders that hold a file with one of these names, and warn about broken links.
 
@@ -121,9 +132,19 @@ def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:
 
 
 def read_csv(path: Path) -> Rows:
-    """Read rows from a csv file, with numbers as floats."""
+    """Read rows from a csv file, with numbers as floats.
+
+    Raises:
+        SystemExit: a row has more or fewer cells than the file has columns.
+    """
+    rows = []
     with path.open(newline="") as file:
-        return [{name: _number(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        reader = csv.DictReader(file)
+        for row in reader:
+            if None in row or None in row.values():
+                raise SystemExit(f"{path}: line {reader.line_num} has not as many cells as the first line")
+            rows.append({name: _number(value) for name, value in row.items()})
+    return rows
 
 
 def _number(text: str) -> float | str:
@@ -186,12 +207,12 @@ def with_enough_seeds(rows: Rows, *names: str) -> Rows:
 
 def with_repeats_replaced(stored: Rows, new: Rows, names: Sequence[str]) -> Rows:
     """Return the stored rows that no new row repeats, told apart by these columns, and then the new rows."""
+    made_anew = {_name_of(row, names) for row in new}
+    return [row for row in stored if _name_of(row, names) not in made_anew] + new
 
-    def key(row: dict[str, Any]) -> tuple[str, ...]:
-        return tuple(str(row[name]) for name in names)
 
-    made_anew = {key(row) for row in new}
-    return [row for row in stored if key(row) not in made_anew] + new
+def _name_of(row: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(str(row[name]) for name in names)
 
 
 def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str]) -> None:
@@ -205,12 +226,24 @@ def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str]
         names: the columns.
 
     Raises:
-        SystemExit: a table has no rows, or the first one has a run twice. Then nothing is written.
+        SystemExit: the first table has no new rows, has a run twice, or has a run whose steps (`frames`) are not those
+            of the run that it repeats. Then nothing is written.
     """
     first, *_ = tables
+    if not tables[first]:
+        raise SystemExit("the given folders have no finished runs; nothing was written")
     twice = next((run for run, rows in groups(tables[first], *names).items() if len(rows) > 1), None)
     if twice is not None:
         raise SystemExit(f"the given folders have two runs of {', '.join(map(str, twice))}; nothing was written")
+    stored_steps = {_name_of(row, names): row.get("frames") for row in read_csv(folder / f"{first}.csv")}
+    for row in tables[first]:
+        run = _name_of(row, names)
+        steps, stored = row.get("frames"), stored_steps.get(run)
+        if stored is not None and steps != stored:
+            raise SystemExit(
+                f"{', '.join(run)}: the given run has {steps:,} steps and the one in {first}.csv {stored:,}; nothing "
+                "was written. Delete its rows to replace it"
+            )
     merged = {}
     for table, new in tables.items():
         rows = with_repeats_replaced(read_csv(folder / f"{table}.csv"), new, names)
