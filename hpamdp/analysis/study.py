@@ -235,18 +235,19 @@ def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str]
     twice = next((run for run, rows in groups(tables[first], *names).items() if len(rows) > 1), None)
     if twice is not None:
         raise SystemExit(f"the given folders have two runs of {', '.join(map(str, twice))}; nothing was written")
-    stored_steps = {_name_of(row, names): row.get("frames") for row in read_csv(folder / f"{first}.csv")}
+    stored = {table: read_csv(folder / f"{table}.csv") for table in tables}
+    steps_of = {_name_of(row, names): row.get("frames") for row in stored[first]}
     for row in tables[first]:
         run = _name_of(row, names)
-        steps, stored = row.get("frames"), stored_steps.get(run)
-        if stored is not None and steps != stored:
+        steps, before = row.get("frames"), steps_of.get(run)
+        if before is not None and steps != before:
             raise SystemExit(
-                f"{', '.join(run)}: the given run has {steps:,} steps and the one in {first}.csv {stored:,}; nothing "
+                f"{', '.join(run)}: the given run has {steps:,} steps and the one in {first}.csv {before:,}; nothing "
                 "was written. Delete its rows to replace it"
             )
     merged = {}
     for table, new in tables.items():
-        rows = with_repeats_replaced(read_csv(folder / f"{table}.csv"), new, names)
+        rows = with_repeats_replaced(stored[table], new, names)
         merged[table] = sorted(rows, key=lambda row: [(isinstance(row[name], str), row[name]) for name in names])
     write_tables(folder, merged)
 
