@@ -83,7 +83,7 @@ def complaints(
     wrong: dict[str, dict[str, None]] = {}
     place: dict[str, str] = {}
     for problem in error.errors(include_url=False):
-        path, value = _locate(problem["loc"], values)
+        path, value = _locate(problem["loc"], values, is_missing=problem["type"] == "missing")
         setting = prefix + ".".join(path)
         if problem["type"] == "extra_forbidden":
             known = _fields(model, path[:-1])
@@ -122,13 +122,13 @@ def _shortened(complaints: list[str]) -> list[str]:
     return complaints if num_more <= 0 else [*complaints[:_MOST_COMPLAINTS], f"and {num_more} more like this"]
 
 
-def _locate(location: tuple[int | str, ...], values: Mapping[str, Any]) -> tuple[list[str], Any]:
-    """Return the path of names to a wrong value, and the value."""
+def _locate(location: tuple[int | str, ...], values: Mapping[str, Any], *, is_missing: bool) -> tuple[list[str], Any]:
+    """Return the path of names to a wrong value, and the value. The last name `is_missing` in some mapping or not."""
     path: list[str] = []
     value: Any = values
     for part in location:
         # The other parts name the type of a union that was tried.
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and (part in value or is_missing):
             path.append(str(part))
             value = value.get(part)
         elif isinstance(value, list | tuple) and isinstance(part, int):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
+from hpamdp.env.action_arrays import single_action
 from hpamdp.env.actions import check_action_values
 
 DIMS = (2, 0, 1)
@@ -41,3 +43,35 @@ def test_the_parameters_of_the_chosen_action_must_be_finite(discrete, column, va
 def test_a_problem_may_use_its_own_words():
     with pytest.raises(ValueError, match=r"got turn=7 \(allowed 0 to 2\), angles=\["):
         check([7], [[0.0, 0.0, 0.0]], names=("turn", "angles"))
+
+
+NONE, ONE, PAIR = np.zeros(0), np.zeros(1), np.zeros(2)
+WRONG = {
+    "a number alone": (3, r"the action must be a tuple \(discrete, parameters\), but is a int"),
+    "no parameters": ((0,), "the action must be a tuple .*, but is a tuple of length 1"),
+    "a fraction": ((0.5, (PAIR, NONE, ONE)), "discrete has type float64, but must be integer"),
+    "a truth value": ((True, (PAIR, NONE, ONE)), "discrete has type bool, but must be integer"),
+    "a text": (("0", (PAIR, NONE, ONE)), "discrete has type <U1, but must be integer"),
+    "a row": ((np.array([0]), (PAIR, NONE, ONE)), r"discrete has shape \[1\], but must be \[\]"),
+    "an unknown one": ((3, (PAIR, NONE, ONE)), "discrete=3, but allowed are 0 to 2"),
+    "a negative one": ((-1, (PAIR, NONE, ONE)), "discrete=-1, but allowed are 0 to 2"),
+    "too few": ((0, (PAIR, NONE)), "parameters must be a tuple of length 3, but is a tuple of length 2"),
+    "all in one array": ((0, np.zeros(3)), "parameters must be a tuple of length 3, but is a ndarray"),
+    "too many of one": ((0, (np.zeros(3), NONE, ONE)), r"parameters of action 0 has shape \[3\], but must be \[2\]"),
+    "a scalar": ((2, (PAIR, NONE, 0.5)), r"parameters of action 2 has shape \[\], but must be \[1\]"),
+    "texts": ((2, (PAIR, NONE, ["a"])), "parameters of action 2 has type <U1, but must be a number"),
+    "nan": ((2, (PAIR, NONE, np.array([math.nan]))), r"the parameters of action 2 are \[nan\], but must be finite"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_a_single_action_of_another_form_is_refused_in_one_line(kind):
+    action, line = WRONG[kind]
+    with pytest.raises(ValueError, match=f"^step: {line}$"):
+        single_action(action, DIMS)
+
+
+def test_a_single_action_is_its_number_and_its_own_parameters():
+    for number in (2, np.int64(2), np.array(2)):
+        chosen, own = single_action((number, (np.full(2, math.nan), NONE, [0.5])), DIMS)
+        assert chosen == 2 and own.tolist() == [0.5], "those of other actions may be anything"

@@ -375,6 +375,23 @@ def test_cells_leave_out_the_entries_whose_resolution_is_0():
     assert table.bonus(torch.cat([other, speeds[1]])) == 1.0
 
 
+def test_cells_that_share_a_place_in_the_table_are_counted_all_the_same():
+    table = VisitTable(4, CountsOptions(resolution=10.0))
+    axis = torch.linspace(-1.0, 1.0, 21)
+    cells = torch.cartesian_prod(axis, axis, axis, axis)
+    table.see(cells)
+    assert table.counts.count_nonzero() < 0.75 * len(cells)
+    assert table.num_cells() == pytest.approx(len(cells), rel=0.01)
+    table.see(cells)
+    assert table.num_cells() == pytest.approx(len(cells), rel=0.01), "visits again are no new cells"
+
+
+@pytest.mark.parametrize("resolution", [[0.0, 0.0, 0.0, 0.0], 1e-50, [1.0, 1e-5, 0.0, 0.0], 1e30])
+def test_counts_refuse_resolutions_that_tell_no_states_apart(resolution):
+    with pytest.raises(SettingError, match=r"^resolution=.*: must (have a number above 0|be from 0.001 to 1e\+06)"):
+        Counts(HPPO(SPECS), resolution=resolution)
+
+
 def test_counts_refuse_a_list_of_resolutions_of_another_length():
     with pytest.raises(SettingError, match=r"resolution=\[1\.0, 2\.0\]: must have a number for each of 4 entries"):
         Counts(HPPO(SPECS), resolution=[1.0, 2.0])

@@ -16,7 +16,7 @@ from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
 from hpamdp.env.lunar_lander.environment import LunarLanderEnv
-from hpamdp.env.lunar_lander.lander import continuous_action, hybrid_action
+from hpamdp.env.lunar_lander.lander import HybridLunarLander, continuous_action, hybrid_action
 from hpamdp.env.registration import register
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -72,15 +72,34 @@ def test_every_chosen_engine_fires_even_at_its_lowest_throttle():
 @pytest.mark.parametrize(
     ("main", "side", "throttle", "line"),
     [
-        (0, -1, 0.5, "discrete=-1, but allowed are 0 to 2"),
-        (2, 0, 0.5, "discrete=2, but allowed are 0 to 1"),
-        (1, 0, np.nan, "the parameters of action 1 are .nan., but must be finite"),
+        (0, -1, 0.5, "side: discrete=-1, but allowed are 0 to 2"),
+        (2, 0, 0.5, "main: discrete=2, but allowed are 0 to 1"),
+        (0.5, 0, 0.5, "main: discrete has type float64, but must be integer"),
+        (1, 0, np.nan, "main: the parameters of action 1 are .nan., but must be finite"),
     ],
 )
 def test_an_action_that_does_not_exist_is_refused_in_one_line(main, side, throttle, line):
     none, box = np.zeros(0, np.float32), np.array([throttle], np.float32)
     with pytest.raises(ValueError, match=f"^step: {line}$"):
         continuous_action({"main": (main, (none, box)), "side": (side, (none, box, box))})
+
+
+def test_an_action_without_one_of_its_two_choices_is_refused_in_one_line():
+    none, box = np.zeros(0, np.float32), np.array([0.5], np.float32)
+    with pytest.raises(ValueError, match=r"must be a dict with keys main, side, but is a dict with keys main$"):
+        continuous_action({"main": (0, (none, box))})
+
+
+def test_no_step_is_taken_before_an_episode_begins_or_after_it_ended():
+    lander = HybridLunarLander()
+    action = hybrid_action(np.array([0.0, 0.0]))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        lander.step(action)
+    lander.reset(seed=0)
+    while not any(lander.step(action)[2:4]):
+        pass
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        lander.step(action)
 
 
 def test_the_hand_written_player_is_shown_with_the_rules_for_which_it_was_measured_alone():

@@ -179,6 +179,14 @@ def test_a_map_of_ones_own_is_played_by_rules_kernel_and_player(tmp_path):
             "polygons[0][1]: is the same corner as the next one",
         ),
         (
+            {"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, 0.1 + 1e-9]]]},
+            "polygons[0][1]: is the same corner as the next one",
+        ),
+        (
+            {"polygons": [[[0.6, 0.3], [1.0, 0.3], [1.0, 0.7], [0.6, 0.7]]]},
+            "target: lies in a wall or too close to walls",
+        ),
+        (
             {"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, 0.2]]] * 700},
             "polygons: have 2100 corners, but may have at most 2000",
         ),
@@ -198,6 +206,7 @@ def test_a_file_that_is_no_map_is_refused_in_one_line_that_says_where(change, me
         ("[1, 2", "is no JSON: EOF"),
         ("[" * 100_000, "is no JSON: recursion limit"),
         ('{"ball": NaN}', "is no JSON: expected value"),
+        ('{"ball": 0.01, "ball": 0.2}', "ball: is given twice"),
         ("[]", "the map: must be an object"),
         ("7" * 2**21, "has 2097152 bytes, but may have at most 1048576"),
     ],
@@ -231,7 +240,7 @@ def test_a_map_without_room_for_the_ball_beside_its_start_is_refused_with_starts
     # The ball fits between four walls with a thousandth to spare, and the grid has no place there.
     walls = [[0.0, 0.256, 0.0, 1.0], [0.744, 1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 0.256], [0.0, 1.0, 0.744, 1.0]]
     polygons = [[[left, low], [left, high], [right, high], [right, low]] for left, right, low, high in walls]
-    narrow = {"ball": 0.243, "start": [0.5, 0.5], "target": [0.9, 0.9, 0.04], "polygons": polygons}
+    narrow = {"ball": 0.243, "start": [0.5, 0.5], "target": [0.5401, 0.5, 0.04], "polygons": polygons}
     assert (PinballEnv(2, map=written(tmp_path, narrow)).reset()[keys.OBSERVATION] == 0.0).all()
     with pytest.raises(
         SettingError, match=r"^map='.*': the ball lies free at no place of a grid of .*; begin at the map's start"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import subprocess
 import sys
 from typing import get_args
 
@@ -203,6 +205,24 @@ def test_an_episode_terminates_after_its_time(actions, decisions, steps):
         td = env.step(td.update(action))["next"]
         assert td["done"].item() == td["terminated"].item() == (number == steps - 1)
         assert td[keys.OBSERVATION][0, -1].item() == pytest.approx(1.0 - 2.0 * (number + 1) / steps, abs=1e-5)
+
+
+@needs_simulator
+def test_no_step_is_taken_before_an_episode_begins_or_after_it_ended():
+    env = Manipulation(decisions=1)
+    for begin in (lambda: None, lambda: (env.reset(seed=0), env.step(env.action_space.sample()))):
+        begin()
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step(env.action_space.sample())
+
+
+@needs_simulator
+def test_a_wrong_way_of_drawing_is_told_in_one_line():
+    script = "import hpamdp.env.primitives.manipulation as m; m.Manipulation()"
+    done = subprocess.run(
+        [sys.executable, "-c", script], env={**os.environ, "MUJOCO_GL": "foo"}, capture_output=True, text=True
+    )
+    assert done.stderr.splitlines()[-1].startswith("hpamdp.settings.SettingError: MuJoCo: ") and "foo" in done.stderr
 
 
 @needs_simulator

@@ -26,6 +26,7 @@ from hpamdp.analysis.study import (
     middle_half,
     planned_seeds,
     read_csv,
+    readable,
     spread,
     standing_rows,
     with_enough_seeds,
@@ -346,6 +347,26 @@ def test_a_csv_file_that_was_cut_is_refused_in_one_line(tmp_path, cut):
 def test_a_run_without_evaluations_is_left_out_of_tables_with_curves(tmp_path, capsys):
     assert evaluated([Run(tmp_path, {}, {})]) == []
     assert capsys.readouterr().err == f"{tmp_path}: metrics.csv is missing or has no evaluations, left out\n"
+
+
+def test_a_run_of_another_study_is_named_and_left_out(tmp_path, capsys):
+    leave_run(tmp_path / "a")
+    (run,) = finished([tmp_path])
+    for name, lacks in (("problems", "choices"), ("generalisation", "trips"), ("hierarchy", "total_frames")):
+        assert readable([run], study(name).gather) == []
+        assert capsys.readouterr().err == f"{run.folder}: has no {lacks}, as runs of this study have; left out\n"
+    assert readable([run], study("learners").gather) == [run]
+
+
+def test_a_folder_with_one_curve_leaves_pearls_other_curves_as_they_are(tmp_path):
+    pearl = study("pearl")
+    stored = read_csv(EXPERIMENTS / "pearl" / "curves.csv")
+    again = [{**stored[0], "score": -5.0}]
+    write_tables(tmp_path, {"one": again})
+    rows = pearl.merged(stored, pearl.gather(tmp_path))
+    is_same = lambda row: all(row[name] == stored[0][name] for name in (*pearl.LEARNER, "seed"))  # noqa: E731
+    assert [row["score"] for row in rows if is_same(row)] == [-5.0]
+    assert [row for row in rows if not is_same(row)] == [row for row in stored if not is_same(row)]
 
 
 @pytest.mark.parametrize("text", ["x,y\r\n1,2\r\n", "problem,library,version,learner,seed\r\nfoo,a,b,c,1\r\n"])

@@ -114,6 +114,32 @@ def test_greens_are_clipped_and_unknown_actions_refused(make):
             env.step(wrong)
 
 
+def test_no_step_is_taken_before_an_episode_begins_or_after_it_ended(make):
+    env = make(TrafficLights, minutes=1)
+    for call in (lambda: env.step(action(0)), env.last_seconds, lambda: env.play("longest_queue")):
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            call()
+    env.reset(seed=1)
+    while not env.step(action(0, MAX_GREEN))[3]:
+        pass
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(action(0))
+
+
+def test_an_episode_may_have_no_vehicles(make):
+    env = make(TrafficLights, minutes=1, traffic=1e-6)
+    env.reset(seed=1)
+    *_, truncated, results = env.step(action(0, MAX_GREEN))
+    assert truncated and results["throughput"] == 0.0 and results["delay"] == 0.0
+
+
+def test_a_cache_that_cannot_be_written_is_told_in_one_line(monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    line = r"^/dev/null/hpamdp/traffic: Not a directory; set XDG_CACHE_HOME to a folder that can be written$"
+    with pytest.raises(SettingError, match=line):
+        network_file("crossing")
+
+
 def test_three_seconds_of_yellow_stand_between_different_phases_and_none_between_equal_ones(tmp_path):
     run = simulation(tmp_path)
     run.begin(0)

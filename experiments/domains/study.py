@@ -30,6 +30,7 @@ from hpamdp.analysis.study import (
     interquartile_mean,
     mean_interval,
     read_csv,
+    readable,
     spread,
     standing_rows,
     with_enough_seeds,
@@ -302,7 +303,7 @@ def _draw_domain(axes: Axes, name: str, curves: Rows, published: Rows) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        results, curves = gather(finished(folders))
+        results, curves = gather(readable(finished(folders), gather))
         tables = {"results": results, "curves": curves}
         stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in tables}
         write_tables(HERE, {name: merged(stored[name], rows) for name, rows in tables.items()})

@@ -20,6 +20,7 @@ from hpamdp.analysis.study import (
     first_at,
     groups,
     read_csv,
+    readable,
     spread,
     with_enough_seeds,
 )
@@ -88,7 +89,7 @@ def cell(rows: Rows) -> str:
 def main(folders: Sequence[str]) -> None:
     """Add the runs in the folders, if any are given, and tabulate."""
     if folders:
-        add_to_tables(HERE, {"results": gather(finished(folders))}, RUN)
+        add_to_tables(HERE, {"results": gather(readable(finished(folders), gather))}, RUN)
     print(table(read_csv(HERE / "results.csv")))
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from hpamdp.analysis.study import Rows, Run, finished, first_at, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, finished, first_at, groups, read_csv, readable, spread, write_tables
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
 from hpamdp.messages import exit_code
@@ -195,7 +195,7 @@ def draw(curves: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        tables = gather(finished(folders))
+        tables = gather(readable(finished(folders), gather))
         write_tables(HERE, {name: rows for name, rows in tables.items() if rows} or tables)
     curves = read_csv(HERE / "curves.csv")
     plain = [row for row in curves if not row["variant"]]

@@ -24,6 +24,7 @@ from hpamdp.analysis.study import (
     groups,
     mean_interval,
     read_csv,
+    readable,
     spread,
     with_enough_seeds,
 )
@@ -273,7 +274,7 @@ def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        add_to_tables(HERE, {"results": gather(finished(folders))}, RUN)
+        add_to_tables(HERE, {"results": gather(readable(finished(folders), gather))}, RUN)
     names = ("results", "players", "from_nothing", "transfer", "people")
     stored = [HERE / f"{name}.csv" for name in names]
     results, players, untrained, transfer, people = (read_csv(file) if file.exists() else [] for file in stored)

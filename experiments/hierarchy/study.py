@@ -28,6 +28,7 @@ from hpamdp.analysis.study import (
     difference,
     finished,
     groups,
+    readable,
     spread,
     standing_rows,
     with_enough_seeds,
@@ -214,7 +215,8 @@ def _label(axes: Axes, title: str, x: str, y: str) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        add_to_tables(HERE, dict(zip(TABLES, gather(finished(folders)), strict=True)), (*CELL, "seed"))
+        gathered = gather(readable(finished(folders), gather))
+        add_to_tables(HERE, dict(zip(TABLES, gathered, strict=True)), (*CELL, "seed"))
     stored = (standing_rows(HERE / f"{name}.csv") for name in TABLES)
     results, curves, choices = (with_enough_seeds(rows, *CELL) for rows in stored)
     curves, choices = of_the_map(curves), of_the_map(choices)

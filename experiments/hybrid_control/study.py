@@ -29,6 +29,7 @@ from hpamdp.analysis.study import (
     finished,
     groups,
     read_csv,
+    readable,
     spread,
 )
 from hpamdp.figure_style import STYLE, draw_spread
@@ -163,7 +164,7 @@ def main(arguments: list[str]) -> None:
         print(play_heuristic())
         return
     if arguments:
-        add_to_tables(HERE, gather(evaluated(finished(arguments))), RUN)
+        add_to_tables(HERE, gather(readable(evaluated(finished(arguments)), gather)), RUN)
     results, curves = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))
     print(table(results))
     print()

@@ -26,6 +26,7 @@ from hpamdp.analysis.study import (
     first_at,
     groups,
     read_csv,
+    readable,
     spread,
     with_enough_seeds,
     write_tables,
@@ -178,7 +179,7 @@ def _draw_references(axes: Axes, results: Rows, boat: str) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        results, curves = gather(finished(folders))
+        results, curves = gather(readable(finished(folders), gather))
         write_tables(HERE, {"results": results, "curves": curves})
     stored = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))
     results, curves = (with_enough_seeds(rows, "low", "problem", "reward") for rows in stored)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hpamdp.analysis.study import Rows, Run, finished, mean_interval, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, finished, mean_interval, read_csv, readable, spread, write_tables
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -102,7 +102,7 @@ def tabulate(rows: Rows) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather the runs in the folders, if any are given, and tabulate."""
     if folders:
-        write_tables(HERE, {"results": gather(finished(folders))})
+        write_tables(HERE, {"results": gather(readable(finished(folders), gather))})
     tabulate(read_csv(HERE / "results.csv"))
 
 

@@ -24,6 +24,7 @@ from hpamdp.analysis.study import (
     first_at,
     groups,
     read_csv,
+    readable,
     spread,
     write_tables,
 )
@@ -164,7 +165,7 @@ def _draw_curve(axes: Axes, rows: Rows, label: str, colour: str, style: str) -> 
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        results, curves = gather(finished(folders))
+        results, curves = gather(readable(finished(folders), gather))
         write_tables(HERE, {"results": results, "curves": curves})
     draw(read_csv(HERE / "curves.csv"), HERE / "curves.png")
     print(table(read_csv(HERE / "results.csv")))

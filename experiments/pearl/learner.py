@@ -5,6 +5,7 @@ python experiments/pearl/learner.py pinball|office SEED FILE    writes the curve
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import hpamdp
 from hpamdp.analysis.study import write_tables
+from hpamdp.messages import exit_code
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "pinball": {"low": "pdqn", "eval.every": 5_000, "eval.layouts": 1},
@@ -76,4 +78,9 @@ def main(problem: str, seed: int, file: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("problem", choices=SETTINGS)
+    parser.add_argument("seed", type=int)
+    parser.add_argument("file", type=Path)
+    given = parser.parse_args()
+    sys.exit(exit_code(lambda: main(given.problem, given.seed, given.file)))

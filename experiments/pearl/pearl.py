@@ -6,6 +6,7 @@ python experiments/pearl/pearl.py PEARL_FOLDER pinball|office SEED FILE [EPISODE
 
 from __future__ import annotations
 
+import argparse
 import csv
 import os
 import runpy
@@ -112,11 +113,19 @@ def main(folder: Path, problem: str, seed: int, file: Path, episodes: int) -> No
 
 
 if __name__ == "__main__":
-    clone, problem, seed, target, *others = sys.argv[1:]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("clone", type=Path, metavar="PEARL_FOLDER")
+    parser.add_argument("problem", choices=TRAINING)
+    parser.add_argument("seed", type=int)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("episodes", type=int, nargs="?")
+    given = parser.parse_args()
+    if not (given.clone / "main.py").is_file():
+        parser.error(f"{given.clone}: is no clone of PEARL's repository: it has no main.py")
     main(
-        Path(clone).absolute(),
-        problem,
-        int(seed),
-        Path(target).absolute(),
-        int(others[0]) if others else TRAINING[problem],
+        given.clone.absolute(),
+        given.problem,
+        given.seed,
+        given.file.absolute(),
+        given.episodes or TRAINING[given.problem],
     )

@@ -1,6 +1,7 @@
 """Draw and tabulate PEARL's code beside hpamdp's learners on Pinball and Office, by episodes and by CPU seconds.
 
-python experiments/pearl/study.py FOLDER    gathers the curves in the folder into curves.csv, then draws and tabulates
+python experiments/pearl/study.py FOLDER    adds the curves in the folder to curves.csv, in the place of earlier ones of
+                                            the same problem, learner and seed, then draws and tabulates
 python experiments/pearl/study.py           draws and tabulates the stored curves
 """
 
@@ -14,7 +15,16 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hpamdp.analysis.study import Rows, first_at, groups, mean_interval, read_csv, spread, write_tables
+from hpamdp.analysis.study import (
+    Rows,
+    first_at,
+    groups,
+    mean_interval,
+    read_csv,
+    spread,
+    with_repeats_replaced,
+    write_tables,
+)
 from hpamdp.figure_style import INK, LEARNER_COLOURS, STYLE
 from hpamdp.messages import exit_code
 
@@ -26,14 +36,26 @@ LEARNER = ("problem", "library", "version", "learner")
 
 
 def gather(folder: Path) -> Rows:
-    """Return the rows of all curves, in the order of problems, libraries and seeds."""
+    """Return the rows of all curves in a folder.
+
+    Raises:
+        SystemExit: the folder has no curves, or a file is none.
+    """
     rows: Rows = []
     for file in sorted(folder.glob("*.csv")):
         of_file = read_csv(file)
         if any(not {*LEARNER, "seed"} <= row.keys() or row["problem"] not in PROBLEMS for row in of_file):
             raise SystemExit(f"{file}: is no curve of this study; nothing was written")
         rows += of_file
+    if not rows:
+        raise SystemExit(f"{folder}: has no curves; nothing was written")
+    return rows
+
+
+def merged(stored: Rows, new: Rows) -> Rows:
+    """Return the stored rows and the new ones, in the order of problems, libraries and seeds."""
     order = list(PROBLEMS)
+    rows = with_repeats_replaced(stored, new, (*LEARNER, "seed"))
     return sorted(rows, key=lambda row: (order.index(row["problem"]), row["library"], row["seed"]))
 
 
@@ -99,7 +121,7 @@ def main(arguments: Sequence[str]) -> None:
     if len(arguments) > 1:
         raise SystemExit(f"give one folder with all curves, not {len(arguments)}")
     if arguments:
-        write_tables(HERE, {"curves": gather(Path(arguments[0]))})
+        write_tables(HERE, {"curves": merged(read_csv(HERE / "curves.csv"), gather(Path(arguments[0])))})
     curves = read_csv(HERE / "curves.csv")
     draw(curves, HERE / "curves.png")
     print(table(curves))

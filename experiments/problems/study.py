@@ -28,6 +28,7 @@ from hpamdp.analysis.study import (
     groups,
     mean_interval,
     read_csv,
+    readable,
     spread,
     with_enough_seeds,
 )
@@ -271,7 +272,7 @@ def draw(curves: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Add the runs in the folders, if any are given, then draw and tabulate."""
     if folders:
-        add_to_tables(HERE, gather(evaluated(finished(folders))), RUN)
+        add_to_tables(HERE, gather(readable(evaluated(finished(folders)), gather)), RUN)
     curves = read_csv(HERE / "curves.csv")
     draw(curves, HERE / "primitives.png")
     print(table(read_csv(HERE / "results.csv"), curves))

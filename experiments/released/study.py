@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, write_tables
+from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, readable, write_tables
 from hpamdp.figure_style import LEARNER_COLOURS
 from hpamdp.messages import exit_code
 
@@ -113,7 +113,7 @@ def _draw_learners(axes: Axes, rows: Rows, column: str) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        write_tables(HERE, gather(finished(folders)))
+        write_tables(HERE, gather(readable(finished(folders)), gather))
     draw(read_csv(HERE / "curves.csv"), HERE / "figure2.png")
     print(table(read_csv(HERE / "learned.csv")))
 

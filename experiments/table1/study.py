@@ -31,6 +31,7 @@ from hpamdp.analysis.study import (
     groups,
     middle_half,
     read_csv,
+    readable,
     spread,
     standing_rows,
     write_tables,
@@ -416,7 +417,7 @@ def human_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        add_to_tables(HERE, gather(finished(folders)), (*CELL, "seed"))
+        add_to_tables(HERE, gather(readable(finished(folders), gather)), (*CELL, "seed"))
     tables = {name: standing_rows(HERE / f"{name}.csv") for name in TABLES}
     stored = read_csv(HERE / "results.csv")
     for line in missing_runs({**tables, "results": stored}):

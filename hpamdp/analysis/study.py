@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from hpamdp.files import replacing
-from hpamdp.messages import one_line, warn
+from hpamdp.messages import file_and_reason, one_line, warn
 from hpamdp.metrics_file import read_rows
 from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_NAME, saved_config, saved_summary
 
@@ -80,6 +80,21 @@ def evaluated(runs: Iterable[Run]) -> list[Run]:
             kept.append(run)
         else:
             warn(f"{run.folder}: metrics.csv is missing or has no evaluations, left out")
+    return kept
+
+
+def readable(runs: Iterable[Run], gather: Callable[[Sequence[Run]], object]) -> list[Run]:
+    """Return the runs that a study's `gather` can read, and warn about the others, such as runs of other problems."""
+    kept = []
+    for run in runs:
+        try:
+            gather([run])
+        except KeyError as error:
+            warn(f"{run.folder}: has no {error.args[0]}, as runs of this study have; left out")
+        except OSError as error:
+            warn(f"{run.folder}: {file_and_reason(error)}; left out")
+        else:
+            kept.append(run)
     return kept
 
 

@@ -16,12 +16,13 @@ from hpamdp.config.components import SUPPLIED_ARGUMENTS
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.config.outside_jobs import composed, word
+from hpamdp.config.schema import Device, usable_device
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
 from hpamdp.messages import first_line
 from hpamdp.run.assemble import grouped
 from hpamdp.run.compatibility import lack_of
-from hpamdp.settings import SettingError, Settings
+from hpamdp.settings import Settings
 
 
 class _Sizes(Settings):
@@ -31,6 +32,7 @@ class _Sizes(Settings):
     seed: NonNegativeInt = 0
     oracle: bool = False
     human: bool = False
+    device: Device = "cpu"
 
 
 def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **settings: Any) -> PAMDPEnv:
@@ -94,17 +96,23 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
     for each, argument in (("id", "name"), ("num_envs", "num_envs")):
         if each in own:
             raise ConfigError(f"{each}: no setting of the problem; give it as the argument {argument}")
-    sizes = {} if num_envs is None else {"num_envs": num_envs}
-    if "seed" in own and env_id.startswith("hpamdp/"):
-        sizes["seed"] = own["seed"]
-    validated(_Sizes, sizes, "", "argument", "hpamdp.make_gymnasium")
+    sizes: dict[str, Any] = {} if num_envs is None else {"num_envs": num_envs}
+    if env_id.startswith("hpamdp/"):
+        sizes |= {each: own[each] for each in ("seed",) if each in own}
+        sizes |= {each: str(own[each]) for each in ("device",) if each in own}
+    checked = validated(_Sizes, sizes, "", "argument", "hpamdp.make_gymnasium")
+    if "device" in sizes:
+        own["device"] = usable_device(checked.device)
     try:
         if num_envs is None:
             return gymnasium.make(env_id, **own)
         return gymnasium.make_vec(env_id, num_envs=num_envs, **own)
-    except (gymnasium.error.Error, SettingError) as error:
+    except (gymnasium.error.Error, ValueError) as error:
         raise ConfigError(f"{env_id}: {first_line(error)}") from error
     except TypeError as error:
+        wrong_class = re.match(r"options: must be \w+, not \w+", str(error))
+        if wrong_class is not None:
+            raise ConfigError(f"{env_id}: {wrong_class.group()}") from error
         unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
         if unknown is None:
             raise

@@ -33,6 +33,27 @@ def _check_device(name: str) -> str:
     return name
 
 
+Device = Annotated[str, AfterValidator(_check_device)]
+
+
+def usable_device(name: str) -> torch.device:
+    """Return the device with a name that `Device` allows.
+
+    Raises:
+        ConfigError: this machine does not have the device.
+    """
+    import torch
+
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if name == "auto":
+        return torch.device("cuda" if count else "cpu")
+    device = torch.device(name)
+    if device.type == "cuda" and (device.index or 0) >= count:
+        there = f"has CUDA devices 0 to {count - 1}" if count else "has no usable CUDA device"
+        raise ConfigError(f"device={name}: this machine {there}; use device=auto or device=cpu")
+    return device
+
+
 def _check_increasing(lengths: tuple[int, ...]) -> tuple[int, ...]:
     if not lengths or any(one >= two for one, two in pairwise(lengths)):
         raise ValueError("must be increasing numbers")
@@ -121,7 +142,7 @@ class RunConfig(Settings):
     """`train`: learn from the agent's own steps. `offline`: from a data set alone. `eval`: only score a checkpoint."""
     seed: Seed = 0
     """Seed of everything random in training: episodes, exploration, initial weights."""
-    device: Annotated[str, AfterValidator(_check_device)] = "auto"
+    device: Device = "auto"
     """`auto` (CUDA if there is a device, else the CPU), `cpu`, `cuda` or `cuda:N`."""
     threads: Annotated[int, Field(ge=1, le=1024)] = 1
     """CPU threads of the learner. Small networks train fastest with one."""
@@ -185,16 +206,7 @@ class RunConfig(Settings):
         Raises:
             ConfigError: this machine does not have the device.
         """
-        import torch
-
-        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        if self.device == "auto":
-            return torch.device("cuda" if count else "cpu")
-        device = torch.device(self.device)
-        if device.type == "cuda" and (device.index or 0) >= count:
-            there = f"has CUDA devices 0 to {count - 1}" if count else "has no usable CUDA device"
-            raise ConfigError(f"device={self.device}: this machine {there}; use device=auto or device=cpu")
-        return device
+        return usable_device(self.device)
 
 
 @dataclass(frozen=True)

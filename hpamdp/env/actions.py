@@ -1,34 +1,14 @@
-"""Validation of the values of actions, with one wording of the error for all environments."""
+"""Validation of the values of batched actions, with one wording of the error for all environments."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from hpamdp.components import Components
 from hpamdp.messages import invalid_action
-
-
-def check_single_action(discrete: Any, parameters: Sequence[Any]) -> int:
-    """Return the number of the discrete action that one Gymnasium environment takes.
-
-    Args:
-        discrete: the number.
-        parameters: those of each discrete action.
-
-    Raises:
-        ValueError: there is no such action, or its parameters are not finite.
-    """
-    number = int(discrete)
-    if not 0 <= number < len(parameters):
-        raise ValueError(f"step: discrete={number}, but allowed are 0 to {len(parameters) - 1}")
-    if not np.isfinite(parameters[number]).all():
-        raise ValueError(f"step: the parameters of action {number} are {parameters[number]}, but must be finite")
-    return number
 
 
 def check_action_values(

@@ -149,7 +149,8 @@ class PAMDPEnv(EnvBase):
             options: for each option's name its discrete actions, by number or name, with _ for a space.
 
         Raises:
-            ValueError: the problem has options of its own, an option has no action, or an action does not exist.
+            ValueError: the problem has options of its own, an option has no action or has one twice, or an action does
+                not exist.
         """
         if self.has_choice or self.option_names:
             raise ValueError(f"{self.title} has options of its own: {', '.join(self.option_names)}")
@@ -160,7 +161,9 @@ class PAMDPEnv(EnvBase):
         for name, actions in options.items():
             if not actions:
                 raise ValueError(f"option {name} allows no action; name at least one")
-            numbers = {self._number_of_action(action) for action in actions}
+            numbers = [self._number_of_action(action) for action in actions]
+            if len({*numbers}) < len(numbers):
+                raise ValueError(f"option {name} has an action twice: {', '.join(map(str, actions))}")
             row = [number in numbers for number in range(num_discrete)]
             if not self.components.any_of_each(torch.tensor(row)):
                 raise ValueError(f"option {name} allows no action of some component; name at least one of each")

@@ -21,6 +21,7 @@ from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
+from hpamdp.env.action_arrays import as_array, describe, parameter_arrays
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.batched_env import GOING_ON, BatchedEnv
 from hpamdp.env.errors import ProblemError
@@ -30,11 +31,10 @@ from hpamdp.env.gymnasium_adapter import (
     GymnasiumVectorAdapter,
     NumpyRows,
     RenderMode,
-    as_array,
-    describe,
 )
 from hpamdp.env.kernel_rows import KernelRows, Results
 from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW
+from hpamdp.settings import SettingError
 
 
 class BatchedEnvAdapter(GymnasiumAdapter):
@@ -47,6 +47,8 @@ class BatchedEnvAdapter(GymnasiumAdapter):
     """
 
     def __init__(self, problem: str, *, render_mode: RenderMode = None, **settings: Any) -> None:
+        if "num_envs" in settings:
+            raise SettingError(f"num_envs={settings['num_envs']}: this is one environment; use gymnasium.make_vec")
         env = _load(problem)(1, **settings)
         super().__init__(NumpyBatchedEnv(env, ()), render_mode)
         self._env = env
@@ -223,13 +225,8 @@ class NumpyBatchedEnv(NumpyRows):
             raise ValueError(f"step: the action must be a tuple ({', '.join(names)}), but is {describe(action)}")
         *options, discrete, parameters = action
         dims = self._env.parameter_dims
-        if not isinstance(parameters, (tuple, list)) or len(parameters) != len(dims):
-            raise ValueError(f"step: parameters must be a tuple of length {len(dims)}, but is {describe(parameters)}")
         given = as_array("step: discrete", discrete, self._batch, is_integer=True).astype(np.int64)
-        arrays = [
-            as_array(f"step: parameters of action {number}", array, (*self._batch, dim))
-            for number, (array, dim) in enumerate(zip(parameters, dims, strict=True))
-        ]
+        arrays = parameter_arrays(parameters, dims, self._batch)
         joined = np.empty((self._env.num_envs, sum(dims)), np.float32)
         np.concatenate(arrays, axis=-1, out=joined if self._batch else joined[0], casting="same_kind")
         chosen = [as_array("step: option", each, self._batch, is_integer=True).astype(np.int64) for each in options]

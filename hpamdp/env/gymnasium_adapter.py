@@ -14,6 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from hpamdp.env.action_arrays import describe
 from hpamdp.env.kernel_rows import KernelRows
 from hpamdp.env.kernels import OUTCOME_ROW
 from hpamdp.settings import SettingError
@@ -154,6 +155,7 @@ class GymnasiumAdapter(gymnasium.Env):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode; see the module's docstring for `options`."""
+        options = _reset_options(options)
         super().reset(seed=seed)
         if seed is None and not self._problem.is_reset:
             seed = int(self.np_random.integers(2**31))
@@ -215,7 +217,7 @@ class GymnasiumVectorAdapter(VectorEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes; see the class's and the module's docstrings for `options`."""
-        options = dict(options or {})
+        options = _reset_options(options)
         mask = options.pop("reset_mask", None)
         self._check_mask(mask, seed)
         super().reset(seed=seed)
@@ -278,28 +280,12 @@ class GymnasiumVectorAdapter(VectorEnv):
         return masked
 
 
-def as_array(name: str, value: Any, shape: tuple[int, ...], *, is_integer: bool = False) -> np.ndarray:
-    """Return a value as an array.
+def _reset_options(options: Any) -> dict[str, Any]:
+    """Return a copy of the options of a reset.
 
     Raises:
-        ValueError: it is no array of this shape and kind; the message calls it `name`.
+        ValueError: they are no mapping.
     """
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be an array, but is {describe(value)}") from None
-    if array.dtype.kind not in ("iu" if is_integer else "iuf"):
-        raise ValueError(f"{name} has type {array.dtype}, but must be {'integer' if is_integer else 'a number'}")
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {list(array.shape)}, but must be {list(shape)}")
-    return array
-
-
-def describe(value: Any) -> str:
-    """Return what a value is, for an error."""
-    kind = type(value).__name__
-    if isinstance(value, Mapping):
-        return f"a {kind} with keys {', '.join(map(str, value))}"
-    if isinstance(value, (tuple, list)):
-        return f"a {kind} of length {len(value)}"
-    return f"a {kind}"
+    if not isinstance(options, Mapping | None):
+        raise ValueError(f"reset: options must be a dict, but is {describe(options)}")
+    return dict(options or {})

@@ -20,10 +20,11 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 
+from hpamdp.env.action_arrays import as_array, describe
 from hpamdp.env.boatdock import kernel, task
 from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.task import BoatState, Rules
-from hpamdp.env.gymnasium_adapter import NumpyRows, as_array, describe
+from hpamdp.env.gymnasium_adapter import NumpyRows
 from hpamdp.env.kernel_rows import KernelRows, invalid_choice
 
 ActionFormat = Literal["dict", "tuple"]

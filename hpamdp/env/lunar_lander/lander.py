@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.actions import check_single_action
+from hpamdp.env.action_arrays import describe, single_action
 from hpamdp.settings import SettingError
 
 SOLVED = 200.0
@@ -19,6 +20,7 @@ _THROTTLE = spaces.Box(0.5, 1.0, (1,), np.float32)
 # The dynamics switch an engine off at 0 (main) and at 0.5 (side), so the lowest throttles lie just above.
 _LEAST_MAIN = np.float32(1e-6)
 _LEAST_SIDE = np.nextafter(np.float32(0.5), np.float32(1.0))
+_DIMS = {"main": (0, 1), "side": (0, 1, 1)}  # parameters of each discrete action
 _SIDES = (0.0, -1.0, 1.0)  # signs of off, left and right in LunarLander's action
 
 
@@ -71,16 +73,25 @@ class HybridLunarLander(gymnasium.Wrapper):
             side=spaces.Tuple([spaces.Discrete(3), spaces.Tuple([_NONE, _THROTTLE, _THROTTLE])]),
         )
         self._return = 0.0
+        self._is_over = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
-        self._return = 0.0
+        self._return, self._is_over = 0.0, False
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: dict[str, Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Fire the engines for a step."""
+        """Fire the engines for a step.
+
+        Raises:
+            ValueError: there is no such action, or its throttle is not finite.
+            ResetNeeded: no episode has begun, or the last one is over.
+        """
+        if self._is_over:
+            raise gymnasium.error.ResetNeeded("step: call reset first")
         observation, reward, terminated, truncated, info = self.env.step(continuous_action(action))
         self._return += float(reward)
+        self._is_over = terminated or truncated
         return observation, float(reward), terminated, truncated, {**info, "is_success": self._return >= SOLVED}
 
 
@@ -90,13 +101,14 @@ def continuous_action(action: dict[str, Any]) -> np.ndarray:
     Raises:
         ValueError: there is no such action, or its throttle is not finite.
     """
-    of_main, of_side = action["main"][1], action["side"][1]
-    main, side = (check_single_action(*action[name]) for name in ("main", "side"))
+    if not isinstance(action, Mapping) or action.keys() != _DIMS.keys():
+        raise ValueError(f"step: the action must be a dict with keys {', '.join(_DIMS)}, but is {describe(action)}")
+    (main, lifts), (side, pushes) = (single_action(action[name], _DIMS[name], f"step: {name}") for name in _DIMS)
     lift, push = np.float32(-1.0), np.float32(0.0)
     if main:
-        lift = max(np.float32(2.0) * of_main[1][0] - np.float32(1.0), _LEAST_MAIN)
+        lift = max(np.float32(2.0) * np.float32(lifts[0]) - np.float32(1.0), _LEAST_MAIN)
     if side:
-        push = np.float32(_SIDES[side]) * max(of_side[side][0], _LEAST_SIDE)
+        push = np.float32(_SIDES[side]) * max(np.float32(pushes[0]), _LEAST_SIDE)
     return np.array([lift, push], np.float32)
 
 

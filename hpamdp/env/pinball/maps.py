@@ -17,6 +17,8 @@ square is put back.
 from __future__ import annotations
 
 import itertools
+import json
+import math
 import os
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -31,6 +33,7 @@ from hpamdp.messages import reason_of
 OWN_MAPS = ("simple", "hard")
 _FOLDER = Path(__file__).resolve().parent / "maps"
 _MAX_BYTES = 2**20
+_SHORTEST_EDGE = 1e-6  # of a wall, in units of the square's side; float32 tells no shorter ones apart
 _MAX_CORNERS = 2_000  # of all polygons: the rules compare every ball with every edge
 
 Coordinate = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -115,6 +118,7 @@ def read(name: str) -> PinballMap:
         from_json(data, allow_inf_nan=False)
     except ValueError as error:
         raise MapError(f"is no JSON: {reason_of(error)}") from error
+    json.loads(data, object_pairs_hook=_refuse_key_given_twice)
     try:
         found = PinballMap.model_validate_json(data)
     except ValidationError as error:
@@ -122,6 +126,18 @@ def read(name: str) -> PinballMap:
         raise MapError(f"{_place(wrong['loc'])}: {wrong['msg'].replace('Input should be', 'must be')}") from error
     _check(found)
     return found
+
+
+def _refuse_key_given_twice(pairs: list[tuple[str, Any]]) -> None:
+    """Refuse a JSON object that has a key twice, of which readers take the last one.
+
+    Raises:
+        MapError: the message names the key.
+    """
+    names = [name for name, _ in pairs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise MapError(f"{twice[:80]}: is given twice")
 
 
 def _place(location: tuple[Any, ...]) -> str:
@@ -140,12 +156,14 @@ def _check(found: PinballMap) -> None:
         raise MapError(f"polygons: have {sum(map(len, found.polygons))} corners, but may have at most {_MAX_CORNERS}")
     for number, polygon in enumerate(found.polygons):
         for place, (corner, following) in enumerate(itertools.pairwise((*polygon, polygon[0]))):
-            if corner == following:
+            if math.dist(corner, following) < _SHORTEST_EDGE:
                 raise MapError(f"polygons[{number}][{place}]: is the same corner as the next one")
     x, y, radius = found.target
     if not (radius <= x <= 1.0 - radius and radius <= y <= 1.0 - radius):
         raise MapError(f"target: the circle around ({x:g}, {y:g}) with radius {radius:g} must lie inside the square")
-    clearance = float(found.clearance(np.array([found.start], np.float64))[0])
+    clearance, around_target = found.clearance(np.array([found.start, (x, y)], np.float64)).tolist()
+    if around_target + radius <= found.ball:  # no place in the circle is farther from the walls
+        raise MapError("target: lies in a wall or too close to walls, so that the ball cannot reach it")
     if clearance <= found.ball:
         where = f"{clearance:.3g} from a wall" if clearance > 0.0 else "inside a wall"
         raise MapError(f"start: lies {where}, but the ball has radius {found.ball:g}")

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.actions import check_single_action
+from hpamdp.env.action_arrays import single_action
 from hpamdp.env.primitives.primitives import (
     LARGE_POSITION_STEPS,
     PRIMITIVES,
@@ -18,6 +18,7 @@ from hpamdp.env.primitives.primitives import (
     Action,
     phases,
 )
+from hpamdp.messages import one_line
 from hpamdp.settings import SettingError
 
 Task = Literal["drawer_close", "soccer", "peg_unplug_side", "sweep_into", "assembly", "disassemble"]
@@ -103,6 +104,7 @@ class Manipulation(gymnasium.Env):
             raise SettingError(f"Manipulation: reach={reach}, but must be above 0 and at most 1")
         self.render_mode = render_mode
         self.actions = ACTIONS[actions]
+        self._parameter_dims = [each.num_arguments for each in self.actions]
         self._is_dense = reward == "dense"
         self._ticks = decisions * STEPS
         self._arm = _make_arm(task, render_mode)
@@ -144,11 +146,13 @@ class Manipulation(gymnasium.Env):
 
         Raises:
             ValueError: there is no such action, or its arguments are not finite.
+            ResetNeeded: no episode has begun, or the last one is over.
         """
-        discrete, parameters = action
-        number = check_single_action(discrete, parameters)
+        if self._ticks_left == 0:
+            raise gymnasium.error.ResetNeeded("step: call reset first")
+        number, own = single_action(action, self._parameter_dims)
         chosen, box = self.actions[number], self._boxes[number]
-        arguments = np.clip(np.asarray(parameters[number], float), box.low, box.high)
+        arguments = np.clip(own.astype(float), box.low, box.high)
         rewards, is_success = [], False
         for phase in phases(chosen, arguments):
             for command in phase.commands(self):
@@ -186,6 +190,8 @@ def _make_arm(task: Task, render_mode: str | None) -> Any:
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS
     except ImportError as error:
         raise SettingError("Meta-World is not installed; pip install 'hpamdp[robots]'") from error
+    except RuntimeError as error:  # of MuJoCo, which reads MUJOCO_GL
+        raise SettingError(f"MuJoCo: {one_line(error)}") from error
     drawing = {} if render_mode is None else {"camera_name": _CAMERA, "width": _PIXELS, "height": _PIXELS}
     arm: Any = ALL_V3_ENVIRONMENTS[f"{task.replace('_', '-')}-v3"](render_mode=render_mode, **drawing)
     # As `metaworld.make_mt_envs` does, which however draws 50 places in advance.

@@ -136,6 +136,10 @@ def write_vehicles(demand: Demand, number: int, network_file: Path, folder: Path
             if count:
                 where = f'id="{name}_{end}" from="{name}" begin="{end - length}" end="{end}" number="{count}"'
                 flows.append(f'<flow {where} departLane="best" departSpeed="max"/>')
+    vehicles = folder / "vehicles.rou.xml"
+    if not flows:  # which jtrrouter refuses
+        vehicles.write_text("<routes/>\n")
+        return vehicles
     turns = []
     for signal in NETWORKS[demand.network]:
         for arm, edge in enumerate(signal.inward()):
@@ -144,7 +148,6 @@ def write_vehicles(demand: Demand, number: int, network_file: Path, folder: Path
     (folder / "flows.xml").write_text("<routes>\n" + "\n".join(flows) + "\n</routes>\n")
     interval = f'<interval begin="0" end="{int(demand.ends[-1])}">'
     (folder / "turns.xml").write_text(f"<turns>{interval}\n" + "\n".join(turns) + "\n</interval></turns>\n")
-    vehicles = folder / "vehicles.rou.xml"
     run_tool(
         "jtrrouter",
         *("--net-file", str(network_file), "--route-files", str(folder / "flows.xml")),

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.actions import check_single_action
+from hpamdp.env.action_arrays import single_action
 from hpamdp.env.traffic.demand import HELD_OUT, KINDS, MOST_TRAFFIC, NUM_DEMANDS
 from hpamdp.env.traffic.network import MAX_GREEN, MIN_GREEN, NETWORKS, PHASES, network_file
 from hpamdp.env.traffic.players import PLAYERS
@@ -77,6 +77,7 @@ class TrafficLights(gymnasium.Env):
         self._task = Task(network, demand, file, 60 * minutes, traffic, reward, render_mode is not None)
         green = spaces.Box(MIN_GREEN, MAX_GREEN, (1,), np.int64 if whole_seconds else np.float32)
         boxes = (*(green for _ in PHASES), *(_NONE for _ in PLAYERS if strategies))
+        self._parameter_dims = [*(1 for _ in PHASES), *(0 for _ in PLAYERS if strategies)]
         self.action_space = spaces.Tuple([spaces.Discrete(len(boxes)), spaces.Tuple(boxes)])
         num_entries = len(observation_names(network))
         self.observation_space = spaces.Box(-np.inf, np.inf, (num_entries,), np.float32)
@@ -101,12 +102,13 @@ class TrafficLights(gymnasium.Env):
 
         Raises:
             ValueError: there is no such action, or its green is not finite.
+            ResetNeeded: no episode has begun, or the last one is over.
         """
-        assert self._simulation is not None
-        discrete, greens = action
-        chosen = check_single_action(discrete, greens)
+        if self._simulation is None or self._last is None or self._last.is_over:
+            raise gymnasium.error.ResetNeeded("step: call reset first")
+        chosen, own = single_action(action, self._parameter_dims)
         if chosen < len(PHASES):
-            self._last = self._simulation.act(chosen, min(max(float(greens[chosen][0]), MIN_GREEN), MAX_GREEN))
+            self._last = self._simulation.act(chosen, min(max(float(own[0]), MIN_GREEN), MAX_GREEN))
         else:
             self._last = self._simulation.follow(PLAYERS[chosen - len(PHASES)])
         if self._last.is_over:
@@ -119,12 +121,14 @@ class TrafficLights(gymnasium.Env):
 
     def last_seconds(self) -> int:
         """Return how long the last step took, in simulated s."""
-        assert self._last is not None
+        if self._last is None:
+            raise gymnasium.error.ResetNeeded("last_seconds: call reset first")
         return self._last.seconds
 
     def play(self, player: str) -> dict[str, float]:
         """Return the results of a player by hand with the demand of the last episode, whose own end remains unknown."""
-        assert self._simulation is not None
+        if self._simulation is None:
+            raise gymnasium.error.ResetNeeded("play: call reset first")
         return self._simulation.play(player)
 
     def render(self) -> np.ndarray:
@@ -139,4 +143,4 @@ class TrafficLights(gymnasium.Env):
         """End the process of the simulation, which the first reset starts."""
         if self._simulation is not None:
             self._simulation.close()
-            self._simulation = None
+            self._simulation = self._last = None

@@ -15,7 +15,7 @@ from platformdirs import user_cache_path
 
 from hpamdp.env.errors import ProblemError
 from hpamdp.files import replacing
-from hpamdp.messages import one_line
+from hpamdp.messages import one_line, reason_of
 from hpamdp.settings import SettingError
 
 FOLDER = Path(__file__).resolve().parent / "networks"
@@ -127,8 +127,7 @@ def network_file(network: str) -> Path:
     It is kept in the user's cache under a name that depends on the files in `networks` and on the version of SUMO.
 
     Raises:
-        SettingError: SUMO is not installed.
-        OSError: the cache cannot be written to.
+        SettingError: SUMO is not installed, or the cache cannot be written to.
     """
     require_sumo()
     files = {part: FOLDER / f"{network}.{part}.xml" for part in _PARTS}
@@ -137,14 +136,19 @@ def network_file(network: str) -> Path:
     made = folder / f"{network}-{hashlib.sha256(made_of).hexdigest()[:16]}.net.xml"
     if made.exists():
         return made
-    folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(made.with_suffix(".lock")):
-        if not made.exists():
-            with replacing(made) as partial:
-                given = [
-                    *("--node-files", str(files["nod"]), "--edge-files", str(files["edg"])),
-                    *("--connection-files", str(files["con"]), "--tllogic-files", str(files["tll"])),
-                ]
-                kept = ["--no-turnarounds", "true", "--offset.disable-normalization", "true"]
-                run_tool("netconvert", *given, *kept, "--output-file", str(partial))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with FileLock(made.with_suffix(".lock")):
+            if not made.exists():
+                with replacing(made) as partial:
+                    given = [
+                        *("--node-files", str(files["nod"]), "--edge-files", str(files["edg"])),
+                        *("--connection-files", str(files["con"]), "--tllogic-files", str(files["tll"])),
+                    ]
+                    kept = ["--no-turnarounds", "true", "--offset.disable-normalization", "true"]
+                    run_tool("netconvert", *given, *kept, "--output-file", str(partial))
+    except OSError as error:
+        raise SettingError(
+            f"{folder}: {reason_of(error)}; set XDG_CACHE_HOME to a folder that can be written"
+        ) from error
     return made

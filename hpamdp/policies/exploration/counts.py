@@ -13,10 +13,11 @@ Differs from the source:
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveFloat
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -29,6 +30,16 @@ from hpamdp.settings import FromList, SettingError, Settings
 
 _HASH_SEED = 0  # of the factors of the hash, which are the same in every run
 _LARGEST_FACTOR = 2**40
+_COARSEST, _FINEST = 1e-3, 1e6  # resolutions; observations are of order 1
+
+
+def _check_resolution(resolution: float | tuple[float, ...]) -> float | tuple[float, ...]:
+    numbers = resolution if isinstance(resolution, tuple) else (resolution,)
+    if not any(numbers):
+        raise ValueError("must have a number above 0, or all states are one cell")
+    if not all(number == 0.0 or _COARSEST <= number <= _FINEST for number in numbers):
+        raise ValueError(f"must be from {_COARSEST:g} to {_FINEST:g}, or 0 in a list")
+    return resolution
 
 
 class CountsOptions(Settings):
@@ -39,7 +50,10 @@ class CountsOptions(Settings):
 
     A batch is counted before its bonuses: if ten environments enter a new cell in one batch, each gets 10^-1/2.
     """
-    resolution: PositiveFloat | Annotated[tuple[NonNegativeFloat, ...], FromList, Field(min_length=1)] = 10.0
+    resolution: Annotated[
+        PositiveFloat | Annotated[tuple[NonNegativeFloat, ...], FromList, Field(min_length=1)],
+        AfterValidator(_check_resolution),
+    ] = 10.0
     """Cells in a unit of each entry of the observation: entries are multiplied by it and rounded.
 
     With 1, an entry in [0, 1], such as a tile, has two cells, and an entry in [-1, 1] has three. A list has a number
@@ -86,6 +100,16 @@ class VisitTable(nn.Module):
         places = self.places(observation)
         self.counts.index_add_(0, places, torch.ones_like(places))
 
+    def num_cells(self) -> float:
+        """Return about how many cells were visited; those that share a slot are estimated.
+
+        Source: linear counting of Whang, Vander-Zanden and Taylor, *A Linear-Time Probabilistic Counting Algorithm for
+        Database Applications*, 1990. If all slots are taken, the number is a lower bound.
+        """
+        num_slots = len(self.counts)
+        num_empty = num_slots - int(self.counts.count_nonzero())
+        return float(round(num_slots * math.log(num_slots / max(num_empty, 1))))
+
 
 class Counts(RewardsNewStates):
     """A bonus for states that were seldom visited, from a table of counts."""
@@ -123,5 +147,4 @@ class Counts(RewardsNewStates):
             return Explored(None, {})
         observation = batch.get(("next", keys.OBSERVATION))[mask]
         self.table.see(observation)
-        cells = float(self.table.counts.count_nonzero())
-        return self.explored(self.table.bonus(observation), mask, {"cells": cells})
+        return self.explored(self.table.bonus(observation), mask, {"cells": self.table.num_cells()})
