@@ -1,320 +1,190 @@
-"""Train learners under selectors on Rooms, with options that end inside episodes, and compare them with the optimum.
+"""Tabulate selectors over options: on other boats, on boats that may be changed, on Goal, Crossing and Rooms.
 
-python experiments/options/study.py high=meta_critic low=hppo    trains, and adds a row to results.csv
-python experiments/options/study.py                              tabulates results.csv
+python experiments/options/study.py FOLDER...    adds the finished runs on Goal in these folders to goal.csv, then
+                                                 tabulates
+python experiments/options/study.py              tabulates the stored csv files
+
+`train_boats.py`, `train_crossing.py` and `train_rooms.py` train, and add rows to the other files.
 """
 
 from __future__ import annotations
 
-import csv
 import sys
-import tempfile
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any
 
-import torch
-from hydra import compose, initialize_config_dir
-from tensordict import TensorDictBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+import numpy as np
 
-from hpamdp import keys
-from hpamdp.config.compose import read
-from hpamdp.config.schema import Config
-from hpamdp.env.rooms import rules
-from hpamdp.env.rooms.environment import RoomsEnv
+from hpamdp.analysis.study import (
+    FEWEST_SEEDS,
+    FIRST_PROTOCOL_SEED,
+    Rows,
+    Run,
+    add_to_tables,
+    finished,
+    groups,
+    mean_interval,
+    read_csv,
+    readable,
+    spread,
+    standing_rows,
+)
 from hpamdp.messages import exit_code
-from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.run.assemble import AssembledRun, assemble
-from hpamdp.run.trainer import Trainer
 
 HERE = Path(__file__).resolve().parent
-CONF = HERE.parent.parent / "conf"
-FILE = HERE / "results.csv"
-GAMMA = 0.95
-Settings: TypeAlias = Mapping[str, Sequence[str]]  # words of the command line, by the selector or the learner
-# Settings of every run, before the words of the command line.
-COMMON = [
-    "env=rooms",
-    f"low.gamma={GAMMA}",
-    "agent.termination=steps",
-    "agent.option_length=3",
-    "eval.layouts=200",
-    "eval.every=0",
-    "log_every=0",
-]
-# Selectors make many updates from recent decisions only. The defaults suit one decision per episode.
-SELECTORS = {
-    "meta_critic": [
-        f"high.gamma={GAMMA}",
-        "high.num_members=1",
-        "high.epsilon_final=0.02",
-        "high.epsilon_decisions=10000",
-        "high.buffer_size=10000",
-        "high.batch_size=256",
-        "high.updates_per_decision=0.05",
-        "high.tau=0.05",
-    ],
-    "actor": [f"high.gamma={GAMMA}", "high.minibatch_size=256", "high.entropy=0.02", "high.lr=1e-3"],
-    "option_critic": [
-        f"high.gamma={GAMMA}",
-        "high.epsilon_steps=50000",
-        "high.buffer_size=10000",
-        "high.batch_size=256",
-        "high.tau=0.05",
-        "agent.termination=learned",
-        "agent.option_length=null",
-    ],
-}
-# Options are uniform for half of the steps. Otherwise a learner that is not chosen does not learn, and is never chosen.
-# Replay learners have small networks and fast targets, for a problem of 104 cells.
-REPLAY = [
-    "num_envs=256",
-    "total_frames=200000",
-    "agent.uniform_option_steps=120000",
-    "low.hidden_dims=[64,64]",
-]
-# Plans have one step. The value of the last state covers the rest, and distinguishes lengths of steps more clearly.
-ONE_STEP_PLANS = [
-    "low.end_values=true",
-    "low.end_value_tau=0.05",
-    "low.horizon=1",
-    "low.temperature=0.01",
-    "low.num_iterations=3",
-]
-DLPA_PLANS = [*ONE_STEP_PLANS, "low.num_samples=32", "low.num_elites=8", "low.epsilon=0.2"]
-PETS_PLANS = [*ONE_STEP_PLANS, "low.greedy_samples=12", "low.parameter_noise=0.2"]
-LEARNERS = {
-    # Small batches, for many updates of a policy that must cross the rooms before it finds a reward.
-    "hppo": [
-        "total_frames=160000",
-        "agent.uniform_option_steps=80000",
-        "num_envs=64",
-        "steps_per_batch=16",
-        "low.minibatch_size=256",
-    ],
-    "pdqn": [
-        *REPLAY,
-        "agent.uniform_option_steps=100000",
-        "low.warmup_steps=2000",
-        "low.updates_per_step=0.05",
-        "low.actor_tau=0.05",
-        "low.critic_tau=0.05",
-        "low.epsilon_steps=15000",
-    ],
-    "hyar": [
-        *REPLAY,
-        "low.warmup_steps=5000",
-        "low.updates_per_step=0.1",
-        "low.tau=0.05",
-        "low.epsilon_steps=30000",
-        "low.codec_pretrain_updates=1000",
-    ],
-    # One in 500 random episodes arrives, so there are many random steps at the start.
-    "paddpg": [
-        *REPLAY,
-        "low.warmup_steps=25000",
-        "low.twin=true",
-        "low.updates_per_step=0.1",
-        "low.hidden_dims=[128,128]",
-        "low.tau=0.05",
-        "low.epsilon_final=0.2",
-        "low.epsilon_steps=60000",
-        "low.actor_lr=3e-4",
-    ],
-    # Low temperatures. With the defaults, a step's entropy bonus exceeds its cost, and never arriving is best.
-    "hsac": [
-        *REPLAY,
-        "low.warmup_steps=25000",
-        "low.updates_per_step=0.1",
-        "low.batch_size=128",
-        "low.tau=0.05",
-        "low.discrete_temperature=0.01",
-        "low.parameter_temperature=0.005",
-        "low.discrete_target_entropy=0.5",
-        "low.parameter_target_entropy=-1.0",
-    ],
-    "dlpa": [
-        "num_envs=64",
-        "total_frames=100000",
-        "agent.uniform_option_steps=60000",
-        "low.hidden_dims=[64,64]",
-        "low.warmup_steps=15000",
-        "low.updates_per_step=0.1",
-        *DLPA_PLANS,
-    ],
-    # As for PADDPG, but more random steps, for models that learn from few arrivals.
-    "pets": [
-        "total_frames=140000",
-        "agent.uniform_option_steps=110000",
-        "num_envs=64",
-        "steps_per_batch=4",
-        "low.warmup_steps=40000",
-        "low.updates_per_step=0.15",
-        "low.batch_size=256",
-        "low.weight_decay=0.1",
-        "low.optimism=0",
-        *PETS_PLANS,
-    ],
-    # Features of two entries each: with one-hot vectors, this gives each cell a value. Episodes are options.
-    "qpamdp": [
-        "total_frames=800000",
-        "agent.uniform_option_steps=400000",
-        "num_envs=64",
-        "steps_per_batch=16",
-        "low.features=null",
-        "low.phi_order=1",
-        "low.psi_order=1",
-        "low.warmup_steps=20000",
-        "low.initial_episodes=30000",
-        "low.relearning_episodes=10000",
-        "low.parameter_updates=5",
-        "low.rollouts=5000",
-        "low.temperature_decay=0.9999",
-        "low.initial_mean=0.5",
-        "low.sigma=0.3",
-    ],
-}
+DOMAINS = HERE.parent / "domains" / "results.csv"
+ALONE = "none"
+PAIR = ("low", "high")
+BOATS = "env.boats="
+CHANGED, KEPT = "changed for 0.1 s", "kept"
 
 
-def make_config(words: Sequence[str], common: Sequence[str], selectors: Settings, learners: Settings) -> Config:
-    """Return the checked config of a run, from settings of all runs, its selector and its learner, and the words."""
-    chosen = dict(word.split("=", 1) for word in words)
-    own = [*selectors.get(chosen.get("high", ""), []), *learners.get(chosen.get("low", ""), [])]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return read(compose("config", [*common, *own, *words], return_hydra_config=True))
+def gather(runs: Sequence[Run]) -> Rows:
+    """Return a row for each run on Goal or Hard Goal."""
+    return [
+        {
+            "domain": run.summary["env"],
+            "low": run.summary["low"],
+            "high": run.summary["high"],
+            "frames": run.summary["frames"],
+            "seed": run.summary["seed"],
+            "success": round(run.summary["success"], 4),
+            "cpu_s": round(run.summary["cpu_s"], 1),
+        }
+        for run in runs
+        if run.summary["env"] in ("goal", "hard_goal")
+    ]
 
 
-def trained(config: Config) -> tuple[AssembledRun, int, float]:
-    """Train an agent, and return the parts of its run, its steps and its CPU seconds."""
-    cpu = time.process_time()
-    with tempfile.TemporaryDirectory() as folder:
-        torch.manual_seed(config.run.seed)
-        parts = assemble(config)
-        trainer = Trainer(config, parts, Path(folder))
-        trainer.train()
-    return parts, trainer.frames, time.process_time() - cpu
+def standing(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
+    """Return the cells with enough seeds: their runs with new seeds, or the earlier ones if there are too few of them.
 
-
-def value_errors(value: torch.Tensor, best: torch.Tensor, num_due: torch.Tensor) -> dict[str, float]:
-    """Return the errors of values relative to the mean best value, at decisions and in all cells.
-
-    Args:
-        value, best: learned and best values of the cells, `[*C]`.
-        num_due: number of decisions in each cell, `[*C]`.
+    Rows on earlier seeds stay in the files.
     """
-    error = (value - best).abs()
-    return {
-        "value_error": round(((num_due * error).sum() / (num_due * best).sum()).item(), 4),
-        "value_error_everywhere": round((error.sum() / best.sum()).item(), 4),
-    }
+    cells = {}
+    for cell, of_cell in groups(rows, *names).items():
+        new = [row for row in of_cell if row["seed"] >= FIRST_PROTOCOL_SEED]
+        chosen = new if len(new) >= FEWEST_SEEDS else [row for row in of_cell if row["seed"] < FIRST_PROTOCOL_SEED]
+        if len(chosen) >= FEWEST_SEEDS:
+            cells[cell] = chosen
+    return cells
 
 
-def train(words: Sequence[str]) -> dict[str, object]:
-    """Train one agent and return its row."""
-    config = make_config(words, COMMON, SELECTORS, LEARNERS)
-    parts, frames, cpu = trained(config)
-    length = config.run.agent.option_length
-    steps = length or 1
-    means, num_due = evaluate(parts)
-    optimum = mean_over_starts(parts, rules.best_values(1.0, steps))
-    return {
-        "high": config.high.name,
-        "low": config.low.name,
-        "sharing": config.run.agent.sharing,
-        "termination": config.run.agent.termination,
-        "option_length": length,
-        "seed": config.run.seed,
-        "steps": frames,
-        "score": round(means["score"], 4),
-        "optimum": round(optimum, 4),
-        "share": round(means["score"] / optimum, 4),
-        "success": round(means["success"], 4),
-        **value_errors(values_of_cells(parts.agent), rules.best_values(GAMMA, steps), num_due),
-        "cpu_s": round(cpu, 1),
-    }
+def boats() -> dict[tuple[str, str], Rows]:
+    """Return the runs with more boats, by `BOATS` and selector, and those that change boats or keep them."""
+    rows = read_csv(HERE / "boats.csv")
+    for row in rows:
+        words = row["words"].split()
+        selector = next(word.removeprefix("high=") for word in words if word.startswith("high="))
+        changes = CHANGED if any(word.startswith("env.switch_cost=") for word in words) else KEPT
+        row["case"] = (BOATS, selector) if any(word.startswith(BOATS) for word in words) else ("", changes)
+    return {case: cell for (case,), cell in standing(rows, "case").items()}
 
 
-def mean_over_starts(parts: AssembledRun, values: torch.Tensor) -> float:
-    """Return the mean of values `[x, y]` over the cells in which the evaluation's episodes begin."""
-    env = parts.evaluation.problem
-    assert isinstance(env, RoomsEnv)
-    env.seed_evaluation(parts.evaluation.seed)
-    env.reset()
-    return values[env.state.x.long(), env.state.y.long()].mean().item()
+def on_goal() -> dict[tuple[str, str, str], Rows]:
+    """Return the runs on Goal and Hard Goal by domain, learner and selector, those of `domains` without one."""
+    runs = standing(read_csv(HERE / "goal.csv"), "domain", *PAIR)
+    alone = [
+        {**row, "low": row["learner"], "high": ALONE}
+        for row in standing_rows(DOMAINS)
+        if (row["domain"], row["learner"]) in {(domain, low) for domain, low, _ in runs}
+    ]
+    return runs | groups(alone, "domain", *PAIR)
 
 
-def evaluate(parts: AssembledRun) -> tuple[dict[str, float], torch.Tensor]:
-    """Play the evaluation's episodes, and return their means and the number of decisions in each cell, `[x, y]`."""
-    env = parts.evaluation.problem
-    assert isinstance(env, RoomsEnv)
-    num_due = torch.zeros(rules.SIZE, rules.SIZE, dtype=torch.float64)
-
-    def policy(td: TensorDictBase) -> TensorDictBase:
-        x, y = env.state.x.long(), env.state.y.long()
-        td = parts.agent.policy(td)
-        is_due = (td[keys.IS_DECISION] & ~td[keys.DONE]).squeeze(-1)
-        num_due.index_put_((x[is_due], y[is_due]), num_due.new_ones(()), accumulate=True)
-        return td
-
-    return parts.evaluation.measure(parts.evaluation.run(policy)), num_due
+def on_the_plane(name: str) -> dict[tuple[str, str], Rows]:
+    """Return the runs on Crossing or Rooms by learner and selector."""
+    return standing(read_csv(HERE / f"{name}.csv"), *PAIR)
 
 
-@torch.no_grad()
-def learned_values(agent: HierarchicalAgent, observation: torch.Tensor) -> torch.Tensor:
-    """Return the learners' values of states `[N, observation_dim]`, float64 `[N]`; NaN if they have none.
-
-    In each state the selector chooses greedily, and the value is that of the chosen option's learner.
-    """
-    none = torch.zeros(len(observation), dtype=torch.long)
-    follows = agent.next_options
-    assert follows is not None and agent.selector is not None
-    shown = observation
-    if agent.is_shared:
-        shown = torch.cat([observation, observation.new_zeros(len(observation), agent.specs.num_options)], -1)
-    agent.selector.decides_ends = False
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        option = follows.choose(shown, none, none)
-        try:
-            value = torch.stack([follows.value(shown, option) for _ in range(10)]).mean(0)  # some are noisy
-        except NotImplementedError:
-            value = torch.full(none.shape, torch.nan)
-    return value.double()
-
-
-def values_of_cells(agent: HierarchicalAgent) -> torch.Tensor:
-    """Return the learners' values of all cells, float64 `[x, y]`: 0 at walls and at the goal."""
-    x, y = (part.flatten().int() for part in torch.meshgrid(*2 * [torch.arange(rules.SIZE)], indexing="ij"))
-    none = torch.zeros_like(x)
-    value = learned_values(agent, rules.observe(rules.RoomsState(x, y, none, none, none)))
-    is_nothing = ~rules.is_free(x, y) | ((x == rules.GOAL) & (y == rules.GOAL))
-    return value.masked_fill(is_nothing, 0.0).reshape(rules.SIZE, rules.SIZE)
+def boats_table(is_changed: bool) -> str:
+    """Return a line for each selector over three boats, or for boats that may be changed and those that are kept."""
+    head = "| {} | n | score | ceiling | of it | changes an episode | planner's | weighted | success | presses | CPU |"
+    lines = [head.format("" if is_changed else "selector"), "|---" * 11 + "|"]
+    for (boats_word, name), rows in boats().items():
+        if bool(boats_word) == is_changed:
+            continue
+        changes = [row["option_changes"] for row in rows if row["option_changes"] != ""]
+        cells = [
+            name,
+            len(rows),
+            spread(_column(rows, "score")),
+            f"{_mean(rows, 'ceiling'):.3f}",
+            _percent(rows, "share"),
+            f"{np.mean(changes):.2f}" if changes else "0",
+            _percent(rows, "oracle_agreement"),
+            _percent(rows, "oracle_agreement_weighted"),
+            _percent(rows, "success"),
+            f"{_mean(rows, 'frames'):,.0f}",
+            f"{_mean(rows, 'cpu_s'):.0f} s",
+        ]
+        lines.append(_line(cells))
+    return "\n".join(lines)
 
 
-def add(row: Mapping[str, object], file: Path) -> None:
-    """Append a row to a csv file."""
-    is_new = not file.exists()
-    with file.open("a", newline="") as stream:
-        writer = csv.DictWriter(stream, list(row))
-        if is_new:
-            writer.writeheader()
-        writer.writerow(row)
+def goal_table() -> str:
+    """Return a line for each selector on each domain, and for the learner without one."""
+    lines = ["| domain | learner | selector | n | goals | 95 % | steps | CPU |", "|---" * 8 + "|"]
+    for (domain, low, high), rows in sorted(on_goal().items(), key=lambda item: (item[0][:2], item[0][2] == ALONE)):
+        scores = _column(rows, "success")
+        cells = [
+            domain.replace("_", " "),
+            low,
+            high,
+            len(rows),
+            spread(scores),
+            "{:.3f} to {:.3f}".format(*mean_interval(scores)),
+            f"{_mean(rows, 'frames'):,.0f}",
+            f"{_mean(rows, 'cpu_s'):.0f} s",
+        ]
+        lines.append(_line(cells))
+    return "\n".join(lines)
 
 
-def tabulate(file: Path) -> None:
-    """Print a csv file as a table."""
-    with file.open(newline="") as stream:
-        names, *rows = csv.reader(stream)
-    for cells in (names, ["---"] * len(names), *rows):
-        print("| " + " | ".join(cells) + " |")
+def pairs_table(name: str) -> str:
+    """Return a line for each learner under each selector on Crossing or Rooms."""
+    head = "| learner | selector | seeds | steps | share | lowest | success | value error | everywhere | CPU |"
+    lines = [head, "|---" * 10 + "|"]
+    for (low, high), rows in on_the_plane(name).items():
+        cells = [
+            low,
+            high,
+            f"{min(_column(rows, 'seed'))} to {max(_column(rows, 'seed'))}",
+            f"{_mean(rows, 'steps'):,.0f}",
+            spread(_column(rows, "share")),
+            f"{min(_column(rows, 'share')):.3f}",
+            _percent(rows, "success"),
+            _percent(rows, "value_error"),
+            _percent(rows, "value_error_everywhere"),
+            f"{_mean(rows, 'cpu_s'):.0f} s",
+        ]
+        lines.append(_line(cells))
+    return "\n".join(lines)
 
 
-def main(words: Sequence[str]) -> None:
-    """Train if there are words, and print the table."""
-    if words:
-        add(train(words), FILE)
-    tabulate(FILE)
+def _column(rows: Rows, name: str) -> list[float]:
+    return [row[name] for row in rows]
+
+
+def _mean(rows: Rows, name: str) -> float:
+    return float(np.mean(_column(rows, name)))
+
+
+def _percent(rows: Rows, name: str) -> str:
+    return f"{100.0 * _mean(rows, name):.1f} %"
+
+
+def _line(cells: Sequence[object]) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def main(folders: Sequence[str]) -> None:
+    """Add the runs on Goal, if folders are given, and tabulate."""
+    if folders:
+        add_to_tables(HERE, {"goal": gather(readable(finished(folders), gather))}, ("domain", *PAIR, "seed"))
+    of_boats = (boats_table(is_changed) for is_changed in (False, True))
+    print(*of_boats, goal_table(), *(pairs_table(name) for name in ("crossing", "rooms")), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Train agents on boats other than people's, and on boats that may be changed inside an episode.
 
-python experiments/options/boats.py WORDS    trains with these words of the command line, and adds a row to boats.csv
-python experiments/options/boats.py          tabulates boats.csv
+python experiments/options/train_boats.py WORDS    trains with these words of the command line, and adds a row to boats.csv
 """
 
 from __future__ import annotations
@@ -59,13 +58,11 @@ def add(row: Mapping[str, Any]) -> None:
 
 
 def main(words: Sequence[str]) -> None:
-    """Train if there are words, and print the table."""
-    if words:
-        add(train(words))
-    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
-    with FILE.open(newline="") as stream:
-        for row in csv.DictReader(stream):
-            print("| " + " | ".join(row[name] for name in COLUMNS) + " |")
+    """Train and add the row."""
+    if not words:
+        raise SystemExit("give words of the command line, such as high=linucb low=hppo")
+    add(train(words))
+    print(f"{FILE}: a row added; study.py tabulates it")
 
 
 if __name__ == "__main__":

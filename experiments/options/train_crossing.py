@@ -1,24 +1,23 @@
 """Train learners under selectors on Crossing, with options that end inside episodes, and compare with the best values.
 
-python experiments/options/crossing_study.py high=meta_critic,actor low=hppo,pdqn seed=0   trains each pair, and adds a
-                                                                                           row each to crossing.csv
-python experiments/options/crossing_study.py                                               tabulates crossing.csv
+python experiments/options/train_crossing.py high=meta_critic,actor low=hppo,pdqn seed=0    trains each pair, and adds a
+                                                                                            row each to crossing.csv
 
 The words are those of the command line, and all combinations of their values are run.
 """
 
 from __future__ import annotations
 
-import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from study import DLPA_PLANS, PETS_PLANS, add, learned_values, make_config, tabulate, trained, value_errors
 from tensordict import TensorDictBase
+from train_rooms import DLPA_PLANS, PETS_PLANS, learned_values, make_config, train_all, trained, value_errors
 
 from hpamdp import keys
+from hpamdp.messages import exit_code
 from hpamdp.run.assemble import AssembledRun
 
 HERE = Path(__file__).resolve().parent
@@ -171,15 +170,5 @@ def evaluate(parts: AssembledRun, best: torch.Tensor) -> tuple[float, float, tor
     return float(earned.mean()) / best[first].mean().item(), float(played["success"].mean()), num_due
 
 
-def main(words: Sequence[str]) -> None:
-    """Train with every combination of the words' values if there are words, and print the table."""
-    names = [word.split("=", 1)[0] for word in words]
-    values = [word.split("=", 1)[1].split(",") for word in words]
-    if words:
-        for chosen in itertools.product(*values):
-            add(train([f"{name}={value}" for name, value in zip(names, chosen, strict=True)]), FILE)
-    tabulate(FILE)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(exit_code(lambda: train_all(sys.argv[1:], train, FILE)))

@@ -1,0 +1,324 @@
+"""Train learners under selectors on Rooms, with options that end inside episodes, and compare them with the optimum.
+
+python experiments/options/train_rooms.py high=meta_critic,actor low=hppo,pdqn seed=0    trains each pair, and adds a row
+                                                                                         each to rooms.csv
+
+The words are those of the command line, and all combinations of their values are run.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import torch
+from hydra import compose, initialize_config_dir
+from tensordict import TensorDictBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from hpamdp import keys
+from hpamdp.config.compose import read
+from hpamdp.config.schema import Config
+from hpamdp.env.rooms import rules
+from hpamdp.env.rooms.environment import RoomsEnv
+from hpamdp.messages import exit_code
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.run.assemble import AssembledRun, assemble
+from hpamdp.run.trainer import Trainer
+
+HERE = Path(__file__).resolve().parent
+CONF = HERE.parent.parent / "conf"
+FILE = HERE / "rooms.csv"
+GAMMA = 0.95
+Settings: TypeAlias = Mapping[str, Sequence[str]]  # words of the command line, by the selector or the learner
+# Settings of every run, before the words of the command line.
+COMMON = [
+    "env=rooms",
+    f"low.gamma={GAMMA}",
+    "agent.termination=steps",
+    "agent.option_length=3",
+    "eval.layouts=200",
+    "eval.every=0",
+    "log_every=0",
+]
+# Selectors make many updates from recent decisions only. The defaults suit one decision per episode.
+SELECTORS = {
+    "meta_critic": [
+        f"high.gamma={GAMMA}",
+        "high.num_members=1",
+        "high.epsilon_final=0.02",
+        "high.epsilon_decisions=10000",
+        "high.buffer_size=10000",
+        "high.batch_size=256",
+        "high.updates_per_decision=0.05",
+        "high.tau=0.05",
+    ],
+    "actor": [f"high.gamma={GAMMA}", "high.minibatch_size=256", "high.entropy=0.02", "high.lr=1e-3"],
+    "option_critic": [
+        f"high.gamma={GAMMA}",
+        "high.epsilon_steps=50000",
+        "high.buffer_size=10000",
+        "high.batch_size=256",
+        "high.tau=0.05",
+        "agent.termination=learned",
+        "agent.option_length=null",
+    ],
+}
+# Options are uniform for half of the steps. Otherwise a learner that is not chosen does not learn, and is never chosen.
+# Replay learners have small networks and fast targets, for a problem of 104 cells.
+REPLAY = [
+    "num_envs=256",
+    "total_frames=200000",
+    "agent.uniform_option_steps=120000",
+    "low.hidden_dims=[64,64]",
+]
+# Plans have one step. The value of the last state covers the rest, and distinguishes lengths of steps more clearly.
+ONE_STEP_PLANS = [
+    "low.end_values=true",
+    "low.end_value_tau=0.05",
+    "low.horizon=1",
+    "low.temperature=0.01",
+    "low.num_iterations=3",
+]
+DLPA_PLANS = [*ONE_STEP_PLANS, "low.num_samples=32", "low.num_elites=8", "low.epsilon=0.2"]
+PETS_PLANS = [*ONE_STEP_PLANS, "low.greedy_samples=12", "low.parameter_noise=0.2"]
+LEARNERS = {
+    # Small batches, for many updates of a policy that must cross the rooms before it finds a reward.
+    "hppo": [
+        "total_frames=160000",
+        "agent.uniform_option_steps=80000",
+        "num_envs=64",
+        "steps_per_batch=16",
+        "low.minibatch_size=256",
+    ],
+    "pdqn": [
+        *REPLAY,
+        "agent.uniform_option_steps=100000",
+        "low.warmup_steps=2000",
+        "low.updates_per_step=0.05",
+        "low.actor_tau=0.05",
+        "low.critic_tau=0.05",
+        "low.epsilon_steps=15000",
+    ],
+    "hyar": [
+        *REPLAY,
+        "low.warmup_steps=5000",
+        "low.updates_per_step=0.1",
+        "low.tau=0.05",
+        "low.epsilon_steps=30000",
+        "low.codec_pretrain_updates=1000",
+    ],
+    # One in 500 random episodes arrives, so there are many random steps at the start.
+    "paddpg": [
+        *REPLAY,
+        "low.warmup_steps=25000",
+        "low.twin=true",
+        "low.updates_per_step=0.1",
+        "low.hidden_dims=[128,128]",
+        "low.tau=0.05",
+        "low.epsilon_final=0.2",
+        "low.epsilon_steps=60000",
+        "low.actor_lr=3e-4",
+    ],
+    # Low temperatures. With the defaults, a step's entropy bonus exceeds its cost, and never arriving is best.
+    "hsac": [
+        *REPLAY,
+        "low.warmup_steps=25000",
+        "low.updates_per_step=0.1",
+        "low.batch_size=128",
+        "low.tau=0.05",
+        "low.discrete_temperature=0.01",
+        "low.parameter_temperature=0.005",
+        "low.discrete_target_entropy=0.5",
+        "low.parameter_target_entropy=-1.0",
+    ],
+    "dlpa": [
+        "num_envs=64",
+        "total_frames=100000",
+        "agent.uniform_option_steps=60000",
+        "low.hidden_dims=[64,64]",
+        "low.warmup_steps=15000",
+        "low.updates_per_step=0.1",
+        *DLPA_PLANS,
+    ],
+    # As for PADDPG, but more random steps, for models that learn from few arrivals.
+    "pets": [
+        "total_frames=140000",
+        "agent.uniform_option_steps=110000",
+        "num_envs=64",
+        "steps_per_batch=4",
+        "low.warmup_steps=40000",
+        "low.updates_per_step=0.15",
+        "low.batch_size=256",
+        "low.weight_decay=0.1",
+        "low.optimism=0",
+        *PETS_PLANS,
+    ],
+    # Features of two entries each: with one-hot vectors, this gives each cell a value. Episodes are options.
+    "qpamdp": [
+        "total_frames=800000",
+        "agent.uniform_option_steps=400000",
+        "num_envs=64",
+        "steps_per_batch=16",
+        "low.features=null",
+        "low.phi_order=1",
+        "low.psi_order=1",
+        "low.warmup_steps=20000",
+        "low.initial_episodes=30000",
+        "low.relearning_episodes=10000",
+        "low.parameter_updates=5",
+        "low.rollouts=5000",
+        "low.temperature_decay=0.9999",
+        "low.initial_mean=0.5",
+        "low.sigma=0.3",
+    ],
+}
+
+
+def make_config(words: Sequence[str], common: Sequence[str], selectors: Settings, learners: Settings) -> Config:
+    """Return the checked config of a run, from settings of all runs, its selector and its learner, and the words."""
+    chosen = dict(word.split("=", 1) for word in words)
+    own = [*selectors.get(chosen.get("high", ""), []), *learners.get(chosen.get("low", ""), [])]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return read(compose("config", [*common, *own, *words], return_hydra_config=True))
+
+
+def trained(config: Config) -> tuple[AssembledRun, int, float]:
+    """Train an agent, and return the parts of its run, its steps and its CPU seconds."""
+    cpu = time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        torch.manual_seed(config.run.seed)
+        parts = assemble(config)
+        trainer = Trainer(config, parts, Path(folder))
+        trainer.train()
+    return parts, trainer.frames, time.process_time() - cpu
+
+
+def value_errors(value: torch.Tensor, best: torch.Tensor, num_due: torch.Tensor) -> dict[str, float]:
+    """Return the errors of values relative to the mean best value, at decisions and in all cells.
+
+    Args:
+        value, best: learned and best values of the cells, `[*C]`.
+        num_due: number of decisions in each cell, `[*C]`.
+    """
+    error = (value - best).abs()
+    return {
+        "value_error": round(((num_due * error).sum() / (num_due * best).sum()).item(), 4),
+        "value_error_everywhere": round((error.sum() / best.sum()).item(), 4),
+    }
+
+
+def train(words: Sequence[str]) -> dict[str, object]:
+    """Train one agent and return its row."""
+    config = make_config(words, COMMON, SELECTORS, LEARNERS)
+    parts, frames, cpu = trained(config)
+    length = config.run.agent.option_length
+    steps = length or 1
+    means, num_due = evaluate(parts)
+    optimum = mean_over_starts(parts, rules.best_values(1.0, steps))
+    return {
+        "high": config.high.name,
+        "low": config.low.name,
+        "sharing": config.run.agent.sharing,
+        "termination": config.run.agent.termination,
+        "option_length": length,
+        "seed": config.run.seed,
+        "steps": frames,
+        "score": round(means["score"], 4),
+        "optimum": round(optimum, 4),
+        "share": round(means["score"] / optimum, 4),
+        "success": round(means["success"], 4),
+        **value_errors(values_of_cells(parts.agent), rules.best_values(GAMMA, steps), num_due),
+        "cpu_s": round(cpu, 1),
+    }
+
+
+def mean_over_starts(parts: AssembledRun, values: torch.Tensor) -> float:
+    """Return the mean of values `[x, y]` over the cells in which the evaluation's episodes begin."""
+    env = parts.evaluation.problem
+    assert isinstance(env, RoomsEnv)
+    env.seed_evaluation(parts.evaluation.seed)
+    env.reset()
+    return values[env.state.x.long(), env.state.y.long()].mean().item()
+
+
+def evaluate(parts: AssembledRun) -> tuple[dict[str, float], torch.Tensor]:
+    """Play the evaluation's episodes, and return their means and the number of decisions in each cell, `[x, y]`."""
+    env = parts.evaluation.problem
+    assert isinstance(env, RoomsEnv)
+    num_due = torch.zeros(rules.SIZE, rules.SIZE, dtype=torch.float64)
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        x, y = env.state.x.long(), env.state.y.long()
+        td = parts.agent.policy(td)
+        is_due = (td[keys.IS_DECISION] & ~td[keys.DONE]).squeeze(-1)
+        num_due.index_put_((x[is_due], y[is_due]), num_due.new_ones(()), accumulate=True)
+        return td
+
+    return parts.evaluation.measure(parts.evaluation.run(policy)), num_due
+
+
+@torch.no_grad()
+def learned_values(agent: HierarchicalAgent, observation: torch.Tensor) -> torch.Tensor:
+    """Return the learners' values of states `[N, observation_dim]`, float64 `[N]`; NaN if they have none.
+
+    In each state the selector chooses greedily, and the value is that of the chosen option's learner.
+    """
+    none = torch.zeros(len(observation), dtype=torch.long)
+    follows = agent.next_options
+    assert follows is not None and agent.selector is not None
+    shown = observation
+    if agent.is_shared:
+        shown = torch.cat([observation, observation.new_zeros(len(observation), agent.specs.num_options)], -1)
+    agent.selector.decides_ends = False
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        option = follows.choose(shown, none, none)
+        try:
+            value = torch.stack([follows.value(shown, option) for _ in range(10)]).mean(0)  # some are noisy
+        except NotImplementedError:
+            value = torch.full(none.shape, torch.nan)
+    return value.double()
+
+
+def values_of_cells(agent: HierarchicalAgent) -> torch.Tensor:
+    """Return the learners' values of all cells, float64 `[x, y]`: 0 at walls and at the goal."""
+    x, y = (part.flatten().int() for part in torch.meshgrid(*2 * [torch.arange(rules.SIZE)], indexing="ij"))
+    none = torch.zeros_like(x)
+    value = learned_values(agent, rules.observe(rules.RoomsState(x, y, none, none, none)))
+    is_nothing = ~rules.is_free(x, y) | ((x == rules.GOAL) & (y == rules.GOAL))
+    return value.masked_fill(is_nothing, 0.0).reshape(rules.SIZE, rules.SIZE)
+
+
+def add(row: Mapping[str, object], file: Path) -> None:
+    """Append a row to a csv file."""
+    is_new = not file.exists()
+    with file.open("a", newline="") as stream:
+        writer = csv.DictWriter(stream, list(row))
+        if is_new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def train_all(words: Sequence[str], train: Callable[[Sequence[str]], Mapping[str, object]], file: Path) -> None:
+    """Train with every combination of the words' values, and add a row each to a csv file.
+
+    Raises:
+        SystemExit: there is no word, or one is not of the form `NAME=VALUE,...`.
+    """
+    wrong = next((word for word in words if "=" not in word), None)
+    if wrong is not None or not words:
+        raise SystemExit(f"give words such as low=hppo,pdqn{'' if wrong is None else f', not {wrong}'}")
+    names, values = zip(*(word.split("=", 1) for word in words), strict=True)
+    for chosen in itertools.product(*(each.split(",") for each in values)):
+        add(train([f"{name}={value}" for name, value in zip(names, chosen, strict=True)]), file)
+    print(f"{file}: rows added; study.py tabulates them")
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: train_all(sys.argv[1:], train, FILE)))
