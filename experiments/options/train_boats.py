@@ -1,6 +1,7 @@
 """Train agents on boats other than people's, and on boats that may be changed inside an episode.
 
-python experiments/options/train_boats.py WORDS    trains with these words of the command line, and adds a row to boats.csv
+python experiments/options/train_boats.py WORDS    trains with these words of the command line, and adds a row to
+                                                   boats.csv
 """
 
 from __future__ import annotations

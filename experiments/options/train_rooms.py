@@ -1,7 +1,7 @@
 """Train learners under selectors on Rooms, with options that end inside episodes, and compare them with the optimum.
 
-python experiments/options/train_rooms.py high=meta_critic,actor low=hppo,pdqn seed=0    trains each pair, and adds a row
-                                                                                         each to rooms.csv
+python experiments/options/train_rooms.py high=meta_critic,actor low=hppo,pdqn seed=0    trains each pair, and adds a
+                                                                                         row each to rooms.csv
 
 The words are those of the command line, and all combinations of their values are run.
 """
