@@ -3,14 +3,16 @@
 import itertools
 import shutil
 import signal
+from pathlib import Path
 
 import pytest
 import torch
 from conftest import compose_config, make_config
+from scripts import load_script
 from tensordict import TensorDict
 from test_grid import SHORT
 from test_resume import stop_and_resume, words_of
-from toy_memory import Cue, CueOfOptions
+from toy_memory import Cue
 from toy_options import Crossing, steppers
 
 import hpamdp
@@ -38,6 +40,7 @@ from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
 from hpamdp.specs import PAMDPSpecs
 
+STUDY = Path(__file__).resolve().parent.parent / "experiments" / "memory" / "study.py"
 SMALL = {"hidden_dims": [16, 16], "memory_size": 8}
 LEARNERS = {"hppo": HPPO, "pdqn": PDQN, "hsac": HSAC}
 # The state of a memory in a step.
@@ -546,18 +549,11 @@ def test_a_stack_solves_what_cannot_be_solved_without_memory(memory):
     assert found >= 0.9 if memory == "stack" else abs(found) < 0.15
 
 
-BUDGETS = {
-    "hppo": {"total_frames": 20_480},
-    "pdqn": {"total_frames": 6000, "low.warmup_steps": 1000, "low.epsilon_steps": 3000},
-    "hsac": {"total_frames": 6000, "low.warmup_steps": 1000},
-}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("memory", ["none", "stack", "gru"])
 @pytest.mark.parametrize("low", LEARNERS)
 def test_learners_with_a_memory_reach_the_optimum_and_without_one_chance(low, memory):
-    found = score(low, memory, **BUDGETS[low])
+    found = load_script(STUDY).train(low, memory, seed=0)["score"]
     assert found >= 0.95 if memory != "none" else abs(found) < 0.15
 
 
@@ -567,9 +563,5 @@ def test_learners_with_a_memory_reach_the_optimum_and_without_one_chance(low, me
     [*itertools.product(["actor", "meta_critic"], ["none", "stack", "gru"]), ("option_critic", "stack")],
 )
 def test_selectors_with_a_memory_reach_the_optimum_and_without_one_chance(high, memory):
-    settings = {"high.memory": memory, "high.gamma": 0.9, "agent.termination": "steps", "agent.option_length": 1}
-    settings |= {"high.epsilon_steps": 5000} if high == "option_critic" else {}
-    sizes = {"total_frames": 12_288, "num_envs": 16, "steps_per_batch": 16, "eval.every": 0, "progress": False}
-    agent = hpamdp.train(CueOfOptions, high=high, low="random", **settings, **sizes)
-    found = agent.evaluate(episodes=500)["score"]
+    found = load_script(STUDY).train(high, memory, seed=0)["score"]
     assert found >= 0.95 if memory != "none" else abs(found) < 0.15

@@ -1,0 +1,109 @@
+"""Train with and without a memory on Cue, a problem that cannot be solved without one, and tabulate.
+
+python experiments/memory/study.py 100 101 102    trains with these seeds, and adds rows to results.csv
+python experiments/memory/study.py                tabulates results.csv
+
+Cue is in `tests/toy_memory.py`: its first observation says what pays in its last step. The best return is 1, and the
+best one without a memory 0 on average. In the selectors' version, options last one step and the last one counts.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import hpamdp
+from hpamdp.analysis.study import Rows, add_to_tables, groups, read_csv, spread, with_enough_seeds
+from hpamdp.messages import exit_code
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent.parent / "tests"))
+from toy_memory import Cue, CueOfOptions  # noqa: E402
+
+EPISODES = 500  # of the evaluation
+RUN = ("learns", "memory", "seed")
+QUIET = {"eval.every": 0, "eval.layouts": 4, "film": False, "progress": False, "threads": 1}
+LEARNERS: dict[str, dict[str, Any]] = {
+    "hppo": {"total_frames": 20_480},
+    "pdqn": {"total_frames": 6000, "low.warmup_steps": 1000, "low.epsilon_steps": 3000},
+    "hsac": {"total_frames": 6000, "low.warmup_steps": 1000},
+}
+SELECTORS: dict[str, dict[str, Any]] = {
+    "actor": {},
+    "meta_critic": {},
+    "option_critic": {"high.epsilon_steps": 5000},
+}
+OF_SELECTORS = {
+    "low": "random",
+    "high.gamma": 0.9,
+    "agent.termination": "steps",
+    "agent.option_length": 1,
+    "total_frames": 12_288,
+    "num_envs": 16,
+    "steps_per_batch": 16,
+}
+MEMORIES = ("none", "stack", "gru")
+REFUSED = ("option_critic", "gru")
+
+
+def train(name: str, memory: str, seed: int) -> dict[str, Any]:
+    """Train a learner or a selector with a memory and return its row."""
+    if name in LEARNERS:
+        problem, settings = Cue, {"low": name, "low.memory": memory, **LEARNERS[name]}
+    else:
+        problem, settings = CueOfOptions, {"high": name, "high.memory": memory, **OF_SELECTORS, **SELECTORS[name]}
+    cpu = time.process_time()
+    agent = hpamdp.train(problem, seed=seed, **{"eval.seed": seed}, **QUIET, **settings)
+    cpu = time.process_time() - cpu
+    return {
+        "learns": name,
+        "memory": memory,
+        "seed": seed,
+        "frames": settings["total_frames"],
+        "score": round(agent.evaluate(episodes=EPISODES)["score"], 4),
+        "cpu_s": round(cpu, 1),
+    }
+
+
+def table(rows: Rows) -> str:
+    """Return a line for each learner and selector: the mean greedy return with each memory."""
+    lines = [
+        "| | " + " | ".join(f"`{memory}`" for memory in MEMORIES) + " | seeds | steps | CPU with `none`, `gru` |",
+        "|---" * (len(MEMORIES) + 4) + "|",
+    ]
+    for (name,), of_name in groups(with_enough_seeds(rows, *RUN[:-1]), "learns").items():
+        cells = groups(of_name, "memory")
+        scores = [spread([row["score"] for row in cells[memory,]]) if (memory,) in cells else "" for memory in MEMORIES]
+        seconds = [
+            np.mean([row["cpu_s"] for row in cells[memory,]]) for memory in ("none", "gru") if (memory,) in cells
+        ]
+        columns = [
+            f"`{'low' if name in LEARNERS else 'high'}={name}`",
+            *scores,
+            len(cells["none",]),
+            f"{of_name[0]['frames']:,}",
+            ", ".join(f"{mean:.0f} s" for mean in seconds),
+        ]
+        lines.append(f"| {' | '.join(map(str, columns))} |")
+    return "\n".join(lines)
+
+
+def main(words: Sequence[str]) -> None:
+    """Train with each seed, if any are given, and tabulate."""
+    if any(not word.isdecimal() for word in words):
+        raise SystemExit(f"give seeds, such as 100 101 102, not {' '.join(words)}")
+    for seed in map(int, words):
+        for name in (*LEARNERS, *SELECTORS):
+            for memory in MEMORIES:
+                if (name, memory) != REFUSED:
+                    add_to_tables(HERE, {"results": [train(name, memory, seed)]}, RUN)
+    print(table(read_csv(HERE / "results.csv")))
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))
