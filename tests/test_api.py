@@ -798,6 +798,14 @@ def test_a_setting_of_the_problem_has_the_same_names_for_all_functions(name, pla
     assert platform_agent.evaluate("platform", episodes=3, **settings)["steps"] <= 2.0
 
 
+def test_make_warns_of_settings_that_count_only_with_another_one(capsys):
+    hpamdp.make("lunar_lander", wind_power=3.0)
+    warning = "env.wind_power=3.0: has no effect; wind_power counts only if enable_wind is set\n"
+    assert capsys.readouterr().err == warning
+    hpamdp.make("lunar_lander", wind_power=3.0, enable_wind=True)
+    assert capsys.readouterr().err == ""
+
+
 def test_make_groups_actions_as_train_does():
     assert hpamdp.make("platform", grouping="default").option_names == ("run", "jump")
 

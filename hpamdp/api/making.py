@@ -19,9 +19,9 @@ from hpamdp.config.outside_jobs import composed, word
 from hpamdp.config.schema import Device, usable_device
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
-from hpamdp.messages import first_line
+from hpamdp.messages import first_line, warn
 from hpamdp.run.assemble import grouped
-from hpamdp.run.compatibility import lack_of
+from hpamdp.run.compatibility import lack_of, settings_without_effect
 from hpamdp.settings import Settings
 
 
@@ -61,6 +61,8 @@ def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **
     own = [word(f"env.{each}", value) for each, value in without_env_prefix(settings).items()]
     with composed(arguments.with_words([*own, word("device", str(device))])) as cfg:
         config = read(cfg).with_objects(arguments.objects)
+    for line in settings_without_effect(config, own):
+        warn(line)
     needs = {each: True for each in ("oracle", "human") if getattr(sizes, each)}
     for need in needs:
         lack = lack_of(need, config)
