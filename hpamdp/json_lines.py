@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import codecs
+import json
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pydantic_core import from_json  # refuses deep nesting, at which `json` meets Python's recursion limit
+
+from hpamdp.messages import one_line
 
 MAX_LINE_BYTES = 1 << 20
 _NUM_SHOWN = 3
@@ -26,10 +30,34 @@ def read_json(line: bytes) -> Any:
         raise LineError(f"longer than {MAX_LINE_BYTES} bytes")
     if line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise LineError("UTF-16, but must be UTF-8")
+    plain = line.removeprefix(codecs.BOM_UTF8)
     try:
-        return from_json(line.removeprefix(codecs.BOM_UTF8), allow_inf_nan=False)
+        value = from_json(plain, allow_inf_nan=False)
     except ValueError as error:
         raise LineError("no JSON") from error
+    twice = key_given_twice(plain)
+    if twice is not None:
+        raise LineError(f"{one_line(twice)[:40]} is given twice")
+    return value
+
+
+def key_given_twice(data: bytes) -> str | None:
+    """Return a key that an object in a valid JSON text has twice, of which readers take the last one; None if none has.
+
+    Args:
+        data: a text that `from_json` has read, so that it is not nested deeply.
+    """
+    found: list[str] = []
+
+    def check(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        names = dict(pairs)
+        if len(names) < len(pairs):
+            counted = Counter(name for name, _ in pairs)
+            found.append(next(name for name, number in counted.items() if number > 1))
+        return names
+
+    json.loads(data, object_pairs_hook=check)
+    return found[0] if found else None
 
 
 def lines_of(data: bytes) -> Iterator[tuple[int, bytes]]:

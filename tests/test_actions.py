@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from hpamdp.env.action_arrays import single_action
 from hpamdp.env.actions import check_action_values
+from hpamdp.env.gymnasium_checks import single_action
 
 DIMS = (2, 0, 1)
 

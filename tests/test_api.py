@@ -660,7 +660,36 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make_gymnasium("platform", 2, **{"env.num_envs": 3}), "give it as the argument num_envs"),
         (lambda: hpamdp.make_gymnasium("platform", **{"env.id": "CartPole-v1"}), "give it as the argument name"),
         (lambda: hpamdp.make_gymnasium("platfom"), "did you mean hpamdp/Platform-v0?"),
-        (lambda: hpamdp.make_gymnasium("platform", seed=-1), "seed=-1: must be greater than or equal to 0"),
+        (lambda: hpamdp.make_gymnasium("platform", seed=3), "seed=3: no setting of the environment; give it to reset"),
+        (lambda: hpamdp.make_gymnasium("platform", 2, seed=3), "seed=3: no setting of the environment; give it to"),
+        (lambda: hpamdp.make_gymnasium("platform", problem="x:Y"), "problem: no setting of the problem; give it as"),
+        (
+            lambda: hpamdp.make("hpamdp/Platform-v1"),
+            r"no such problem .*; did you mean hpamdp/Platform-v0",
+        ),
+        (
+            lambda: hpamdp.make_gymnasium("BoatDockUnseen", render_mode="rgb_array"),
+            "has no pictures",
+        ),
+        (lambda: hpamdp.make_gymnasium("lunar_lander", enable_wind="no"), "enable_wind=no, but must be True or False"),
+        (
+            lambda: hpamdp.make_gymnasium("lunar_lander", wind_power=-1.0),
+            "wind_power=-1.0, ",
+        ),
+        (lambda: hpamdp.make_gymnasium("lunar_lander", gravity="a"), "gravity=a, but must be a finite number"),
+        (
+            lambda: hpamdp.make_gymnasium("lunar_lander", render_mode="x"),
+            "render_mode='x', but must be None",
+        ),
+        (
+            lambda: hpamdp.make_gymnasium("lunar_lander").reset(options={"x": 1}),
+            "unknown options .'x'.",
+        ),
+        (
+            lambda: hpamdp.make_gymnasium("platform").reset(options={None: 1, "a": 2}),
+            r"unknown options \[None, 'a'\]",
+        ),
+        (lambda: hpamdp.make_gymnasium("no_such_module:Env"), "No module named 'no_such_module'"),
         (lambda: hpamdp.make_gymnasium("platform", render_mode="ansi"), "must be None or rgb_array"),
         (lambda: hpamdp.make_gymnasium("platform", device="gpu"), 'device="gpu": must be auto, cpu, cuda or cuda:N'),
         (lambda: hpamdp.make_gymnasium("boatdock", 2, device="cuda:9"), "device=cuda:9: this machine has "),
@@ -804,6 +833,11 @@ def test_make_warns_of_settings_that_count_only_with_another_one(capsys):
     assert capsys.readouterr().err == warning
     hpamdp.make("lunar_lander", wind_power=3.0, enable_wind=True)
     assert capsys.readouterr().err == ""
+
+
+def test_numpys_whole_numbers_are_whole_numbers():
+    assert hpamdp.make("platform", np.int64(2), seed=np.int64(3)).num_envs == 2
+    assert hpamdp.make_gymnasium("platform", np.int64(2)).num_envs == 2
 
 
 def test_make_groups_actions_as_train_does():

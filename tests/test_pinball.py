@@ -207,6 +207,8 @@ def test_a_file_that_is_no_map_is_refused_in_one_line_that_says_where(change, me
         ("[" * 100_000, "is no JSON: recursion limit"),
         ('{"ball": NaN}', "is no JSON: expected value"),
         ('{"ball": 0.01, "ball": 0.2}', "ball: is given twice"),
+        ('{"a\\nb": 1, "a\\nb": 2}', "a b: is given twice"),
+        ('{"x": {"y": 1, "y": 2}}', "y: is given twice"),
         ("[]", "the map: must be an object"),
         ("7" * 2**21, "has 2097152 bytes, but may have at most 1048576"),
     ],

@@ -4,6 +4,7 @@ import json
 import math
 import os
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
@@ -18,15 +19,14 @@ from hpamdp.analysis.study import (
     add_to_tables,
     curve,
     difference,
-    evaluated,
     finished,
+    gathered,
     groups,
     interquartile_mean,
     mean_interval,
     middle_half,
     planned_seeds,
     read_csv,
-    readable,
     spread,
     standing_rows,
     with_enough_seeds,
@@ -344,18 +344,56 @@ def test_a_csv_file_that_was_cut_is_refused_in_one_line(tmp_path, cut):
         read_csv(tmp_path / "cut.csv")
 
 
-def test_a_run_without_evaluations_is_left_out_of_tables_with_curves(tmp_path, capsys):
-    assert evaluated([Run(tmp_path, {}, {})]) == []
-    assert capsys.readouterr().err == f"{tmp_path}: metrics.csv is missing or has no evaluations, left out\n"
+def test_a_run_of_another_study_and_a_damaged_one_are_named_and_left_out(tmp_path, capsys):
+    leave_run(tmp_path / "kept")
+    for name in ("other", "no_metrics", "no_number", "seed", "config", "no_config"):
+        leave_run(tmp_path / name)
+    change_summary(tmp_path / "other", env="platform")
+    (tmp_path / "no_metrics" / "metrics.csv").unlink()
+    change_summary(tmp_path / "no_number", success=None)
+    change_summary(tmp_path / "seed", seed="a")
+    (tmp_path / "config" / "config.yaml").write_text("low: {twin: true}\nenv: 4\n")
+    (tmp_path / "no_config" / "config.yaml").write_text("low: {twin: true}\n")
+    results, _ = gathered([tmp_path], study("learners").gather, env=("boatdock",))
+    assert [row["seed"] for row in results] == [0]
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.removeprefix(f"{tmp_path}/") for line in lines] == [
+        "config: is damaged: AttributeError: 'int' object has no attribute 'get'; left out",
+        "no_config: has no env, as runs of this study have; left out",
+        "no_metrics: metrics.csv is missing or has no evaluations; left out",
+        "no_number: is damaged: TypeError: type NoneType doesn't define __round__ method; left out",
+        "other: env=platform, but runs of this study have boatdock; left out",
+        "seed: seed=a: must be a whole number; left out",
+    ]
 
 
-def test_a_run_of_another_study_is_named_and_left_out(tmp_path, capsys):
-    leave_run(tmp_path / "a")
-    (run,) = finished([tmp_path])
-    for name, lacks in (("problems", "choices"), ("generalisation", "trips"), ("hierarchy", "total_frames")):
-        assert readable([run], study(name).gather) == []
-        assert capsys.readouterr().err == f"{run.folder}: has no {lacks}, as runs of this study have; left out\n"
-    assert readable([run], study("learners").gather) == [run]
+GATHERING = [
+    file.parent.name
+    for file in sorted(EXPERIMENTS.glob("*/study.py"))
+    if "gathered(" in file.read_text(encoding="utf-8")
+]
+
+
+def test_twelve_studies_gather_runs():
+    assert len(GATHERING) >= 12
+
+
+@pytest.mark.parametrize("name", GATHERING)
+def test_a_study_that_is_given_a_run_of_no_study_writes_nothing(name, tmp_path, monkeypatch):
+    module, copy = study(name), tmp_path / "study"
+    shutil.copytree(EXPERIMENTS / name, copy)
+    monkeypatch.setattr(module, "HERE", copy)
+    before = {file: file.read_bytes() for file in copy.glob("*.csv")}
+    leave_run(tmp_path / "runs" / "foreign")
+    change_summary(tmp_path / "runs" / "foreign", env="nowhere")
+    with pytest.raises(SystemExit, match=r"no finished runs of this study; nothing was written"):
+        module.main([str(tmp_path / "runs")])
+    assert {file: file.read_bytes() for file in copy.glob("*.csv")} == before
+
+
+def change_summary(folder, **values):
+    file = folder / "summary.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | values))
 
 
 def test_a_folder_with_one_curve_leaves_pearls_other_curves_as_they_are(tmp_path):
@@ -369,7 +407,19 @@ def test_a_folder_with_one_curve_leaves_pearls_other_curves_as_they_are(tmp_path
     assert [row for row in rows if not is_same(row)] == [row for row in stored if not is_same(row)]
 
 
-@pytest.mark.parametrize("text", ["x,y\r\n1,2\r\n", "problem,library,version,learner,seed\r\nfoo,a,b,c,1\r\n"])
+CURVE = "problem,library,version,learner,seed,episodes,steps,cpu_s,score,success\r\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x,y\r\n1,2\r\n",
+        "problem,library,version,learner,seed\r\npinball,a,b,c,1\r\n",
+        f"{CURVE}foo,a,b,c,1,1,1,1,1,1\r\n",
+        f"{CURVE}pinball,a,b,c,a,1,1,1,1,1\r\n",
+        f"{CURVE}pinball,a,b,c,1,1,1,1,nan,1\r\n",
+    ],
+)
 def test_pearls_study_refuses_a_file_that_is_no_curve_of_it(tmp_path, text):
     (tmp_path / "other.csv").write_text(text)
     with pytest.raises(SystemExit, match=r"other\.csv: is no curve of this study; nothing was written"):

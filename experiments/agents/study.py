@@ -43,7 +43,8 @@ def row(folder: Path) -> list[str]:
 
 def main(words: Sequence[str]) -> None:
     """Print the table."""
-    assert not words
+    if words:
+        raise SystemExit(f"takes no words, but was given {' '.join(words)}")
     folders = sorted((file.parent for file in AGENTS.glob("*/summary.json")), key=_order)
     for cells in (HEAD, ["---"] * len(HEAD), *map(row, folders)):
         print(f"| {' | '.join(cells)} |")

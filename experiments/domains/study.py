@@ -25,12 +25,11 @@ from hpamdp.analysis.study import (
     Run,
     curve,
     difference,
-    finished,
+    gathered,
     groups,
     interquartile_mean,
     mean_interval,
     read_csv,
-    readable,
     spread,
     standing_rows,
     with_enough_seeds,
@@ -55,6 +54,8 @@ DOMAINS = {
     "moving": (10_000_000, "score"),
     "sliding": (10_000_000, "score"),
 }
+# Hard Move is one environment with four numbers of actuators.
+ENVIRONMENTS = [*dict.fromkeys("hard_move" if name.startswith("hard_move") else name for name in DOMAINS)]
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
 MIN_SEEDS_MIDDLE = 5  # least seeds for an interquartile mean beside the mean
 FIRST_STEPS = 700  # start of the curves' axes, before any evaluation
@@ -303,7 +304,7 @@ def _draw_domain(axes: Axes, name: str, curves: Rows, published: Rows) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        results, curves = gather(readable(finished(folders), gather))
+        results, curves = gathered(folders, gather, env=ENVIRONMENTS)
         tables = {"results": results, "curves": curves}
         stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in tables}
         write_tables(HERE, {name: merged(stored[name], rows) for name, rows in tables.items()})

@@ -16,11 +16,10 @@ from hpamdp.analysis.study import (
     Rows,
     Run,
     add_to_tables,
-    finished,
     first_at,
+    gathered,
     groups,
     read_csv,
-    readable,
     spread,
     with_enough_seeds,
 )
@@ -28,6 +27,8 @@ from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 RUN = ("problem", "learner", "exploration", "seed")
+PROBLEMS = ("crossing", "office", "pinball", "platform")
+LEARNERS = ("hppo", "pdqn")
 # A selector over options that last four steps is a kind of exploration, too; on Crossing every row has one.
 OPTIONS = "options"
 KINDS = ("none", "held", "counts", "novelty", OPTIONS)
@@ -89,7 +90,7 @@ def cell(rows: Rows) -> str:
 def main(folders: Sequence[str]) -> None:
     """Add the runs in the folders, if any are given, and tabulate."""
     if folders:
-        add_to_tables(HERE, {"results": gather(readable(finished(folders), gather))}, RUN)
+        add_to_tables(HERE, {"results": gathered(folders, gather, env=PROBLEMS, low=LEARNERS)}, RUN)
     print(table(read_csv(HERE / "results.csv")))
 
 

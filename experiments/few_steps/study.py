@@ -15,7 +15,17 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from hpamdp.analysis.study import Rows, Run, finished, first_at, groups, read_csv, readable, spread, write_tables
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    first_at,
+    gathered,
+    groups,
+    read_csv,
+    spread,
+    with_repeats_replaced,
+    write_tables,
+)
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
 from hpamdp.messages import exit_code
@@ -46,6 +56,12 @@ VARIANTS = {
     "horizon=3": "plans of three presses",
 }
 ABLATION_SEEDS = (0, 1, 2)
+# Columns that name a run, in each table.
+RUN = {
+    "curves": ("augment", "seed", "boat", "reward", "variant"),
+    "long": ("augment", "seed", "boat"),
+    "augment": ("learner", "augment", "seed"),
+}
 COLUMNS = {"frames": "presses", "eval/score": "score", "eval/success": "success", "wall_s": "wall_s"}
 
 
@@ -195,8 +211,9 @@ def draw(curves: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        tables = gather(readable(finished(folders), gather))
-        write_tables(HERE, {name: rows for name, rows in tables.items() if rows} or tables)
+        new = gathered(folders, gather, env=("boatdock",))
+        stored = {name: read_csv(HERE / f"{name}.csv") for name in new}
+        write_tables(HERE, {name: with_repeats_replaced(stored[name], rows, RUN[name]) for name, rows in new.items()})
     curves = read_csv(HERE / "curves.csv")
     plain = [row for row in curves if not row["variant"]]
     draw(plain, HERE / "curves.png")

@@ -20,11 +20,10 @@ from hpamdp.analysis.study import (
     Rows,
     Run,
     add_to_tables,
-    finished,
+    gathered,
     groups,
     mean_interval,
     read_csv,
-    readable,
     spread,
     with_enough_seeds,
 )
@@ -274,7 +273,7 @@ def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        add_to_tables(HERE, {"results": gather(readable(finished(folders), gather))}, RUN)
+        add_to_tables(HERE, {"results": gathered(folders, gather, env=("boatdock_unseen",))}, RUN)
     names = ("results", "players", "from_nothing", "transfer", "people")
     stored = [HERE / f"{name}.csv" for name in names]
     results, players, untrained, transfer, people = (read_csv(file) if file.exists() else [] for file in stored)

@@ -26,9 +26,8 @@ from hpamdp.analysis.study import (
     add_to_tables,
     curve,
     difference,
-    finished,
+    gathered,
     groups,
-    readable,
     spread,
     standing_rows,
     with_enough_seeds,
@@ -215,8 +214,8 @@ def _label(axes: Axes, title: str, x: str, y: str) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        gathered = gather(readable(finished(folders), gather))
-        add_to_tables(HERE, dict(zip(TABLES, gathered, strict=True)), (*CELL, "seed"))
+        new = dict(zip(TABLES, gathered(folders, gather, env=("boatdock",)), strict=True))
+        add_to_tables(HERE, new, (*CELL, "seed"))
     stored = (standing_rows(HERE / f"{name}.csv") for name in TABLES)
     results, curves, choices = (with_enough_seeds(rows, *CELL) for rows in stored)
     curves, choices = of_the_map(curves), of_the_map(choices)

@@ -25,11 +25,9 @@ from hpamdp.analysis.study import (
     add_to_tables,
     curve,
     difference,
-    evaluated,
-    finished,
+    gathered,
     groups,
     read_csv,
-    readable,
     spread,
 )
 from hpamdp.figure_style import STYLE, draw_spread
@@ -164,7 +162,11 @@ def main(arguments: list[str]) -> None:
         print(play_heuristic())
         return
     if arguments:
-        add_to_tables(HERE, gather(readable(evaluated(finished(arguments)), gather)), RUN)
+        add_to_tables(
+            HERE,
+            gathered(arguments, gather, env=("gymnasium", "lunar_lander"), low=("hppo",)),
+            RUN,
+        )
     results, curves = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))
     print(table(results))
     print()

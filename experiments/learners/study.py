@@ -20,16 +20,15 @@ from matplotlib.ticker import EngFormatter
 from hpamdp.analysis.study import (
     Rows,
     Run,
+    add_to_tables,
     curve,
     difference,
-    finished,
     first_at,
+    gathered,
     groups,
     read_csv,
-    readable,
     spread,
     with_enough_seeds,
-    write_tables,
 )
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.figure_style import LEARNER_COLOURS
@@ -179,8 +178,9 @@ def _draw_references(axes: Axes, results: Rows, boat: str) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        results, curves = gather(readable(finished(folders), gather))
-        write_tables(HERE, {"results": results, "curves": curves})
+        results, curves = gathered(folders, gather, env=("boatdock", "platform"), high=("none",))
+        names = ("low", "problem", "reward", "seed")
+        add_to_tables(HERE, {"results": results, "curves": curves}, names, steps="presses", sorts=False)
     stored = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))
     results, curves = (with_enough_seeds(rows, "low", "problem", "reward") for rows in stored)
     draw(curves, results, "shaped", "frames", HERE / "curves.png")

@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hpamdp.analysis.study import Rows, Run, finished, mean_interval, read_csv, readable, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, add_to_tables, gathered, mean_interval, read_csv, spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
+RUN = ("env", "termination", "high", "low", "seed")
 sys.path.insert(0, str(HERE.parent.parent / "examples" / "crossing"))
 from crossing import Crossing, best_values, cell_of  # noqa: E402
 
@@ -102,7 +103,7 @@ def tabulate(rows: Rows) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather the runs in the folders, if any are given, and tabulate."""
     if folders:
-        write_tables(HERE, {"results": gather(readable(finished(folders), gather))})
+        add_to_tables(HERE, {"results": gathered(folders, gather, env=("crossing", "rooms"))}, RUN)
     tabulate(read_csv(HERE / "results.csv"))
 
 

@@ -79,13 +79,14 @@ def table(rows: Rows) -> str:
     for (name,), of_name in groups(with_enough_seeds(rows, *RUN[:-1]), "learns").items():
         cells = groups(of_name, "memory")
         scores = [spread([row["score"] for row in cells[memory,]]) if (memory,) in cells else "" for memory in MEMORIES]
+        seeds = {row["seed"] for row in of_name}
         seconds = [
             np.mean([row["cpu_s"] for row in cells[memory,]]) for memory in ("none", "gru") if (memory,) in cells
         ]
         columns = [
             f"`{'low' if name in LEARNERS else 'high'}={name}`",
             *scores,
-            len(cells["none",]),
+            len(seeds),
             f"{of_name[0]['frames']:,}",
             ", ".join(f"{mean:.0f} s" for mean in seconds),
         ]

@@ -18,15 +18,14 @@ from matplotlib.ticker import EngFormatter
 from hpamdp.analysis.study import (
     Rows,
     Run,
+    add_to_tables,
     curve,
     difference,
-    finished,
     first_at,
+    gathered,
     groups,
     read_csv,
-    readable,
     spread,
-    write_tables,
 )
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.figure_style import draw_spread
@@ -165,8 +164,9 @@ def _draw_curve(axes: Axes, rows: Rows, label: str, colour: str, style: str) -> 
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        results, curves = gather(readable(finished(folders), gather))
-        write_tables(HERE, {"results": results, "curves": curves})
+        results, curves = gathered(folders, gather, env=("boatdock",), low=COLOURS, high=("human",))
+        names = ("low", "start", "data", "episodes", "seed")
+        add_to_tables(HERE, {"results": results, "curves": curves}, names, sorts=False)
     draw(read_csv(HERE / "curves.csv"), HERE / "curves.png")
     print(table(read_csv(HERE / "results.csv")))
 

@@ -22,11 +22,10 @@ from hpamdp.analysis.study import (
     Rows,
     Run,
     add_to_tables,
-    finished,
+    gathered,
     groups,
     mean_interval,
     read_csv,
-    readable,
     spread,
     standing_rows,
 )
@@ -53,7 +52,6 @@ def gather(runs: Sequence[Run]) -> Rows:
             "cpu_s": round(run.summary["cpu_s"], 1),
         }
         for run in runs
-        if run.summary["env"] in ("goal", "hard_goal")
     ]
 
 
@@ -182,7 +180,8 @@ def _line(cells: Sequence[object]) -> str:
 def main(folders: Sequence[str]) -> None:
     """Add the runs on Goal, if folders are given, and tabulate."""
     if folders:
-        add_to_tables(HERE, {"goal": gather(readable(finished(folders), gather))}, ("domain", *PAIR, "seed"))
+        new = gathered(folders, gather, env=("goal", "hard_goal"))
+        add_to_tables(HERE, {"goal": new}, ("domain", *PAIR, "seed"))
     of_boats = (boats_table(is_changed) for is_changed in (False, True))
     print(*of_boats, goal_table(), *(pairs_table(name) for name in ("crossing", "rooms")), sep="\n\n")
 

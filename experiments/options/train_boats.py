@@ -36,7 +36,9 @@ def train(words: Sequence[str]) -> dict[str, Any]:
     """Train one agent and return its row."""
     with tempfile.TemporaryDirectory() as folder:
         run = [sys.executable, "-m", "hpamdp.cli", *COMMON, *words, f"hydra.run.dir={folder}", "overwrite=true"]
-        subprocess.run(run, check=True)
+        code = subprocess.run(run).returncode
+        if code:
+            raise SystemExit(code)  # the run has said why
         return row_of(json.loads((Path(folder) / "summary.json").read_text()), words)
 
 

@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import TypeAlias
 
 import torch
-from hydra import compose, initialize_config_dir
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.config.compose import read
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.outside_jobs import composed
 from hpamdp.config.schema import Config
 from hpamdp.env.rooms import rules
 from hpamdp.env.rooms.environment import RoomsEnv
@@ -33,7 +34,6 @@ from hpamdp.run.assemble import AssembledRun, assemble
 from hpamdp.run.trainer import Trainer
 
 HERE = Path(__file__).resolve().parent
-CONF = HERE.parent.parent / "conf"
 FILE = HERE / "rooms.csv"
 GAMMA = 0.95
 Settings: TypeAlias = Mapping[str, Sequence[str]]  # words of the command line, by the selector or the learner
@@ -185,8 +185,8 @@ def make_config(words: Sequence[str], common: Sequence[str], selectors: Settings
     """Return the checked config of a run, from settings of all runs, its selector and its learner, and the words."""
     chosen = dict(word.split("=", 1) for word in words)
     own = [*selectors.get(chosen.get("high", ""), []), *learners.get(chosen.get("low", ""), [])]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return read(compose("config", [*common, *own, *words], return_hydra_config=True))
+    with composed([*common, *own, *words]) as cfg:
+        return read(cfg)
 
 
 def trained(config: Config) -> tuple[AssembledRun, int, float]:
@@ -309,14 +309,18 @@ def train_all(words: Sequence[str], train: Callable[[Sequence[str]], Mapping[str
     """Train with every combination of the words' values, and add a row each to a csv file.
 
     Raises:
-        SystemExit: there is no word, or one is not of the form `NAME=VALUE,...`.
+        SystemExit: there is no word, or one is wrong.
     """
     wrong = next((word for word in words if "=" not in word), None)
     if wrong is not None or not words:
         raise SystemExit(f"give words such as low=hppo,pdqn{'' if wrong is None else f', not {wrong}'}")
     names, values = zip(*(word.split("=", 1) for word in words), strict=True)
     for chosen in itertools.product(*(each.split(",") for each in values)):
-        add(train([f"{name}={value}" for name, value in zip(names, chosen, strict=True)]), file)
+        try:
+            row = train([f"{name}={value}" for name, value in zip(names, chosen, strict=True)])
+        except ConfigError as error:
+            raise SystemExit(str(error)) from error
+        add(row, file)
     print(f"{file}: rows added; study.py tabulates them")
 
 

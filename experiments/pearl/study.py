@@ -7,6 +7,7 @@ python experiments/pearl/study.py           draws and tabulates the stored curve
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,6 +34,7 @@ PROBLEMS = {"pinball": "Pinball, simple map", "office": "Office"}
 AXES = {"episodes": "episodes of training", "cpu_s": "CPU seconds of training"}
 REACHED = 0.95  # success of a greedy evaluation
 LEARNER = ("problem", "library", "version", "learner")
+NUMBERS = ("seed", "episodes", "steps", "cpu_s", "score", "success")
 
 
 def gather(folder: Path) -> Rows:
@@ -43,13 +45,27 @@ def gather(folder: Path) -> Rows:
     """
     rows: Rows = []
     for file in sorted(folder.glob("*.csv")):
-        of_file = read_csv(file)
-        if any(not {*LEARNER, "seed"} <= row.keys() or row["problem"] not in PROBLEMS for row in of_file):
+        if not is_curve(file):
             raise SystemExit(f"{file}: is no curve of this study; nothing was written")
+        of_file = read_csv(file)
         rows += of_file
     if not rows:
         raise SystemExit(f"{folder}: has no curves; nothing was written")
     return rows
+
+
+def is_curve(file: Path) -> bool:
+    """Return whether a file has the columns of a curve, with numbers where curves have them."""
+    try:
+        rows = read_csv(file)
+    except (OSError, UnicodeDecodeError):
+        return False
+    return all(
+        {*LEARNER, *NUMBERS} == row.keys()
+        and row["problem"] in PROBLEMS
+        and all(isinstance(row[name], int | float) and math.isfinite(row[name]) for name in NUMBERS)
+        for row in rows
+    )
 
 
 def merged(stored: Rows, new: Rows) -> Rows:

@@ -34,7 +34,12 @@ def gather(folder: Path) -> dict[str, Rows]:
     """Return the rows of `curves` and of `speed`, in the order of problems, libraries and seeds."""
 
     def rows_of(files: Sequence[Path]) -> Rows:
-        rows = [row for file in files for row in read_csv(file)]
+        rows = []
+        for file in files:
+            of_file = read_csv(file)
+            if any(row.get("problem") not in PROBLEMS for row in of_file):
+                raise SystemExit(f"{file}: is no file of this study; nothing was written")
+            rows += of_file
         order = list(PROBLEMS)
         return sorted(rows, key=lambda row: (order.index(row["problem"]), row["library"], row["learner"], row["seed"]))
 

@@ -22,13 +22,11 @@ from hpamdp.analysis.study import (
     Run,
     add_to_tables,
     curve,
-    evaluated,
-    finished,
     first_at,
+    gathered,
     groups,
     mean_interval,
     read_csv,
-    readable,
     spread,
     with_enough_seeds,
 )
@@ -38,6 +36,7 @@ from hpamdp.figure_style import LEARNER_COLOURS, STYLE, draw_spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
+ENVIRONMENTS = ("circuit", "office", "pinball", "primitives", "traffic")
 CELL = ("problem", "learner", "exploration", "frames")
 RUN = ("problem", "learner", "exploration", "seed")
 # Results of traffic lights that traffic.csv has of the agent and of the players by hand, on the same demands.
@@ -272,7 +271,7 @@ def draw(curves: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Add the runs in the folders, if any are given, then draw and tabulate."""
     if folders:
-        add_to_tables(HERE, gather(readable(evaluated(finished(folders)), gather)), RUN)
+        add_to_tables(HERE, gathered(folders, gather, env=ENVIRONMENTS), RUN)
     curves = read_csv(HERE / "curves.csv")
     draw(curves, HERE / "primitives.png")
     print(table(read_csv(HERE / "results.csv"), curves))

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, readable, write_tables
+from hpamdp.analysis.study import Rows, Run, add_to_tables, curve, gathered, groups, read_csv
 from hpamdp.figure_style import LEARNER_COLOURS
 from hpamdp.messages import exit_code
 
@@ -33,8 +33,6 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
     curves: Rows = []
     for run in runs:
         summary = run.summary
-        if summary["env"] != "boatdock_released":
-            continue
         name = {"low": summary["low"], "boat": run.config["env"]["controller"], "seed": summary["seed"]}
         learned.append(
             {
@@ -113,7 +111,12 @@ def _draw_learners(axes: Axes, rows: Rows, column: str) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        write_tables(HERE, gather(readable(finished(folders)), gather))
+        add_to_tables(
+            HERE,
+            gathered(folders, gather, env=("boatdock_released",)),
+            ("low", "boat", "seed"),
+            sorts=False,
+        )
     draw(read_csv(HERE / "curves.csv"), HERE / "figure2.png")
     print(table(read_csv(HERE / "learned.csv")))
 

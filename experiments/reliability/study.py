@@ -18,6 +18,8 @@ OUTCOMES = ("traceback", "silent", "harm")
 
 def main(words: Sequence[str]) -> None:
     """Print a line for each kind of input."""
+    if words:
+        raise SystemExit(f"takes no words, but was given {' '.join(words)}")
     print("| kind | cases | before: traceback | wrong in silence | harm | after: traceback | wrong in silence | harm |")
     print("|---|---|---|---|---|---|---|---|")
     for row in read_csv(HERE / "hostile.csv"):

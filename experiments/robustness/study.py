@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from hpamdp.analysis.study import Rows, Run, difference, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, difference, gathered, groups, read_csv, spread, write_tables
 from hpamdp.config.compose import conf_dir
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.messages import exit_code
@@ -76,7 +76,7 @@ def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, fl
             noisy = {**options, **dict.fromkeys(LEVELS, 0.0), noise: level}
             key = str(noisy)
             if key not in evaluations:
-                evaluations[key] = make_evaluation(replace(config, env=replace(config.env, options=noisy)), env)
+                evaluations[key] = make_evaluation(replace(config, env=replace(config.env, settings=noisy)), env)
             evaluation = evaluations[key]
             measured = evaluation.measure(evaluation.run(agent.policy))
             figures = {figure: round(measured[figure], 4) for figure in FIGURES}
@@ -193,7 +193,7 @@ def main(folders: Sequence[str]) -> None:
     """Score, draw, tabulate."""
     if folders:
         torch.set_num_threads(1)
-        add(finished(folders))
+        add(gathered(folders, list, env=("boatdock",)))
     rows = read_csv(HERE / "results.csv")
     rows.sort(key=_order)
     draw(rows, HERE / "robustness.png")

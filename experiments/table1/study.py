@@ -27,11 +27,10 @@ from hpamdp.analysis.study import (
     add_to_tables,
     curve,
     difference,
-    finished,
+    gathered,
     groups,
     middle_half,
     read_csv,
-    readable,
     spread,
     standing_rows,
     write_tables,
@@ -417,7 +416,8 @@ def human_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        add_to_tables(HERE, gather(readable(finished(folders), gather)), (*CELL, "seed"))
+        new = gathered(folders, gather, env=("boatdock",))
+        add_to_tables(HERE, new, (*CELL, "seed"), steps="presses")
     tables = {name: standing_rows(HERE / f"{name}.csv") for name in TABLES}
     stored = read_csv(HERE / "results.csv")
     for line in missing_runs({**tables, "results": stored}):

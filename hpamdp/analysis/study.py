@@ -9,17 +9,18 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy import stats
 
 from hpamdp.files import replacing
-from hpamdp.messages import file_and_reason, one_line, warn
+from hpamdp.messages import file_and_reason, first_line, one_line, warn
 from hpamdp.metrics_file import read_rows
 from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_NAME, saved_config, saved_summary
 
 Rows = list[dict[str, Any]]
+T = TypeVar("T")
 
 MIN_SEEDS = 10  # smallest number of seeds for an interquartile mean and a bootstrap interval
 FEWEST_SEEDS = 3  # seeds that a cell needs for a place in a table
@@ -72,30 +73,54 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
     return runs
 
 
-def evaluated(runs: Iterable[Run]) -> list[Run]:
-    """Return the runs whose metrics have evaluations, and warn about the others."""
+def gathered(folders: Iterable[Path | str], gather: Callable[[Sequence[Run]], T], **of_study: Collection[str]) -> T:
+    """Return what a study's `gather` reads from its finished runs under the folders, and warn about all other runs.
+
+    Args:
+        folders: the folders.
+        gather: reads runs.
+        of_study: what the summaries of the study's runs may have, by name, such as `env=("goal", "hard_goal")`. A run
+            of another problem, or a damaged one, is left out.
+
+    Raises:
+        SystemExit: no run is left.
+    """
     kept = []
-    for run in runs:
-        if run.evaluations():
+    for run in finished(folders):
+        fault = _fault_in_summary(run, of_study) or _fault_in_files(run, gather)
+        if fault is None:
             kept.append(run)
         else:
-            warn(f"{run.folder}: metrics.csv is missing or has no evaluations, left out")
-    return kept
+            warn(f"{run.folder}: {fault}; left out")
+    if not kept:
+        raise SystemExit("the given folders have no finished runs of this study; nothing was written")
+    return gather(kept)
 
 
-def readable(runs: Iterable[Run], gather: Callable[[Sequence[Run]], object]) -> list[Run]:
-    """Return the runs that a study's `gather` can read, and warn about the others, such as runs of other problems."""
-    kept = []
-    for run in runs:
-        try:
-            gather([run])
-        except KeyError as error:
-            warn(f"{run.folder}: has no {error.args[0]}, as runs of this study have; left out")
-        except OSError as error:
-            warn(f"{run.folder}: {file_and_reason(error)}; left out")
-        else:
-            kept.append(run)
-    return kept
+def _fault_in_summary(run: Run, of_study: Mapping[str, Collection[str]]) -> str | None:
+    """Return why a run is none of a study, or None."""
+    for name, allowed in of_study.items():
+        if run.summary.get(name) not in [*allowed]:
+            return f"{name}={run.summary.get(name)}, but runs of this study have {' or '.join(allowed)}"
+    for name in ("seed", "frames"):
+        if type(run.summary.get(name)) is not int:
+            return f"{name}={run.summary.get(name)}: must be a whole number"
+    return None
+
+
+def _fault_in_files(run: Run, gather: Callable[[Sequence[Run]], object]) -> str | None:
+    """Return why the files of a run cannot be read, or None."""
+    try:
+        if not run.evaluations():
+            return "metrics.csv is missing or has no evaluations"
+        gather([run])
+    except KeyError as error:
+        return f"has no {error.args[0]}, as runs of this study have"
+    except OSError as error:
+        return file_and_reason(error)
+    except Exception as error:  # whatever is wrong in a damaged file
+        return f"is damaged: {type(error).__name__}: {first_line(error)}"
+    return None
 
 
 def run_folders(folder: Path, seen: set[str], marks: Collection[str] = (SUMMARY_NAME,)) -> Iterator[Path]:
@@ -230,7 +255,9 @@ def _name_of(row: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ...]:
     return tuple(str(row[name]) for name in names)
 
 
-def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str]) -> None:
+def add_to_tables(
+    folder: Path, tables: Mapping[str, Rows], names: Sequence[str], *, steps: str = "frames", sorts: bool = True
+) -> None:
     """Add rows to csv files, in the place of those of repeated runs; sort them by these columns, which name a run.
 
     In a column with numbers and texts, numbers come first.
@@ -239,10 +266,12 @@ def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str]
         folder: of the files.
         tables: the new rows by the names of the files. The first table has one row for each run.
         names: the columns.
+        steps: the first table's column with the steps of a run.
+        sorts: if False, stored rows stay in their order, and the new ones follow.
 
     Raises:
-        SystemExit: the first table has no new rows, has a run twice, or has a run whose steps (`frames`) are not those
-            of the run that it repeats. Then nothing is written.
+        SystemExit: the first table has no new rows, has a run twice, or has a run whose steps are not those of the run
+            that it repeats. Then nothing is written.
     """
     first, *_ = tables
     if not tables[first]:
@@ -251,20 +280,24 @@ def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str]
     if twice is not None:
         raise SystemExit(f"the given folders have two runs of {', '.join(map(str, twice))}; nothing was written")
     stored = {table: read_csv(folder / f"{table}.csv") for table in tables}
-    steps_of = {_name_of(row, names): row.get("frames") for row in stored[first]}
+    steps_of = {_name_of(row, names): row.get(steps) for row in stored[first]}
     for row in tables[first]:
         run = _name_of(row, names)
-        steps, before = row.get("frames"), steps_of.get(run)
-        if before is not None and steps != before:
+        of_new, before = row.get(steps), steps_of.get(run)
+        if before is not None and of_new != before:
             raise SystemExit(
-                f"{', '.join(run)}: the given run has {steps:,} steps and the one in {first}.csv {before:,}; nothing "
+                f"{', '.join(run)}: the given run has {of_new:,} steps and the one in {first}.csv {before:,}; nothing "
                 "was written. Delete its rows to replace it"
             )
     merged = {}
     for table, new in tables.items():
         rows = with_repeats_replaced(stored[table], new, names)
-        merged[table] = sorted(rows, key=lambda row: [(isinstance(row[name], str), row[name]) for name in names])
+        merged[table] = _sorted_by(rows, names) if sorts else rows
     write_tables(folder, merged)
+
+
+def _sorted_by(rows: Rows, names: Sequence[str]) -> Rows:
+    return sorted(rows, key=lambda row: [(isinstance(row[name], str), row[name]) for name in names])
 
 
 def first_at(rows: Rows, column: str, level: float) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 from torchrl.envs import EnvBase
 
-from hpamdp.complaints import as_code
+from hpamdp.complaints import as_code, no_such
 from hpamdp.config.components import GROUPS, takes_settings_model
 from hpamdp.config.compose import conf_dir
 from hpamdp.config.errors import ConfigError
@@ -185,6 +185,9 @@ def _is_problem_class(env: Any) -> bool:
 def _words_of_name(name: str) -> list[str]:
     own = plain_name(name)
     if name.startswith("hpamdp/"):
+        if "-v" in name and name not in gymnasium.registry:
+            ids = [each for each in gymnasium.registry if each.startswith("hpamdp/")]
+            raise ConfigError(f"{name}: {no_such('problem with a Gymnasium id', name, ids)}")
         names = [file.stem for file in (conf_dir() / "env").glob("*.yaml") if plain_name(file.stem) == own]
         if names:
             return [word("env", names[0])]

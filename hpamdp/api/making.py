@@ -95,12 +95,12 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
     """
     env_id = _id_of(name)
     own = without_env_prefix(settings)
-    for each, argument in (("id", "name"), ("num_envs", "num_envs")):
+    elsewhere = {"id": "name", "num_envs": "num_envs"} | ({"problem": "name"} if env_id.startswith("hpamdp/") else {})
+    for each, argument in elsewhere.items():
         if each in own:
             raise ConfigError(f"{each}: no setting of the problem; give it as the argument {argument}")
     sizes: dict[str, Any] = {} if num_envs is None else {"num_envs": num_envs}
     if env_id.startswith("hpamdp/"):
-        sizes |= {each: own[each] for each in ("seed",) if each in own}
         sizes |= {each: str(own[each]) for each in ("device",) if each in own}
     checked = validated(_Sizes, sizes, "", "argument", "hpamdp.make_gymnasium")
     if "device" in sizes:
@@ -108,8 +108,8 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
     try:
         if num_envs is None:
             return gymnasium.make(env_id, **own)
-        return gymnasium.make_vec(env_id, num_envs=num_envs, **own)
-    except (gymnasium.error.Error, ValueError) as error:
+        return gymnasium.make_vec(env_id, num_envs=checked.num_envs, **own)
+    except (gymnasium.error.Error, ValueError, ImportError) as error:
         raise ConfigError(f"{env_id}: {first_line(error)}") from error
     except TypeError as error:
         wrong_class = re.match(r"options: must be \w+, not \w+", str(error))

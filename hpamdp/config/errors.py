@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeAlias, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from hpamdp.complaints import as_json, complaints
@@ -55,11 +56,16 @@ def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: st
 
     try:
         # As JSON, in which the strict mode takes what a yaml can hold: a list where a tuple is wanted, 1 for 1.0.
-        checked = model.model_validate_json(json.dumps(values, default=str))
+        checked = model.model_validate_json(json.dumps(values, default=_plain))
     except ValidationError as error:
         raise ConfigError(complaints(error, model, values, what, prefix=prefix, where=place)) from error
     _refuse_huge(model, values, prefix, place)
     return checked
+
+
+def _plain(value: Any) -> Any:
+    """Return NumPy's numbers as Python's, and what else JSON does not know as text."""
+    return value.item() if isinstance(value, np.number) else str(value)
 
 
 def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str, where: Where) -> None:

@@ -462,7 +462,7 @@ class PAMDPEnv(EnvBase):
         is_action = components.exists(discrete)
         exists = (option >= 0) & (option < len(self._allowed_by_option)) & is_action
         places = components.places(torch.where(is_action.reshape(-1, *[1] * (discrete.ndim - 1)), discrete, 0))
-        allowed = self._allowed_by_option[torch.where(exists, option, 0)].gather(-1, places)
+        allowed = self._allowed_by_option[torch.where(exists, option, 0)].gather(-1, places.long())
         is_valid = exists & allowed.all(-1)
         if is_valid.all():
             return
@@ -482,9 +482,12 @@ class PAMDPEnv(EnvBase):
         if value is None or value.shape != shape:
             given_shape = None if value is None else list(value.shape)
             raise ValueError(f"step: {name} has shape {given_shape}, but must be {list(shape)}")
-        if is_integer and (value.is_floating_point() or value.dtype == torch.bool):
+        is_number = not (value.is_complex() or value.dtype == torch.bool)
+        if not is_number or (is_integer and value.is_floating_point()):
             given_type = str(value.dtype).removeprefix("torch.")
-            raise ValueError(f"step: {name} has type {given_type}, but must be integer")
+            raise ValueError(
+                f"step: {name} has type {given_type}, but must be {'integer' if is_integer else 'a number'}"
+            )
 
     def make_done_spec(self) -> Composite:
         """Return the spec of `done`, `terminated` and `truncated`, bool `[N, 1]`."""

@@ -21,7 +21,6 @@ from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
-from hpamdp.env.action_arrays import as_array, describe, parameter_arrays
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.batched_env import GOING_ON, BatchedEnv
 from hpamdp.env.errors import ProblemError
@@ -32,6 +31,7 @@ from hpamdp.env.gymnasium_adapter import (
     NumpyRows,
     RenderMode,
 )
+from hpamdp.env.gymnasium_checks import as_array, describe, parameter_arrays
 from hpamdp.env.kernel_rows import KernelRows, Results
 from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW
 from hpamdp.settings import SettingError
@@ -49,7 +49,10 @@ class BatchedEnvAdapter(GymnasiumAdapter):
     def __init__(self, problem: str, *, render_mode: RenderMode = None, **settings: Any) -> None:
         if "num_envs" in settings:
             raise SettingError(f"num_envs={settings['num_envs']}: this is one environment; use gymnasium.make_vec")
+        _refuse_seed(settings)
         env = _load(problem)(1, **settings)
+        if render_mode is not None and type(env).draw is BatchedEnv.draw:
+            raise SettingError(f"render_mode={render_mode!r}: {env.title} has no pictures")
         super().__init__(NumpyBatchedEnv(env, ()), render_mode)
         self._env = env
         self.own_time_limit = env.max_steps
@@ -76,6 +79,7 @@ class BatchedEnvVectorAdapter(GymnasiumVectorAdapter):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **settings: Any,
     ) -> None:
+        _refuse_seed(settings)
         env = _load(problem)(num_envs, **settings)
         super().__init__(NumpyBatchedEnv(env, (num_envs,)), num_envs, autoreset_mode)
 
@@ -232,6 +236,16 @@ class NumpyBatchedEnv(NumpyRows):
         chosen = [as_array("step: option", each, self._batch, is_integer=True).astype(np.int64) for each in options]
         option = chosen[0].reshape(self._env.num_envs) if chosen else None
         return option, given.reshape(self._env.num_envs), joined
+
+
+def _refuse_seed(settings: Mapping[str, Any]) -> None:
+    """Refuse the seed that a `BatchedEnv` takes, since resets seed a Gymnasium environment.
+
+    Raises:
+        SettingError: there is one.
+    """
+    if "seed" in settings:
+        raise SettingError(f"seed={settings['seed']}: no setting of the environment; give it to reset")
 
 
 def _load(problem: str) -> type[Any]:

@@ -14,10 +14,9 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from hpamdp.env.action_arrays import describe
+from hpamdp.env.gymnasium_checks import check_render_mode, reset_options
 from hpamdp.env.kernel_rows import KernelRows
 from hpamdp.env.kernels import OUTCOME_ROW
-from hpamdp.settings import SettingError
 
 RenderMode = Literal["rgb_array"] | None
 
@@ -111,8 +110,7 @@ class NumpyRows(NumpyEnv):
 
     def _start_columns(self, options: Mapping[str, Any]) -> Mapping[int, np.ndarray]:
         """Check the options of a reset and return the columns of the state that they set, by their places."""
-        if options:
-            raise ValueError(f"reset: unknown options {sorted(options)}; there are none")
+        reset_options(options)
         return {}
 
     def _leaves(self, action: Any) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
@@ -143,8 +141,7 @@ class GymnasiumAdapter(gymnasium.Env):
     training_begins_elsewhere: bool = False
 
     def __init__(self, problem: NumpyEnv, render_mode: RenderMode) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise SettingError(f"{type(self).__name__}: render_mode={render_mode!r}, but must be None or rgb_array")
+        check_render_mode(type(self).__name__, render_mode)
         self._problem = problem
         self.action_space = problem.action_space
         self.observation_space = problem.observation_space
@@ -155,7 +152,7 @@ class GymnasiumAdapter(gymnasium.Env):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode; see the module's docstring for `options`."""
-        options = _reset_options(options)
+        options = reset_options(options, allowed=None)
         super().reset(seed=seed)
         if seed is None and not self._problem.is_reset:
             seed = int(self.np_random.integers(2**31))
@@ -217,7 +214,7 @@ class GymnasiumVectorAdapter(VectorEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes; see the class's and the module's docstrings for `options`."""
-        options = _reset_options(options)
+        options = reset_options(options, allowed=None)
         mask = options.pop("reset_mask", None)
         self._check_mask(mask, seed)
         super().reset(seed=seed)
@@ -278,14 +275,3 @@ class GymnasiumVectorAdapter(VectorEnv):
                 continue
             masked[f"_{name}"] = has_value.copy()
         return masked
-
-
-def _reset_options(options: Any) -> dict[str, Any]:
-    """Return a copy of the options of a reset.
-
-    Raises:
-        ValueError: they are no mapping.
-    """
-    if not isinstance(options, Mapping | None):
-        raise ValueError(f"reset: options must be a dict, but is {describe(options)}")
-    return dict(options or {})

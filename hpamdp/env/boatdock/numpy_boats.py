@@ -20,11 +20,11 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.action_arrays import as_array, describe
 from hpamdp.env.boatdock import kernel, task
 from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.task import BoatState, Rules
 from hpamdp.env.gymnasium_adapter import NumpyRows
+from hpamdp.env.gymnasium_checks import as_array, describe, reset_options
 from hpamdp.env.kernel_rows import KernelRows, invalid_choice
 
 ActionFormat = Literal["dict", "tuple"]
@@ -162,9 +162,7 @@ class NumpyBoats(NumpyRows):
     def _start_columns(self, options: Mapping[str, Any]) -> Mapping[int, np.ndarray]:
         if not options:
             return {}
-        unknown = set(options) - set(_OPTION_SHAPES)
-        if unknown:
-            raise ValueError(f"reset: unknown options {sorted(unknown)}; allowed: {', '.join(_OPTION_SHAPES)}")
+        reset_options(options, [*_OPTION_SHAPES])
         missing = {"start", "goal"} - set(options)
         if missing:
             raise ValueError(f"reset: options {sorted(options)} lack {sorted(missing)}: a layout has both points")

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.action_arrays import describe, single_action
+from hpamdp.env.gymnasium_checks import check_render_mode, describe, reset_options, single_action
 from hpamdp.settings import SettingError
 
 SOLVED = 200.0
@@ -54,6 +54,15 @@ class HybridLunarLander(gymnasium.Wrapper):
         wind_power: float = 15.0,
         turbulence_power: float = 1.5,
     ) -> None:
+        check_render_mode("HybridLunarLander", render_mode)
+        for name, number in (("gravity", gravity), ("wind_power", wind_power), ("turbulence_power", turbulence_power)):
+            if isinstance(number, bool) or not isinstance(number, int | float | np.number) or not np.isfinite(number):
+                raise SettingError(f"HybridLunarLander: {name}={number}, but must be a finite number")
+        if min(wind_power, turbulence_power) < 0.0:
+            given = f"wind_power={wind_power}, turbulence_power={turbulence_power}"
+            raise SettingError(f"HybridLunarLander: {given}, but must be at least 0")
+        if not isinstance(enable_wind, bool | np.bool_):
+            raise SettingError(f"HybridLunarLander: enable_wind={enable_wind}, but must be True or False")
         try:
             from gymnasium.envs.box2d.lunar_lander import LunarLander
         except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
@@ -77,6 +86,7 @@ class HybridLunarLander(gymnasium.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
+        reset_options(options)
         self._return, self._is_over = 0.0, False
         return self.env.reset(seed=seed, options=options)
 

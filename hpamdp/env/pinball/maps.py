@@ -17,7 +17,6 @@ square is put back.
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import os
 from pathlib import Path
@@ -28,7 +27,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json  # refuses deep nesting, at which `json` meets Python's recursion limit
 
 from hpamdp.files import read_regular
-from hpamdp.messages import reason_of
+from hpamdp.json_lines import key_given_twice
+from hpamdp.messages import one_line, reason_of
 
 OWN_MAPS = ("simple", "hard")
 _FOLDER = Path(__file__).resolve().parent / "maps"
@@ -118,7 +118,9 @@ def read(name: str) -> PinballMap:
         from_json(data, allow_inf_nan=False)
     except ValueError as error:
         raise MapError(f"is no JSON: {reason_of(error)}") from error
-    json.loads(data, object_pairs_hook=_refuse_key_given_twice)
+    twice = key_given_twice(data)
+    if twice is not None:
+        raise MapError(f"{one_line(twice)[:80]}: is given twice")
     try:
         found = PinballMap.model_validate_json(data)
     except ValidationError as error:
@@ -126,18 +128,6 @@ def read(name: str) -> PinballMap:
         raise MapError(f"{_place(wrong['loc'])}: {wrong['msg'].replace('Input should be', 'must be')}") from error
     _check(found)
     return found
-
-
-def _refuse_key_given_twice(pairs: list[tuple[str, Any]]) -> None:
-    """Refuse a JSON object that has a key twice, of which readers take the last one.
-
-    Raises:
-        MapError: the message names the key.
-    """
-    names = [name for name, _ in pairs]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise MapError(f"{twice[:80]}: is given twice")
 
 
 def _place(location: tuple[Any, ...]) -> str:

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.action_arrays import single_action
+from hpamdp.env.gymnasium_checks import check_render_mode, reset_options, single_action
 from hpamdp.env.primitives.primitives import (
     LARGE_POSITION_STEPS,
     PRIMITIVES,
@@ -102,6 +102,7 @@ class Manipulation(gymnasium.Env):
             raise SettingError(f"Manipulation: decisions={decisions}, but must be a whole number of at least 1")
         if not isinstance(reach, int | float | np.floating) or not 0.0 < reach <= 1.0:
             raise SettingError(f"Manipulation: reach={reach}, but must be above 0 and at most 1")
+        check_render_mode("Manipulation", render_mode)
         self.render_mode = render_mode
         self.actions = ACTIONS[actions]
         self._parameter_dims = [each.num_arguments for each in self.actions]
@@ -133,6 +134,7 @@ class Manipulation(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Begin an episode with new places of object and goal."""
+        reset_options(options)
         super().reset(seed=seed)
         if seed is not None:
             self._arm.seed(seed)

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.action_arrays import single_action
+from hpamdp.env.gymnasium_checks import check_render_mode, reset_options, single_action
 from hpamdp.env.traffic.demand import HELD_OUT, KINDS, MOST_TRAFFIC, NUM_DEMANDS
 from hpamdp.env.traffic.network import MAX_GREEN, MIN_GREEN, NETWORKS, PHASES, network_file
 from hpamdp.env.traffic.players import PLAYERS
@@ -72,6 +72,7 @@ class TrafficLights(gymnasium.Env):
             raise SettingError(f"TrafficLights: minutes={minutes}, but must be a whole number of at least 1")
         if not isinstance(traffic, int | float | np.floating) or not 0.0 < traffic <= MOST_TRAFFIC:
             raise SettingError(f"TrafficLights: traffic={traffic}, but must be above 0 and at most {MOST_TRAFFIC:g}")
+        check_render_mode("TrafficLights", render_mode)
         self.render_mode = render_mode
         file = str(network_file(network))
         self._task = Task(network, demand, file, 60 * minutes, traffic, reward, render_mode is not None)
@@ -88,6 +89,7 @@ class TrafficLights(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
+        reset_options(options)
         super().reset(seed=seed)
         number = int(self.np_random.integers(HELD_OUT)) if seed is None else seed
         if not 0 <= number < NUM_DEMANDS:

@@ -1,4 +1,4 @@
-"""Checks of the actions that Gymnasium environments take: their structure, types and shapes.
+"""Checks of what Gymnasium environments take: actions, options of a reset, ways of drawing.
 
 Nothing here needs torch, which takes seconds to import.
 """
@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from hpamdp.settings import SettingError
 
 
 def as_array(name: str, value: Any, shape: tuple[int, ...], *, is_integer: bool = False) -> np.ndarray:
@@ -81,3 +83,33 @@ def single_action(action: Any, parameter_dims: Sequence[int], where: str = "step
     if not np.isfinite(own).all():
         raise ValueError(f"{where}: the parameters of action {number} are {own}, but must be finite")
     return number, own
+
+
+def reset_options(options: Any, allowed: Sequence[str] | None = ()) -> dict[str, Any]:
+    """Return a copy of the options of a reset.
+
+    Args:
+        options: the options, or None.
+        allowed: their names; if None, the environment checks them itself.
+
+    Raises:
+        ValueError: they are no mapping, or one has an unknown name.
+    """
+    if not isinstance(options, Mapping | None):
+        raise ValueError(f"reset: options must be a dict, but is {describe(options)}")
+    given = dict(options or {})
+    unknown = [] if allowed is None else [name for name in given if name not in allowed]
+    if unknown:
+        there_are = f"allowed: {', '.join(allowed)}" if allowed else "there are none"
+        raise ValueError(f"reset: unknown options {unknown}; {there_are}")
+    return given
+
+
+def check_render_mode(name: str, render_mode: Any) -> None:
+    """Refuse a way of drawing but None and `rgb_array`.
+
+    Raises:
+        SettingError: the message names the environment.
+    """
+    if render_mode not in (None, "rgb_array"):
+        raise SettingError(f"{name}: render_mode={render_mode!r}, but must be None or rgb_array")
