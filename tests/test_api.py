@@ -700,6 +700,8 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make_gymnasium("platform").reset(options=5), "reset: options must be a dict, but is a int"),
         (lambda: hpamdp.make_gymnasium("office", 2).reset(options=5), "reset: options must be a dict, but is a "),
         (lambda: hpamdp.make("platform", grouping={"up": ["hop", "hop"]}), "option up has an action twice: hop, hop"),
+        (lambda: hpamdp.make("platform", grouping={"a b": [0]}), "env.grouping: 'a b' names an entry; give a word of"),
+        (lambda: hpamdp.make("platform", grouping={1: [0]}), "env.grouping: 1 names an entry; give a word of letters"),
         (lambda: hpamdp.make("platform", grouping={"up": "hop"}), 'env.grouping.up="hop": must be a list'),
         (lambda: hpamdp.train("platform", max_stps=5), r"did you mean env\.max_steps"),
         (lambda: hpamdp.train("platform", low="hppo", lr=1e-3), r"did you mean low\.lr\?"),

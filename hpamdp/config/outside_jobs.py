@@ -123,7 +123,12 @@ def _written(name: str, value: Any) -> str:
         return for_hydra(str(value))
     if isinstance(value, list | tuple):
         return f"[{','.join(_written(name, item) for item in value)}]"
-    if isinstance(value, Mapping) and all(is_name(entry) for entry in value):
+    if isinstance(value, Mapping):
+        for entry in value:
+            if not is_name(entry):
+                raise ConfigError(
+                    f"{name}: {as_code(entry)} names an entry; give a word of letters, digits and _ . + -"
+                )
         return f"{{{','.join(f'{entry}:{_written(name, item)}' for entry, item in value.items())}}}"
     raise ConfigError(f"{name}={as_code(value)}: must be a number, a text, or a list or mapping of these")
 
