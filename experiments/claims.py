@@ -1616,8 +1616,8 @@ def memory() -> list[Claim]:
     return [
         Claim(
             page("memory"),
-            "With `stack` and with `gru` {learners:word} learners return {lowest:.2f} or more with each of {seeds:word} "
-            "seeds, and {selectors:word} selectors {of_selectors:.3f}. Without a memory none returns more than "
+            "With `stack` and with `gru` {learners:word} learners return {lowest:.2f} or more with each of "
+            "{seeds:word} seeds, and {selectors:word} selectors {of_selectors:.3f}. Without a memory none returns more than "
             "{without:.2f}.",
             numbers,
         )
@@ -2019,6 +2019,7 @@ STUDIES: list[Callable[[], list[Claim]]] = [
         generalisation,
         hybrid_control,
         lengths,
+        memory,
         offline,
     ),
     *(exploration, options, pearl, peers, problems, quickstart, reliability, robustness, speed, throughput, intervals),

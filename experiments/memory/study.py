@@ -76,7 +76,11 @@ def table(rows: Rows) -> str:
         "| | " + " | ".join(f"`{memory}`" for memory in MEMORIES) + " | seeds | steps | CPU with `none`, `gru` |",
         "|---" * (len(MEMORIES) + 4) + "|",
     ]
-    for (name,), of_name in groups(with_enough_seeds(rows, *RUN[:-1]), "learns").items():
+    by_name = groups(with_enough_seeds(rows, *RUN[:-1]), "learns")
+    for name in (*LEARNERS, *SELECTORS):
+        if (name,) not in by_name:
+            continue
+        of_name = by_name[name,]
         cells = groups(of_name, "memory")
         scores = [spread([row["score"] for row in cells[memory,]]) if (memory,) in cells else "" for memory in MEMORIES]
         seeds = {row["seed"] for row in of_name}
