@@ -1617,8 +1617,8 @@ def memory() -> list[Claim]:
         Claim(
             page("memory"),
             "With `stack` and with `gru` {learners:word} learners return {lowest:.2f} or more with each of "
-            "{seeds:word} seeds, and {selectors:word} selectors {of_selectors:.3f}. Without a memory none returns more than "
-            "{without:.2f}.",
+            "{seeds:word} seeds, and {selectors:word} selectors {of_selectors:.3f}. Without a memory none returns more "
+            "than {without:.2f}.",
             numbers,
         )
     ]
