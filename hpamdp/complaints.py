@@ -123,7 +123,7 @@ def _shortened(complaints: list[str]) -> list[str]:
 
 
 def _locate(location: tuple[int | str, ...], values: Mapping[str, Any], *, is_missing: bool) -> tuple[list[str], Any]:
-    """Return the path of names to a wrong value, and the value. The last name `is_missing` in some mapping or not."""
+    """Return the path of names to a wrong value, and the value. `is_missing`: whether a mapping lacks the last name."""
     path: list[str] = []
     value: Any = values
     for part in location:

@@ -100,8 +100,8 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         if each in own:
             raise ConfigError(f"{each}: no setting of the problem; give it as the argument {argument}")
     sizes: dict[str, Any] = {} if num_envs is None else {"num_envs": num_envs}
-    if env_id.startswith("hpamdp/"):
-        sizes |= {each: str(own[each]) for each in ("device",) if each in own}
+    if "device" in own and env_id.startswith("hpamdp/"):
+        sizes["device"] = str(own["device"])
     checked = validated(_Sizes, sizes, "", "argument", "hpamdp.make_gymnasium")
     if "device" in sizes:
         own["device"] = usable_device(checked.device)
