@@ -1475,9 +1475,6 @@ def offline() -> list[Claim]:
     ]
 
 
-OPTION_SELECTORS = ("meta_critic", "actor", "option_critic")
-
-
 def options() -> list[Claim]:
     study_of_options = study("options")
     boats, goal = study_of_options.boats(), study_of_options.on_goal()
@@ -1507,7 +1504,7 @@ def options() -> list[Claim]:
         good=len(crossing) - len(below),
         pairs=len(crossing),
         dlpa=min(column(crossing["dlpa", "actor"], "share")),
-        qpamdp={high: min(column(crossing["qpamdp", high], "share")) for high in OPTION_SELECTORS},
+        qpamdp={high: min(column(crossing["qpamdp", high], "share")) for high in study_of_options.SELECTORS},
         seeds=seeds(changing),
         seeds_alone=seeds(alone["goal"]),
         failed=sum(share < 0.9 for share in column(kept, "share")),
@@ -1531,7 +1528,7 @@ def options() -> list[Claim]:
             holds=below == said
             and all(seeds(runs) == numbers["seeds"] for runs in crossing.values())
             and is_reached
-            and {*rooms} == {(low, high) for low in ("hppo", "pdqn") for high in OPTION_SELECTORS}
+            and {*rooms} == {(low, high) for low in ("hppo", "pdqn") for high in study_of_options.SELECTORS}
             and is_unclear
             and not gain.is_clear,
         ),
@@ -1560,7 +1557,8 @@ def options() -> list[Claim]:
             "{qpamdp[option_critic]:.2f} (Q-PAMDP under the option-critic). The mean errors of the values are "
             "within 5 % for all pairs except DLPA under the actor and Q-PAMDP.",
             numbers,
-            holds=below == said and wrong == {("dlpa", "actor")} | {("qpamdp", high) for high in OPTION_SELECTORS},
+            holds=below == said
+            and wrong == {("dlpa", "actor")} | {("qpamdp", high) for high in study_of_options.SELECTORS},
         ),
         Claim(
             page("options"),

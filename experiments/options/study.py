@@ -34,6 +34,8 @@ from hpamdp.messages import exit_code
 HERE = Path(__file__).resolve().parent
 DOMAINS = HERE.parent / "domains" / "results.csv"
 ALONE = "none"
+SELECTORS = ("meta_critic", "actor", "option_critic")
+STEPS = 301_056  # of a run on Goal or Hard Goal
 PAIR = ("low", "high")
 BOATS = "env.boats="
 CHANGED, KEPT = "changed for 0.1 s", "kept"
@@ -180,7 +182,8 @@ def _line(cells: Sequence[object]) -> str:
 def main(folders: Sequence[str]) -> None:
     """Add the runs on Goal, if folders are given, and tabulate."""
     if folders:
-        new = gathered(folders, gather, env=("goal", "hard_goal"))
+        of_study = {"env": ("goal", "hard_goal"), "high": SELECTORS, "frames": (STEPS,)}
+        new = gathered(folders, gather, **of_study)
         add_to_tables(HERE, {"goal": new}, ("domain", *PAIR, "seed"))
     of_boats = (boats_table(is_changed) for is_changed in (False, True))
     print(*of_boats, goal_table(), *(pairs_table(name) for name in ("crossing", "rooms")), sep="\n\n")

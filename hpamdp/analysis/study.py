@@ -73,7 +73,7 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
     return runs
 
 
-def gathered(folders: Iterable[Path | str], gather: Callable[[Sequence[Run]], T], **of_study: Collection[str]) -> T:
+def gathered(folders: Iterable[Path | str], gather: Callable[[Sequence[Run]], T], **of_study: Collection[Any]) -> T:
     """Return what a study's `gather` reads from its finished runs under the folders, and warn about all other runs.
 
     Args:
@@ -97,11 +97,11 @@ def gathered(folders: Iterable[Path | str], gather: Callable[[Sequence[Run]], T]
     return gather(kept)
 
 
-def _fault_in_summary(run: Run, of_study: Mapping[str, Collection[str]]) -> str | None:
+def _fault_in_summary(run: Run, of_study: Mapping[str, Collection[Any]]) -> str | None:
     """Return why a run is none of a study, or None."""
     for name, allowed in of_study.items():
         if run.summary.get(name) not in [*allowed]:
-            return f"{name}={run.summary.get(name)}, but runs of this study have {' or '.join(allowed)}"
+            return f"{name}={run.summary.get(name)}, but runs of this study have {' or '.join(map(str, allowed))}"
     for name in ("seed", "frames"):
         if type(run.summary.get(name)) is not int:
             return f"{name}={run.summary.get(name)}: must be a whole number"
