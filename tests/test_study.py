@@ -331,6 +331,16 @@ def test_a_run_of_another_length_does_not_replace_a_stored_one(tmp_path):
     assert read_csv(tmp_path / "results.csv")[0]["frames"] == 800_000
 
 
+def test_a_shorter_run_with_a_new_seed_does_not_join_a_cell(tmp_path):
+    names = ("domain", "learner", "seed")
+    write_tables(tmp_path, {"results": [{**_row("pdqn", 2), "frames": 800_000}]})
+    with pytest.raises(SystemExit, match=r"goal, pdqn: has runs of 2,000 and 800,000 steps; nothing was written"):
+        add_to_tables(tmp_path, {"results": [{**_row("pdqn", 3), "frames": 2_000}]}, names)
+    assert len(read_csv(tmp_path / "results.csv")) == 1
+    add_to_tables(tmp_path, {"results": [{**_row("pdqn", 3), "frames": 2_000}]}, names, lengths_differ=True)
+    assert len(read_csv(tmp_path / "results.csv")) == 2
+
+
 def test_nothing_is_written_if_there_are_no_new_runs(tmp_path):
     write_tables(tmp_path, {"results": [_row("pdqn", 0)]})
     with pytest.raises(SystemExit, match="no finished runs; nothing was written"):

@@ -271,7 +271,7 @@ def draw(curves: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Add the runs in the folders, if any are given, then draw and tabulate."""
     if folders:
-        add_to_tables(HERE, gathered(folders, gather, env=ENVIRONMENTS), RUN)
+        add_to_tables(HERE, gathered(folders, gather, env=ENVIRONMENTS), RUN, lengths_differ=True)
     curves = read_csv(HERE / "curves.csv")
     draw(curves, HERE / "primitives.png")
     print(table(read_csv(HERE / "results.csv"), curves))

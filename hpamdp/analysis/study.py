@@ -256,7 +256,13 @@ def _name_of(row: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ...]:
 
 
 def add_to_tables(
-    folder: Path, tables: Mapping[str, Rows], names: Sequence[str], *, steps: str = "frames", sorts: bool = True
+    folder: Path,
+    tables: Mapping[str, Rows],
+    names: Sequence[str],
+    *,
+    steps: str = "frames",
+    lengths_differ: bool = False,
+    sorts: bool = True,
 ) -> None:
     """Add rows to csv files, in the place of those of repeated runs; sort them by these columns, which name a run.
 
@@ -267,11 +273,13 @@ def add_to_tables(
         tables: the new rows by the names of the files. The first table has one row for each run.
         names: the columns.
         steps: the first table's column with the steps of a run.
+        lengths_differ: whether the seeds of a cell may have different steps. Else a shorter run, such as a trial, is
+            refused, which would join the cell's mean.
         sorts: if False, stored rows stay in their order, and the new ones follow.
 
     Raises:
         SystemExit: the first table has no new rows, has a run twice, or has a run whose steps are not those of the run
-            that it repeats. Then nothing is written.
+            that it repeats, or of its cell. Then nothing is written.
     """
     first, *_ = tables
     if not tables[first]:
@@ -289,11 +297,26 @@ def add_to_tables(
                 f"{', '.join(run)}: the given run has {of_new:,} steps and the one in {first}.csv {before:,}; nothing "
                 "was written. Delete its rows to replace it"
             )
+    if not lengths_differ:
+        _refuse_other_lengths(with_repeats_replaced(stored[first], tables[first], names), names, steps)
     merged = {}
     for table, new in tables.items():
         rows = with_repeats_replaced(stored[table], new, names)
         merged[table] = _sorted_by(rows, names) if sorts else rows
     write_tables(folder, merged)
+
+
+def _refuse_other_lengths(rows: Rows, names: Sequence[str], steps: str) -> None:
+    """Refuse cells whose seeds have different steps.
+
+    Raises:
+        SystemExit: there is one.
+    """
+    for cell, of_cell in groups(rows, *(name for name in names if name != "seed")).items():
+        lengths = sorted({row[steps] for row in of_cell if row.get(steps) is not None})
+        if len(lengths) > 1:
+            listed = " and ".join(f"{length:,}" for length in lengths)
+            raise SystemExit(f"{', '.join(map(str, cell))}: has runs of {listed} steps; nothing was written")
 
 
 def _sorted_by(rows: Rows, names: Sequence[str]) -> Rows:
