@@ -1478,7 +1478,7 @@ def offline() -> list[Claim]:
 def options() -> list[Claim]:
     study_of_options = study("options")
     boats, goal = study_of_options.boats(), study_of_options.on_goal()
-    crossing, rooms = (study_of_options.on_the_plane(name) for name in ("crossing", "rooms"))
+    crossing, rooms = (study_of_options.by_pair(name) for name in ("crossing", "rooms"))
     single = groups([row for row in rows("options/rooms.csv") if (row["low"], row["high"]) not in rooms], "low", "high")
     changing, kept = (boats["", case] for case in (study_of_options.CHANGED, study_of_options.KEPT))
     bar = 95  # per cent of the best return

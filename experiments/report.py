@@ -4,9 +4,10 @@ python experiments/report.py    runs `main([])` of every study.py; renews the ta
                                 numbers in their sentences differ from the csv files (claims.py); writes
                                 report/report.html, and every figure as SVG
 
-In the page of a study, `<!-- table -->` and `<!-- /table -->` enclose all its tables. In every page
-`<!-- table 2 of STUDY -->` and `<!-- /table -->` enclose the second table of that study. In docs/, tables made from csv
-files and from rows of a study's tables are renewed by docs/hooks.py, which explains their marks.
+In the page of a study, `<!-- table -->` and `<!-- /table -->` enclose all its tables, and `<!-- table 2 of STUDY -->`
+and `<!-- /table -->` the second one. So they do in the project's README, in that of agents/ and in docs/, there for
+every study. In docs/, tables made from csv files and from rows of a study's tables are renewed by docs/hooks.py, which
+explains their marks.
 """
 
 from __future__ import annotations
@@ -65,7 +66,8 @@ def report(experiments: Path, target: Path) -> list[str]:
             except (Exception, SystemExit) as error:  # one failing study must not stop the others
                 failures.append(f"{folder.name}: {type(error).__name__}: {error}")
         if (folder / "README.md").exists():
-            failures += renew_numbered(folder / "README.md", tables)
+            own = {name: text for name, text in tables.items() if name == folder.name}
+            failures += renew_numbered(folder / "README.md", own)
         text = page_of(folder, tables.get(folder.name))
         if text is None:
             continue

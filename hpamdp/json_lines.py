@@ -42,7 +42,7 @@ def read_json(line: bytes) -> Any:
 
 
 def key_given_twice(data: bytes) -> str | None:
-    """Return a key that an object in a valid JSON text has twice, of which readers take the last one; None if none has.
+    """Return a key that some object of a JSON text has twice, or None. Readers would take its last value.
 
     Args:
         data: a text that `from_json` has read, so that it is not nested deeply.

@@ -700,8 +700,11 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make_gymnasium("platform").reset(options=5), "reset: options must be a dict, but is a int"),
         (lambda: hpamdp.make_gymnasium("office", 2).reset(options=5), "reset: options must be a dict, but is a "),
         (lambda: hpamdp.make("platform", grouping={"up": ["hop", "hop"]}), "option up has an action twice: hop, hop"),
-        (lambda: hpamdp.make("platform", grouping={"a b": [0]}), "env.grouping: 'a b' names an entry; give a word of"),
-        (lambda: hpamdp.make("platform", grouping={1: [0]}), "env.grouping: 1 names an entry; give a word of letters"),
+        (
+            lambda: hpamdp.make("platform", grouping={"a b": [0]}),
+            "the name 'a b' of an entry must be a text",
+        ),
+        (lambda: hpamdp.make("platform", grouping={1: [0]}), "env.grouping: the name 1 of an entry must be a text"),
         (lambda: hpamdp.make("platform", grouping={"up": "hop"}), 'env.grouping.up="hop": must be a list'),
         (lambda: hpamdp.train("platform", max_stps=5), r"did you mean env\.max_steps"),
         (lambda: hpamdp.train("platform", low="hppo", lr=1e-3), r"did you mean low\.lr\?"),
@@ -837,7 +840,7 @@ def test_make_warns_of_settings_that_count_only_with_another_one(capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_numpys_whole_numbers_are_whole_numbers():
+def test_make_takes_numpys_whole_numbers():
     assert hpamdp.make("platform", np.int64(2), seed=np.int64(3)).num_envs == 2
     assert hpamdp.make_gymnasium("platform", np.int64(2)).num_envs == 2
 

@@ -386,9 +386,9 @@ def test_cells_that_share_a_place_in_the_table_are_counted_all_the_same():
     assert table.num_cells() == pytest.approx(len(cells), rel=0.01), "visits again are no new cells"
 
 
-@pytest.mark.parametrize("resolution", [[0.0, 0.0, 0.0, 0.0], 1e-50, [1.0, 1e-5, 0.0, 0.0], 1e30])
-def test_counts_refuse_resolutions_that_tell_no_states_apart(resolution):
-    with pytest.raises(SettingError, match=r"^resolution=.*: must (have a number above 0|be from 0.001 to 1e\+06)"):
+@pytest.mark.parametrize("resolution", [[0.0, 0.0, 0.0, 0.0], 1e-50, [1.0, 1e-50, 0.0, 0.0], 1e30])
+def test_counts_refuse_resolutions_out_of_bounds_and_lists_of_zeros(resolution):
+    with pytest.raises(SettingError, match=r"^resolution=.*: must (have a number above 0|be from 1e-12 to 1e\+06)"):
         Counts(HPPO(SPECS), resolution=resolution)
 
 

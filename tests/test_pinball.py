@@ -176,11 +176,11 @@ def test_a_map_of_ones_own_is_played_by_rules_kernel_and_player(tmp_path):
         ({"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, None]]]}, "polygons[0][2][1]: must be a valid number"),
         (
             {"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, 0.1]]]},
-            "polygons[0][1]: is the same corner as the next one",
+            "polygons[0][1]: is less than 1e-06 from the next corner",
         ),
         (
             {"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, 0.1 + 1e-9]]]},
-            "polygons[0][1]: is the same corner as the next one",
+            "polygons[0][1]: is less than 1e-06 from the next corner",
         ),
         (
             {"polygons": [[[0.6, 0.3], [1.0, 0.3], [1.0, 0.7], [0.6, 0.7]]]},

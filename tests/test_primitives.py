@@ -217,7 +217,7 @@ def test_no_step_is_taken_before_an_episode_begins_or_after_it_ended():
 
 
 @needs_simulator
-def test_a_wrong_way_of_drawing_is_told_in_one_line():
+def test_a_wrong_mujoco_gl_is_a_setting_error():
     script = "import hpamdp.env.primitives.manipulation as m; m.Manipulation()"
     done = subprocess.run(
         [sys.executable, "-c", script], env={**os.environ, "MUJOCO_GL": "foo"}, capture_output=True, text=True

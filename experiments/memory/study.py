@@ -3,8 +3,9 @@
 python experiments/memory/study.py 100 101 102    trains with these seeds, and adds rows to results.csv
 python experiments/memory/study.py                tabulates results.csv
 
-Cue is in `tests/toy_memory.py`: its first observation says what pays in its last step. The best return is 1, and the
-best one without a memory 0 on average. In the selectors' version, options last one step and the last one counts.
+Cue is in `tests/toy_memory.py`: its first observation says which action is rewarded in its last step. The best return
+is 1, and the best one without a memory 0 on average. In the selectors' version, options last one step, and only the
+last one is rewarded.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ OF_SELECTORS = {
     "steps_per_batch": 16,
 }
 MEMORIES = ("none", "stack", "gru")
-REFUSED = ("option_critic", "gru")
+REFUSED = ("option_critic", "gru")  # it learns from single steps
 
 
 def train(name: str, memory: str, seed: int) -> dict[str, Any]:

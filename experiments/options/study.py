@@ -93,17 +93,17 @@ def on_goal() -> dict[tuple[str, str, str], Rows]:
     return runs | groups(alone, "domain", *PAIR)
 
 
-def on_the_plane(name: str) -> dict[tuple[str, str], Rows]:
+def by_pair(name: str) -> dict[tuple[str, str], Rows]:
     """Return the runs on Crossing or Rooms by learner and selector."""
     return standing(read_csv(HERE / f"{name}.csv"), *PAIR)
 
 
-def boats_table(is_changed: bool) -> str:
+def boats_table(compares_changes: bool) -> str:
     """Return a line for each selector over three boats, or for boats that may be changed and those that are kept."""
     head = "| {} | n | score | ceiling | of it | changes an episode | planner's | weighted | success | presses | CPU |"
-    lines = [head.format("" if is_changed else "selector"), "|---" * 11 + "|"]
+    lines = [head.format("" if compares_changes else "selector"), "|---" * 11 + "|"]
     for (boats_word, name), rows in boats().items():
-        if bool(boats_word) == is_changed:
+        if bool(boats_word) == compares_changes:
             continue
         changes = [row["option_changes"] for row in rows if row["option_changes"] != ""]
         cells = [
@@ -146,7 +146,7 @@ def pairs_table(name: str) -> str:
     """Return a line for each learner under each selector on Crossing or Rooms."""
     head = "| learner | selector | seeds | steps | share | lowest | success | value error | everywhere | CPU |"
     lines = [head, "|---" * 10 + "|"]
-    for (low, high), rows in on_the_plane(name).items():
+    for (low, high), rows in by_pair(name).items():
         cells = [
             low,
             high,
@@ -185,7 +185,7 @@ def main(folders: Sequence[str]) -> None:
         of_study = {"env": ("goal", "hard_goal"), "high": SELECTORS, "frames": (STEPS,)}
         new = gathered(folders, gather, **of_study)
         add_to_tables(HERE, {"goal": new}, ("domain", *PAIR, "seed"))
-    of_boats = (boats_table(is_changed) for is_changed in (False, True))
+    of_boats = (boats_table(compares_changes) for compares_changes in (False, True))
     print(*of_boats, goal_table(), *(pairs_table(name) for name in ("crossing", "rooms")), sep="\n\n")
 
 

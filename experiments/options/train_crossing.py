@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -22,6 +23,7 @@ from hpamdp.run.assemble import AssembledRun
 
 HERE = Path(__file__).resolve().parent
 FILE = HERE / "crossing.csv"
+RUN = ("high", "low", "seed")
 EXAMPLE = HERE.parent.parent / "examples" / "crossing"
 sys.path.insert(0, str(EXAMPLE))
 from crossing import NUM_CELLS, Crossing, best_values, cell_of, observe  # noqa: E402
@@ -121,7 +123,7 @@ LEARNERS = {
 }
 
 
-def train(words: Sequence[str]) -> dict[str, object]:
+def train(words: Sequence[str]) -> dict[str, Any]:
     """Train one agent and return its row."""
     config = make_config(words, COMMON, SELECTORS, LEARNERS)
     parts, frames, cpu = trained(config)
@@ -171,4 +173,4 @@ def evaluate(parts: AssembledRun, best: torch.Tensor) -> tuple[float, float, tor
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(lambda: train_all(sys.argv[1:], train, FILE)))
+    sys.exit(exit_code(lambda: train_all(sys.argv[1:], train, FILE, RUN)))

@@ -8,20 +8,21 @@ The words are those of the command line, and all combinations of their values ar
 
 from __future__ import annotations
 
-import csv
 import itertools
+import re
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
+from hpamdp.analysis.study import add_to_tables
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed
@@ -35,6 +36,7 @@ from hpamdp.run.trainer import Trainer
 
 HERE = Path(__file__).resolve().parent
 FILE = HERE / "rooms.csv"
+RUN = ("high", "low", "sharing", "termination", "option_length", "seed")
 GAMMA = 0.95
 Settings: TypeAlias = Mapping[str, Sequence[str]]  # words of the command line, by the selector or the learner
 # Settings of every run, before the words of the command line.
@@ -214,7 +216,7 @@ def value_errors(value: torch.Tensor, best: torch.Tensor, num_due: torch.Tensor)
     }
 
 
-def train(words: Sequence[str]) -> dict[str, object]:
+def train(words: Sequence[str]) -> dict[str, Any]:
     """Train one agent and return its row."""
     config = make_config(words, COMMON, SELECTORS, LEARNERS)
     parts, frames, cpu = trained(config)
@@ -295,18 +297,16 @@ def values_of_cells(agent: HierarchicalAgent) -> torch.Tensor:
     return value.masked_fill(is_nothing, 0.0).reshape(rules.SIZE, rules.SIZE)
 
 
-def add(row: Mapping[str, object], file: Path) -> None:
-    """Append a row to a csv file."""
-    is_new = not file.exists()
-    with file.open("a", newline="") as stream:
-        writer = csv.DictWriter(stream, list(row))
-        if is_new:
-            writer.writeheader()
-        writer.writerow(row)
-
-
-def train_all(words: Sequence[str], train: Callable[[Sequence[str]], Mapping[str, object]], file: Path) -> None:
+def train_all(
+    words: Sequence[str], train: Callable[[Sequence[str]], dict[str, Any]], file: Path, run: Sequence[str]
+) -> None:
     """Train with every combination of the words' values, and add a row each to a csv file.
+
+    Args:
+        words: of the command line, such as `low=hppo,pdqn`.
+        train: trains with the words of one run and returns its row.
+        file: the csv file.
+        run: its columns that name a run.
 
     Raises:
         SystemExit: there is no word, or one is wrong.
@@ -315,14 +315,15 @@ def train_all(words: Sequence[str], train: Callable[[Sequence[str]], Mapping[str
     if wrong is not None or not words:
         raise SystemExit(f"give words such as low=hppo,pdqn{'' if wrong is None else f', not {wrong}'}")
     names, values = zip(*(word.split("=", 1) for word in words), strict=True)
-    for chosen in itertools.product(*(each.split(",") for each in values)):
+    # A comma inside brackets separates no values, as in low.hidden_dims=[64,64].
+    for chosen in itertools.product(*(re.split(r",(?![^\[]*\])", each) for each in values)):
         try:
             row = train([f"{name}={value}" for name, value in zip(names, chosen, strict=True)])
         except ConfigError as error:
             raise SystemExit(str(error)) from error
-        add(row, file)
+        add_to_tables(file.parent, {file.stem: [row]}, run, steps="steps")
     print(f"{file}: rows added; study.py tabulates them")
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(lambda: train_all(sys.argv[1:], train, FILE)))
+    sys.exit(exit_code(lambda: train_all(sys.argv[1:], train, FILE, RUN)))

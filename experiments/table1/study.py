@@ -51,6 +51,7 @@ BUDGETS = (4_000, 20_000, 100_000, 400_000, 4_000_000, 24_000_000)  # presses af
 NEAR = 1.1  # an evaluation counts for a budget that differs by no more than this factor
 TABLES = ("results", "curves", "efficiency")
 CELL = ("low", "boat", "reward")
+OF_STUDY = {"env": ("boatdock",), "high": ("none",), "low": LEARNERS}
 LEARNERS = ("hppo", "pdqn", "hyar", "qpamdp", "dlpa")
 HUMAN_COLOUR, INK, FAINT = "#D98200", "#2b2b2b", "#8c8c8c"
 
@@ -84,8 +85,6 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
     efficiency: Rows = []
     for run in runs:
         summary = run.summary
-        if summary["env"] != "boatdock" or summary["high"] != "none" or summary["low"] not in LEARNERS:
-            continue
         name = {
             "low": summary["low"],
             "boat": summary["controller"],
@@ -416,7 +415,7 @@ def human_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        new = gathered(folders, gather, env=("boatdock",))
+        new = gathered(folders, gather, **OF_STUDY)
         add_to_tables(HERE, new, (*CELL, "seed"), steps="presses")
     tables = {name: standing_rows(HERE / f"{name}.csv") for name in TABLES}
     stored = read_csv(HERE / "results.csv")

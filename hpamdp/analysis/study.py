@@ -98,7 +98,7 @@ def gathered(folders: Iterable[Path | str], gather: Callable[[Sequence[Run]], T]
 
 
 def _fault_in_summary(run: Run, of_study: Mapping[str, Collection[Any]]) -> str | None:
-    """Return why a run is none of a study, or None."""
+    """Return why a run does not belong to a study, or None."""
     for name, allowed in of_study.items():
         if run.summary.get(name) not in [*allowed]:
             return f"{name}={run.summary.get(name)}, but runs of this study have {' or '.join(map(str, allowed))}"
@@ -109,7 +109,7 @@ def _fault_in_summary(run: Run, of_study: Mapping[str, Collection[Any]]) -> str 
 
 
 def _fault_in_files(run: Run, gather: Callable[[Sequence[Run]], object]) -> str | None:
-    """Return why the files of a run cannot be read, or None."""
+    """Return why a study cannot read a run, or None."""
     try:
         if not run.evaluations():
             return "metrics.csv is missing or has no evaluations"
@@ -118,8 +118,8 @@ def _fault_in_files(run: Run, gather: Callable[[Sequence[Run]], object]) -> str 
         return f"has no {error.args[0]}, as runs of this study have"
     except OSError as error:
         return file_and_reason(error)
-    except Exception as error:  # whatever is wrong in a damaged file
-        return f"is damaged: {type(error).__name__}: {first_line(error)}"
+    except Exception as error:  # such as a text for a number in a damaged file
+        return f"cannot be read by this study: {type(error).__name__}: {first_line(error)}"
     return None
 
 
@@ -264,18 +264,17 @@ def add_to_tables(
     lengths_differ: bool = False,
     sorts: bool = True,
 ) -> None:
-    """Add rows to csv files, in the place of those of repeated runs; sort them by these columns, which name a run.
-
-    In a column with numbers and texts, numbers come first.
+    """Add rows to csv files. They replace the rows of the runs that they repeat.
 
     Args:
         folder: of the files.
         tables: the new rows by the names of the files. The first table has one row for each run.
-        names: the columns.
-        steps: the first table's column with the steps of a run.
+        names: the columns that name a run.
+        steps: the first table's column with the steps of a run. Without it, lengths are not compared.
         lengths_differ: whether the seeds of a cell may have different steps. Else a shorter run, such as a trial, is
             refused, which would join the cell's mean.
-        sorts: if False, stored rows stay in their order, and the new ones follow.
+        sorts: whether to sort the rows by `names`, numbers before texts. Else stored rows stay in their order, and the
+            new ones follow.
 
     Raises:
         SystemExit: the first table has no new rows, has a run twice, or has a run whose steps are not those of the run
@@ -302,7 +301,9 @@ def add_to_tables(
     merged = {}
     for table, new in tables.items():
         rows = with_repeats_replaced(stored[table], new, names)
-        merged[table] = _sorted_by(rows, names) if sorts else rows
+        if sorts:
+            rows.sort(key=lambda row: [(isinstance(row[name], str), row[name]) for name in names])
+        merged[table] = rows
     write_tables(folder, merged)
 
 
@@ -317,10 +318,6 @@ def _refuse_other_lengths(rows: Rows, names: Sequence[str], steps: str) -> None:
         if len(lengths) > 1:
             listed = " and ".join(f"{length:,}" for length in lengths)
             raise SystemExit(f"{', '.join(map(str, cell))}: has runs of {listed} steps; nothing was written")
-
-
-def _sorted_by(rows: Rows, names: Sequence[str]) -> Rows:
-    return sorted(rows, key=lambda row: [(isinstance(row[name], str), row[name]) for name in names])
 
 
 def first_at(rows: Rows, column: str, level: float) -> dict[str, Any] | None:

@@ -185,7 +185,7 @@ def _is_problem_class(env: Any) -> bool:
 def _words_of_name(name: str) -> list[str]:
     own = plain_name(name)
     if name.startswith("hpamdp/"):
-        if "-v" in name and name not in gymnasium.registry:
+        if re.search(r"-v\d+$", name) and name.lower() not in {each.lower() for each in gymnasium.registry}:
             ids = [each for each in gymnasium.registry if each.startswith("hpamdp/")]
             raise ConfigError(f"{name}: {no_such('problem with a Gymnasium id', name, ids)}")
         names = [file.stem for file in (conf_dir() / "env").glob("*.yaml") if plain_name(file.stem) == own]

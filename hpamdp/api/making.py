@@ -22,7 +22,7 @@ from hpamdp.env.registration import register
 from hpamdp.messages import first_line, warn
 from hpamdp.run.assemble import grouped
 from hpamdp.run.compatibility import lack_of, settings_without_effect
-from hpamdp.settings import Settings
+from hpamdp.settings import SettingError, Settings
 
 
 class _Sizes(Settings):
@@ -85,7 +85,7 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         A `gymnasium.Env`, or a `gymnasium.vector.VectorEnv` if `num_envs` is given.
 
     Raises:
-        ConfigError: there is no such id, or a setting is wrong or given twice.
+        ConfigError: there is no such id or device, a package is missing, or a setting is wrong or given twice.
 
     Example:
         >>> import hpamdp
@@ -109,17 +109,25 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         if num_envs is None:
             return gymnasium.make(env_id, **own)
         return gymnasium.make_vec(env_id, num_envs=checked.num_envs, **own)
-    except (gymnasium.error.Error, ValueError, ImportError) as error:
-        raise ConfigError(f"{env_id}: {first_line(error)}") from error
-    except TypeError as error:
+    except (gymnasium.error.Error, ValueError, ModuleNotFoundError, TypeError) as error:
+        complaint = _complaint(error, env_id)
+        if complaint is None:
+            raise
+        raise ConfigError(f"{env_id}: {complaint}") from error
+
+
+def _complaint(error: Exception, env_id: str) -> str | None:
+    """Return what a user gave wrong, in one line; None for other errors, whose traceback says more."""
+    if isinstance(error, TypeError):
         wrong_class = re.match(r"options: must be \w+, not \w+", str(error))
         if wrong_class is not None:
-            raise ConfigError(f"{env_id}: {wrong_class.group()}") from error
+            return wrong_class.group()
         unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
         if unknown is None:
-            raise
-        name = unknown.group(1)
-        raise ConfigError(f"{env_id}: {name}: {no_such('argument', name, _arguments_of(env_id))}") from error
+            return None
+        return f"{unknown.group(1)}: {no_such('argument', unknown.group(1), _arguments_of(env_id))}"
+    is_refusal = isinstance(error, gymnasium.error.Error | SettingError | ModuleNotFoundError)
+    return first_line(error) if is_refusal or env_id.startswith("hpamdp/") else None
 
 
 def _arguments_of(env_id: str) -> list[str]:

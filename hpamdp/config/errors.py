@@ -64,8 +64,9 @@ def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: st
 
 
 def _plain(value: Any) -> Any:
-    """Return NumPy's numbers as Python's, and what else JSON does not know as text."""
-    return value.item() if isinstance(value, np.number) else str(value)
+    """Return NumPy's numbers and truth values as Python's, and what else JSON does not know as text."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    return plain if isinstance(plain, bool | int | float) else str(value)
 
 
 def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str, where: Where) -> None:

@@ -126,7 +126,9 @@ def _written(name: str, value: Any) -> str:
     if isinstance(value, Mapping):
         for entry in value:
             if not is_name(entry):
-                raise ConfigError(f"{name}: {as_code(entry)} names an entry; give a word of letters, digits and _.+-")
+                raise ConfigError(
+                    f"{name}: the name {as_code(entry)} of an entry must be a text of letters, digits, _, . and -"
+                )
         return f"{{{','.join(f'{entry}:{_written(name, item)}' for entry, item in value.items())}}}"
     raise ConfigError(f"{name}={as_code(value)}: must be a number, a text, or a list or mapping of these")
 

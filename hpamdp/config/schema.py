@@ -37,7 +37,7 @@ Device = Annotated[str, AfterValidator(_check_device)]
 
 
 def usable_device(name: str) -> torch.device:
-    """Return the device with a name that `Device` allows.
+    """Return the device of a setting; `auto` is CUDA if there is a device.
 
     Raises:
         ConfigError: this machine does not have the device.

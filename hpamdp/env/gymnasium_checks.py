@@ -109,7 +109,7 @@ def check_render_mode(name: str, render_mode: Any) -> None:
     """Refuse a way of drawing but None and `rgb_array`.
 
     Raises:
-        SettingError: the message names the environment.
+        SettingError: `render_mode` is neither None nor `rgb_array`.
     """
     if render_mode not in (None, "rgb_array"):
         raise SettingError(f"{name}: render_mode={render_mode!r}, but must be None or rgb_array")

@@ -33,7 +33,7 @@ from hpamdp.messages import one_line, reason_of
 OWN_MAPS = ("simple", "hard")
 _FOLDER = Path(__file__).resolve().parent / "maps"
 _MAX_BYTES = 2**20
-_SHORTEST_EDGE = 1e-6  # of a wall, in units of the square's side; float32 tells no shorter ones apart
+_SHORTEST_EDGE = 1e-6  # of a wall, in units of the square's side; shorter ones are lost to rounding in float32
 _MAX_CORNERS = 2_000  # of all polygons: the rules compare every ball with every edge
 
 Coordinate = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -147,7 +147,7 @@ def _check(found: PinballMap) -> None:
     for number, polygon in enumerate(found.polygons):
         for place, (corner, following) in enumerate(itertools.pairwise((*polygon, polygon[0]))):
             if math.dist(corner, following) < _SHORTEST_EDGE:
-                raise MapError(f"polygons[{number}][{place}]: is the same corner as the next one")
+                raise MapError(f"polygons[{number}][{place}]: is less than {_SHORTEST_EDGE:g} from the next corner")
     x, y, radius = found.target
     if not (radius <= x <= 1.0 - radius and radius <= y <= 1.0 - radius):
         raise MapError(f"target: the circle around ({x:g}, {y:g}) with radius {radius:g} must lie inside the square")

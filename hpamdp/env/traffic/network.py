@@ -15,7 +15,7 @@ from platformdirs import user_cache_path
 
 from hpamdp.env.errors import ProblemError
 from hpamdp.files import replacing
-from hpamdp.messages import one_line, reason_of
+from hpamdp.messages import file_and_reason, one_line, reason_of
 from hpamdp.settings import SettingError
 
 FOLDER = Path(__file__).resolve().parent / "networks"
@@ -109,13 +109,16 @@ def run_tool(name: str, *arguments: str) -> None:
     """Run one of SUMO's programs.
 
     Raises:
-        ProblemError: it failed; the message is its own first line.
+        ProblemError: it cannot be started, or it failed; then the message is its own first line.
     """
     import sumo
 
     program = os.path.join(sumo.SUMO_HOME, "bin", name)
     environment = {**os.environ, "SUMO_HOME": sumo.SUMO_HOME}
-    done = subprocess.run([program, *arguments], env=environment, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run([program, *arguments], env=environment, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise ProblemError(f"SUMO's {name} cannot be started: {file_and_reason(error)}") from error
     if done.returncode:
         said = done.stderr.strip() or done.stdout.strip() or f"exit code {done.returncode}"
         raise ProblemError(f"SUMO's {name} failed: {one_line(said)}")
@@ -134,9 +137,9 @@ def network_file(network: str) -> Path:
     made_of = b"".join(file.read_bytes() for file in files.values()) + version("eclipse-sumo").encode()
     folder = user_cache_path("hpamdp") / "traffic"
     made = folder / f"{network}-{hashlib.sha256(made_of).hexdigest()[:16]}.net.xml"
-    if made.exists():
-        return made
     try:
+        if made.exists():
+            return made
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(made.with_suffix(".lock")):
             if not made.exists():

@@ -30,7 +30,7 @@ from hpamdp.settings import FromList, SettingError, Settings
 
 _HASH_SEED = 0  # of the factors of the hash, which are the same in every run
 _LARGEST_FACTOR = 2**40
-_COARSEST, _FINEST = 1e-3, 1e6  # resolutions; observations are of order 1
+_COARSEST, _FINEST = 1e-12, 1e6  # resolutions in float32; finer cells of observations above 1e6 overflow int64
 
 
 def _check_resolution(resolution: float | tuple[float, ...]) -> float | tuple[float, ...]:
@@ -38,7 +38,7 @@ def _check_resolution(resolution: float | tuple[float, ...]) -> float | tuple[fl
     if not any(numbers):
         raise ValueError("must have a number above 0, or all states are one cell")
     if not all(number == 0.0 or _COARSEST <= number <= _FINEST for number in numbers):
-        raise ValueError(f"must be from {_COARSEST:g} to {_FINEST:g}, or 0 in a list")
+        raise ValueError(f"must be from {_COARSEST:g} to {_FINEST:g}; in a list, 0 leaves an entry out")
     return resolution
 
 
@@ -101,14 +101,15 @@ class VisitTable(nn.Module):
         self.counts.index_add_(0, places, torch.ones_like(places))
 
     def num_cells(self) -> float:
-        """Return about how many cells were visited; those that share a slot are estimated.
+        """Return an estimate of how many cells were visited, which corrects for cells that share a slot.
 
         Source: linear counting of Whang, Vander-Zanden and Taylor, *A Linear-Time Probabilistic Counting Algorithm for
-        Database Applications*, 1990. If all slots are taken, the number is a lower bound.
+        Database Applications*, 1990. If all slots are taken, the number is too low.
         """
         num_slots = len(self.counts)
-        num_empty = num_slots - int(self.counts.count_nonzero())
-        return float(round(num_slots * math.log(num_slots / max(num_empty, 1))))
+        num_taken = int(self.counts.count_nonzero())
+        estimate = round(num_slots * math.log(num_slots / max(num_slots - num_taken, 1)))
+        return float(max(estimate, num_taken))
 
 
 class Counts(RewardsNewStates):
