@@ -51,8 +51,8 @@ BUDGETS = (4_000, 20_000, 100_000, 400_000, 4_000_000, 24_000_000)  # presses af
 NEAR = 1.1  # an evaluation counts for a budget that differs by no more than this factor
 TABLES = ("results", "curves", "efficiency")
 CELL = ("low", "boat", "reward")
-OF_STUDY = {"env": ("boatdock",), "high": ("none",), "low": LEARNERS}
 LEARNERS = ("hppo", "pdqn", "hyar", "qpamdp", "dlpa")
+OF_STUDY = {"env": ("boatdock",), "high": ("none",), "low": LEARNERS}
 HUMAN_COLOUR, INK, FAINT = "#D98200", "#2b2b2b", "#8c8c8c"
 
 # The paper's Table 1: mean and standard deviation, congruent and incongruent.
