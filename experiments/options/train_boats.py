@@ -6,7 +6,6 @@ python experiments/options/train_boats.py WORDS    trains with these words of th
 
 from __future__ import annotations
 
-import csv
 import json
 import subprocess
 import sys
@@ -15,9 +14,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hpamdp.analysis.study import add_to_tables
 from hpamdp.messages import exit_code
 
-FILE = Path(__file__).resolve().parent / "boats.csv"
+HERE = Path(__file__).resolve().parent
 FIGURES = (
     "score",
     "success",
@@ -28,7 +28,6 @@ FIGURES = (
     "frames",
     "cpu_s",
 )
-COLUMNS = ("words", "seed", "score", "ceiling", "share", *FIGURES[1:])
 COMMON = ["film=false", "eval.every=500000"]
 
 
@@ -50,22 +49,12 @@ def row_of(summary: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
     return {"words": " ".join(words), "seed": summary["seed"], "ceiling": round(ceiling, 4), "share": share, **figures}
 
 
-def add(row: Mapping[str, Any]) -> None:
-    """Append a row to the file."""
-    is_new = not FILE.exists()
-    with FILE.open("a", newline="") as stream:
-        writer = csv.DictWriter(stream, COLUMNS, restval="")
-        if is_new:
-            writer.writeheader()
-        writer.writerow(row)
-
-
 def main(words: Sequence[str]) -> None:
     """Train and add the row."""
     if not words:
         raise SystemExit("give words of the command line, such as high=linucb low=hppo")
-    add(train(words))
-    print(f"{FILE}: a row added; study.py tabulates it")
+    add_to_tables(HERE, {"boats": [train(words)]}, ("words", "seed"), sorts=False)
+    print(f"{HERE / 'boats.csv'}: a row added; study.py tabulates it")
 
 
 if __name__ == "__main__":
