@@ -72,7 +72,7 @@ def standing(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
 
 
 def boats() -> dict[tuple[str, str], Rows]:
-    """Return the runs with more boats, by `BOATS` and selector, and those that change boats or keep them."""
+    """Return the runs with more boats, by `BOATS` and selector, and the runs that change boats or keep them."""
     rows = read_csv(HERE / "boats.csv")
     for row in rows:
         words = row["words"].split()
@@ -99,7 +99,7 @@ def by_pair(name: str) -> dict[tuple[str, str], Rows]:
 
 
 def boats_table(compares_changes: bool) -> str:
-    """Return a line for each selector over three boats, or for boats that may be changed and those that are kept."""
+    """Return a line for each selector over three boats, or for agents that change boats and agents that keep them."""
     head = "| {} | n | score | ceiling | of it | changes an episode | planner's | weighted | success | presses | CPU |"
     lines = [head.format("" if compares_changes else "selector"), "|---" * 11 + "|"]
     for (boats_word, name), rows in boats().items():
