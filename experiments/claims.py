@@ -1519,11 +1519,11 @@ def options() -> list[Claim]:
         Claim(
             page("options"),
             "Agents that may change them reach {changing:.0f} % of the ceiling with each of {seeds:word} seeds. "
-            "Of the agents that keep their boat, {failed:word} of {seeds:word} ends at {kept_lowest:.0f} %, so the gain "
-            "is unclear. Crossing: with {seeds:word} seeds each, {good} of {pairs} pairs of a learner and a "
-            "selector reach {bar} % of the best return with every seed. DLPA under the actor, and Q-PAMDP under the actor "
-            "and the option-critic, do not. Rooms: H-PPO and P-DQN reach it under all three selectors. Goal: a "
-            "selector above H-PPO makes no clear difference.",
+            "Of the agents that keep their boat, {failed:word} of {seeds:word} ends at {kept_lowest:.0f} %, so "
+            "the gain is unclear. Crossing: with {seeds:word} seeds each, {good} of {pairs} pairs of a learner "
+            "and a selector reach {bar} % of the best return with every seed. DLPA under the actor, and Q-PAMDP "
+            "under the actor and the option-critic, do not. Rooms: H-PPO and P-DQN reach it under all three "
+            "selectors. Goal: a selector above H-PPO makes no clear difference.",
             numbers,
             holds=below == said
             and all(seeds(runs) == numbers["seeds"] for runs in crossing.values())
@@ -1534,10 +1534,10 @@ def options() -> list[Claim]:
         ),
         Claim(
             page("options"),
-            "The ceiling gains {ceiling:.2f} if a change costs 0.1 s of fuel. Agents that may change controllers reach "
-            "{changing:.1f} % of the ceiling, with each of {seeds:word} seeds. Of the agents that keep their boat, two "
-            "reach {kept_highest:.0f} % and {failed:word} {kept_lowest:.0f} %: it chooses the controller no better than "
-            "by chance. So the difference is unclear.",
+            "The ceiling gains {ceiling:.2f} if a change costs 0.1 s of fuel. Agents that may change controllers "
+            "reach {changing:.1f} % of the ceiling, with each of {seeds:word} seeds. Of the agents that keep "
+            "their boat, two reach {kept_highest:.0f} % and {failed:word} {kept_lowest:.0f} %: it chooses the "
+            "controller no better than by chance. So the difference is unclear.",
             numbers,
             holds=not gain.is_clear and min(column(kept, "oracle_agreement")) < 0.5,
         ),
