@@ -7,7 +7,7 @@ import torch
 from scripts import load_script
 
 from hpamdp import keys
-from hpamdp.analysis.study import read_csv
+from hpamdp.analysis.study import read_csv, write_tables
 
 PEERS = Path(__file__).resolve().parent.parent / "experiments" / "peers"
 
@@ -107,8 +107,14 @@ def test_the_tables_have_a_line_for_each_learner_with_means_over_seeds_and_steps
     assert study.speed_table(rows).splitlines()[-1] == "| hpamdp 1 | pdqn | 100, 100 | 100 |"
 
 
-def test_curves_of_trainings_of_different_lengths_are_refused():
+def test_a_folder_with_trainings_of_different_lengths_or_with_a_run_twice_is_refused(tmp_path):
     study = module("study")
-    longer = row(301, 0.0, 0, 0.0) | {"limit_s": 900.0}
-    with pytest.raises(ValueError, match=r"limit_s=\[600\.0, 900\.0\]: must be the same"):
-        study.scores_table([row(300, 0.0, 0, 0.0), longer])
+    run = row(300, 0.0, 0, 0.0)
+    write_tables(tmp_path, {"a": [run], "b": [row(301, 0.0, 0, 0.0) | {"limit_s": 900.0}]})
+    with pytest.raises(
+        SystemExit, match=r"b\.csv: has limit_s=900\.0, and files before it 600\.0; nothing was written"
+    ):
+        study.gather(tmp_path)
+    write_tables(tmp_path, {"b": [run]})
+    with pytest.raises(SystemExit, match="two runs of platform, hpamdp, 1, pdqn, greedy, 300; nothing was written"):
+        study.gather(tmp_path)

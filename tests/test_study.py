@@ -342,6 +342,34 @@ def test_a_shorter_run_with_a_new_seed_does_not_join_a_cell(tmp_path):
     assert len(read_csv(tmp_path / "results.csv")) == 2
 
 
+def test_a_curve_that_is_given_twice_or_is_shorter_than_those_of_its_cell_is_refused(tmp_path):
+    def of_run(seed, last):
+        return [{"boat": "congruent", "seed": seed, "presses": presses} for presses in (0, last)]
+
+    def add(rows):
+        add_to_tables(tmp_path, {"curves": rows}, ("boat", "seed"), steps="presses", of_evaluations=True)
+
+    write_tables(tmp_path, {"curves": of_run(0, 384)})
+    with pytest.raises(SystemExit, match="two runs of congruent, 1; nothing was written"):
+        add(of_run(1, 384) + of_run(1, 200))
+    with pytest.raises(SystemExit, match=r"congruent: has runs of 200 and 384 steps; nothing was written"):
+        add(of_run(1, 200))
+    add(of_run(1, 384))
+    assert read_csv(tmp_path / "curves.csv") == of_run(0, 384) + of_run(1, 384)
+
+
+def test_domains_and_pearl_refuse_a_run_that_is_given_twice(tmp_path, monkeypatch):
+    domains, twice = study("domains"), {**_row("pdqn", 100), "frames": 200}
+    monkeypatch.setattr(domains, "HERE", tmp_path)
+    monkeypatch.setattr(domains, "gathered", lambda *_, **__: ([twice, twice], []))
+    with pytest.raises(SystemExit, match="two runs of goal, pdqn, 200, 100; nothing was written"):
+        domains.main([str(tmp_path)])
+    curve_of_run = read_csv(EXPERIMENTS / "pearl" / "curves.csv")[:2]
+    write_tables(tmp_path, {"one": curve_of_run, "two": curve_of_run})
+    with pytest.raises(SystemExit, match=r"two runs of pinball, .*; nothing was written"):
+        study("pearl").gather(tmp_path)
+
+
 def test_nothing_is_written_if_there_are_no_new_runs(tmp_path):
     write_tables(tmp_path, {"results": [_row("pdqn", 0)]})
     with pytest.raises(SystemExit, match="no finished runs; nothing was written"):

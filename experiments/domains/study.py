@@ -30,6 +30,7 @@ from hpamdp.analysis.study import (
     interquartile_mean,
     mean_interval,
     read_csv,
+    refuse_repeats,
     spread,
     standing_rows,
     with_enough_seeds,
@@ -305,6 +306,7 @@ def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
         results, curves = gathered(folders, gather, env=ENVIRONMENTS)
+        refuse_repeats(results, KEY, KEY)
         tables = {"results": results, "curves": curves}
         stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in tables}
         write_tables(HERE, {name: merged(stored[name], rows) for name, rows in tables.items()})

@@ -21,9 +21,9 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
+    merged_tables,
     read_csv,
     spread,
-    with_repeats_replaced,
     write_tables,
 )
 from hpamdp.env.boatdock.harbour import CONTROLLERS
@@ -212,8 +212,15 @@ def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
         new = gathered(folders, gather, env=("boatdock",))
-        stored = {name: read_csv(HERE / f"{name}.csv") for name in new}
-        write_tables(HERE, {name: with_repeats_replaced(stored[name], rows, RUN[name]) for name, rows in new.items()})
+        merged = {}
+        for name in ("curves", "long"):
+            if new[name]:
+                merged |= merged_tables(
+                    HERE, {name: new[name]}, RUN[name], steps="presses", of_evaluations=True, sorts=False
+                )
+        if new["augment"]:  # whose runs end at people's score
+            merged |= merged_tables(HERE, {"augment": new["augment"]}, RUN["augment"], lengths_differ=True, sorts=False)
+        write_tables(HERE, merged)
     curves = read_csv(HERE / "curves.csv")
     plain = [row for row in curves if not row["variant"]]
     draw(plain, HERE / "curves.png")

@@ -22,6 +22,7 @@ from hpamdp.analysis.study import (
     groups,
     mean_interval,
     read_csv,
+    refuse_repeats,
     spread,
     with_repeats_replaced,
     write_tables,
@@ -41,16 +42,16 @@ def gather(folder: Path) -> Rows:
     """Return the rows of all curves in a folder.
 
     Raises:
-        SystemExit: the folder has no curves, or a file is none.
+        SystemExit: the folder has no curves, a file is none, or two files are of one run.
     """
     rows: Rows = []
     for file in sorted(folder.glob("*.csv")):
         if not is_curve(file):
             raise SystemExit(f"{file}: is no curve of this study; nothing was written")
-        of_file = read_csv(file)
-        rows += of_file
+        rows += read_csv(file)
     if not rows:
         raise SystemExit(f"{folder}: has no curves; nothing was written")
+    refuse_repeats(rows, (*LEARNER, "seed", "steps"), (*LEARNER, "seed"))
     return rows
 
 

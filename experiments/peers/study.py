@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from hpamdp.analysis.study import Rows, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, groups, read_csv, refuse_repeats, spread, write_tables
 from hpamdp.figure_style import FAINT, INK, LEARNER_COLOURS, STYLE
 from hpamdp.messages import exit_code
 
@@ -31,15 +31,25 @@ NAME = ("problem", "library", "version", "learner", "acts")
 
 
 def gather(folder: Path) -> dict[str, Rows]:
-    """Return the rows of `curves` and of `speed`, in the order of problems, libraries and seeds."""
+    """Return the rows of `curves` and of `speed`, in the order of problems, libraries and seeds.
+
+    Raises:
+        SystemExit: a file is not of this study or ends after another CPU time, or two are of one run.
+    """
 
     def rows_of(files: Sequence[Path]) -> Rows:
-        rows = []
+        rows: Rows = []
         for file in files:
             of_file = read_csv(file)
-            if any(row.get("problem") not in PROBLEMS for row in of_file):
+            if not of_file or any(row.get("problem") not in PROBLEMS for row in of_file):
                 raise SystemExit(f"{file}: is no file of this study; nothing was written")
             rows += of_file
+            if of_file[0]["limit_s"] != rows[0]["limit_s"]:
+                raise SystemExit(
+                    f"{file}: has limit_s={of_file[0]['limit_s']}, and files before it {rows[0]['limit_s']}; "
+                    "nothing was written"
+                )
+        refuse_repeats(rows, (*NAME, "seed", "cpu_s"), (*NAME, "seed"))
         order = list(PROBLEMS)
         return sorted(rows, key=lambda row: (order.index(row["problem"]), row["library"], row["learner"], row["seed"]))
 
@@ -50,15 +60,8 @@ def gather(folder: Path) -> dict[str, Rows]:
 
 
 def limit_of(curves: Rows) -> float:
-    """Return the CPU seconds of training after which all runs end.
-
-    Raises:
-        ValueError: the runs have different limits.
-    """
-    limits = {float(row["limit_s"]) for row in curves}
-    if len(limits) != 1:
-        raise ValueError(f"limit_s={sorted(limits)}: must be the same in all curves")
-    return limits.pop()
+    """Return the CPU seconds of training after which all runs end."""
+    return float(curves[0]["limit_s"])
 
 
 def at(run: Rows, cpu_s: float) -> dict[str, float]:

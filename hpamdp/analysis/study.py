@@ -255,22 +255,30 @@ def _name_of(row: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ...]:
     return tuple(str(row[name]) for name in names)
 
 
-def add_to_tables(
+def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str], **checks: Any) -> None:
+    """Add rows to csv files, or nothing if one is refused: write what `merged_tables` returns."""
+    write_tables(folder, merged_tables(folder, tables, names, **checks))
+
+
+def merged_tables(
     folder: Path,
     tables: Mapping[str, Rows],
     names: Sequence[str],
     *,
     steps: str = "frames",
+    of_evaluations: bool = False,
     lengths_differ: bool = False,
     sorts: bool = True,
-) -> None:
-    """Add rows to csv files. They replace the rows of the runs that they repeat.
+) -> dict[str, Rows]:
+    """Return the rows of csv files with new rows, which replace those of the runs that they repeat.
 
     Args:
         folder: of the files.
         tables: the new rows by the names of the files. The first table has one row for each run.
         names: the columns that name a run.
         steps: the first table's column with the steps of a run. Without it, lengths are not compared.
+        of_evaluations: whether the first table has a row for each evaluation instead, in order. `steps` is then its
+            column with the steps before the evaluation.
         lengths_differ: whether the seeds of a cell may have different steps. Else a shorter run, such as a trial, is
             refused, which would join the cell's mean.
         sorts: whether to sort the rows by `names`, numbers before texts. Else stored rows stay in their order, and the
@@ -278,17 +286,16 @@ def add_to_tables(
 
     Raises:
         SystemExit: the first table has no new rows, has a run twice, or has a run whose steps are not those of the run
-            that it repeats, or of its cell. Then nothing is written.
+            that it repeats, or of its cell.
     """
     first, *_ = tables
     if not tables[first]:
         raise SystemExit("the given folders have no finished runs; nothing was written")
-    twice = next((run for run, rows in groups(tables[first], *names).items() if len(rows) > 1), None)
-    if twice is not None:
-        raise SystemExit(f"the given folders have two runs of {', '.join(map(str, twice))}; nothing was written")
+    refuse_repeats(tables[first], (*names, steps) if of_evaluations else names, names)
     stored = {table: read_csv(folder / f"{table}.csv") for table in tables}
-    steps_of = {_name_of(row, names): row.get(steps) for row in stored[first]}
-    for row in tables[first]:
+    steps_of = {_name_of(row, names): row.get(steps) for row in _ends(stored[first], names)}
+    new_runs = _ends(tables[first], names)
+    for row in new_runs:
         run = _name_of(row, names)
         of_new, before = row.get(steps), steps_of.get(run)
         if before is not None and of_new != before:
@@ -297,14 +304,36 @@ def add_to_tables(
                 "was written. Delete its rows to replace it"
             )
     if not lengths_differ:
-        _refuse_other_lengths(with_repeats_replaced(stored[first], tables[first], names), names, steps)
+        _refuse_other_lengths(with_repeats_replaced(_ends(stored[first], names), new_runs, names), names, steps)
     merged = {}
     for table, new in tables.items():
         rows = with_repeats_replaced(stored[table], new, names)
         if sorts:
             rows.sort(key=lambda row: [(isinstance(row[name], str), row[name]) for name in names])
         merged[table] = rows
-    write_tables(folder, merged)
+    return merged
+
+
+def refuse_repeats(rows: Rows, row_names: Sequence[str], run_names: Sequence[str]) -> None:
+    """Refuse rows of which two have the same name.
+
+    Args:
+        rows: the rows.
+        row_names: the columns that name a row.
+        run_names: the columns that name its run.
+
+    Raises:
+        SystemExit: there are two.
+    """
+    twice = next((same[0] for same in groups(rows, *row_names).values() if len(same) > 1), None)
+    if twice is not None:
+        run = ", ".join(_name_of(twice, run_names))
+        raise SystemExit(f"the given folders have two runs of {run}; nothing was written")
+
+
+def _ends(rows: Rows, names: Sequence[str]) -> Rows:
+    """Return the last row of each run."""
+    return [of_run[-1] for of_run in groups(rows, *names).values()]
 
 
 def _refuse_other_lengths(rows: Rows, names: Sequence[str], steps: str) -> None:
