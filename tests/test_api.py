@@ -15,6 +15,7 @@ import pytest
 import torch
 import yaml
 from gymnasium import spaces
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
@@ -280,6 +281,7 @@ def test_an_evaluation_returns_means_or_one_entry_for_each_episode(platform_agen
         (np.full(9, np.nan), "entry 0 of the observation is not finite"),
         ("left", "must hold 9 numbers, but is 'left'"),
         (None, "must hold 9 numbers"),
+        (TensorDict({"observation": torch.zeros(2, 9)}, [2]), "must hold 9 numbers, but is TensorDict"),
     ],
 )
 def test_a_wrong_observation_is_refused_with_its_shape(platform_agent, observation, message):

@@ -469,6 +469,17 @@ def test_a_problem_without_pictures_or_player_says_so():
         env.scripted_action(env.state)
 
 
+@pytest.mark.parametrize("seed", [1.5, "a", True, -1])
+def test_a_seed_that_is_no_whole_number_of_at_least_0_is_refused(seed):
+    env = PlatformEnv(2, seed=3)
+    first = env.reset()[keys.OBSERVATION]
+    for method in (env.set_seed, env.seed_evaluation):
+        with pytest.raises(ValueError, match=f"seed={seed!r}: must be a whole number of at least 0"):
+            method(seed)
+    env.set_seed(np.int64(3))
+    assert torch.equal(env.reset()[keys.OBSERVATION], first)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("problem", POINTS)
 def test_compiled_rules_play_as_the_others(problem):

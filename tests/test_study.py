@@ -406,6 +406,47 @@ def test_a_run_of_another_study_and_a_damaged_one_are_named_and_left_out(tmp_pat
     ]
 
 
+def test_a_run_on_another_problem_of_gymnasium_does_not_join_those_on_hybrid_shoot(tmp_path, capsys):
+    leave_run(tmp_path / "other")
+    change_summary(tmp_path / "other", env="gymnasium")
+    (tmp_path / "other/config.yaml").write_text("low: {}\nenv: {entry_point: 'other:Env'}\n")
+    with pytest.raises(SystemExit, match="no finished runs of this study; nothing was written"):
+        gathered([tmp_path], study("hybrid_control").gather)
+    assert "env.entry_point=other:Env, but runs of this study have hybrid_shoot" in capsys.readouterr().err
+
+
+def test_options_refuses_cells_of_runs_with_different_settings():
+    options = study("options")
+    rows = [{"low": "pdqn", "high": "ucb", "seed": seed, "sharing": "shared"} for seed in (100, 101, 102)]
+    assert options.standing(rows, options.PAIR, ["sharing"]) == {("pdqn", "ucb"): rows}
+    with pytest.raises(SystemExit, match="pdqn, ucb: has runs with different sharing"):
+        options.standing([*rows, rows[0] | {"sharing": "per_option"}], options.PAIR, ["sharing"])
+
+
+@pytest.mark.parametrize(
+    ("script", "words", "complaint"),
+    [
+        ("train_rooms", ["high=actor", "low=hppo,hpo"], "low=hpo: no such choice.*no run was trained"),
+        ("train_crossing", ["high=actor,acto", "low=hppo"], "high=acto: no such choice.*no run was trained"),
+        ("train_rooms", ["low"], "give words such as low=hppo,pdqn, not low"),
+        ("train_boats", ["low=hppo"], "high=... and low=... among them; nothing was trained"),
+    ],
+)
+def test_scripts_of_options_check_all_runs_before_they_train(script, words, complaint, monkeypatch):
+    monkeypatch.syspath_prepend(str(EXPERIMENTS / "options"))
+    module = load_script(EXPERIMENTS / "options" / f"{script}.py")
+
+    def train(given):
+        raise AssertionError(f"trains {given}")
+
+    with pytest.raises(SystemExit, match=f"(?s){complaint}"):
+        if script == "train_boats":
+            monkeypatch.setattr(module, "train", train)
+            module.main(words)
+        else:
+            module.train_all(words, module.RECIPE, train, module.FILE, module.RUN)
+
+
 GATHERING = [
     file.parent.name
     for file in sorted(EXPERIMENTS.glob("*/study.py"))

@@ -35,6 +35,7 @@ from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 RUN = ("problem", "variant", "seed")
+SHOOT = "hybrid_shoot:HybridShootEnv"
 PROBLEMS = {"lunar_lander": "Hybrid LunarLander", "gymnasium": "Hybrid-Shoot"}
 # What a score is compared with: Gymnasium's bar, and the best possible return.
 BARS = {"lunar_lander": 200.0, "gymnasium": 34.7}
@@ -73,8 +74,14 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
 
 
 def variant(run: Run) -> str:
-    """Return the key of a run's variant in `VARIANTS`."""
+    """Return the key of a run's variant in `VARIANTS`.
+
+    Raises:
+        ValueError: the run is of another problem of Gymnasium.
+    """
     low, env = run.config["low"], run.config["env"]
+    if run.summary["env"] == "gymnasium" and env["entry_point"] != SHOOT:
+        raise ValueError(f"env.entry_point={env['entry_point']}, but runs of this study have {SHOOT}")
     if env.get("action_form", "components") == "auto":
         return "one choice"
     if low["autoregressive"]:

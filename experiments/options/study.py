@@ -37,6 +37,7 @@ ALONE = "none"
 SELECTORS = ("meta_critic", "actor", "option_critic")
 STEPS = 301_056  # of a run on Goal or Hard Goal
 PAIR = ("low", "high")
+SETTINGS = ("sharing", "termination", "option_length")  # columns of the runs on Rooms
 BOATS = "env.boats="
 CHANGED, KEPT = "changed for 0.1 s", "kept"
 
@@ -57,10 +58,18 @@ def gather(runs: Sequence[Run]) -> Rows:
     ]
 
 
-def standing(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
+def standing(rows: Rows, names: Sequence[str], settings: Sequence[str] = ()) -> dict[tuple[Any, ...], Rows]:
     """Return the cells with enough seeds: their runs with new seeds, or the earlier ones if there are too few of them.
 
     Rows on earlier seeds stay in the files.
+
+    Args:
+        rows: of a file.
+        names: columns that name a cell.
+        settings: columns in which the runs of a cell must agree.
+
+    Raises:
+        SystemExit: they do not agree.
     """
     cells = {}
     for cell, of_cell in groups(rows, *names).items():
@@ -68,6 +77,8 @@ def standing(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
         chosen = new if len(new) >= FEWEST_SEEDS else [row for row in of_cell if row["seed"] < FIRST_PROTOCOL_SEED]
         if len(chosen) >= FEWEST_SEEDS:
             cells[cell] = chosen
+            if len(groups(chosen, *settings)) > 1:
+                raise SystemExit(f"{', '.join(cell)}: has runs with different {', '.join(settings)}")
     return cells
 
 
@@ -76,15 +87,17 @@ def boats() -> dict[tuple[str, str], Rows]:
     rows = read_csv(HERE / "boats.csv")
     for row in rows:
         words = row["words"].split()
+        row["settings"] = " ".join(word for word in words if not word.startswith(("seed=", "eval.seed=")))
         selector = next(word.removeprefix("high=") for word in words if word.startswith("high="))
         changes = CHANGED if any(word.startswith("env.switch_cost=") for word in words) else KEPT
-        row["case"] = (BOATS, selector) if any(word.startswith(BOATS) for word in words) else ("", changes)
-    return {case: cell for (case,), cell in standing(rows, "case").items()}
+        is_of_boats = any(word.startswith(BOATS) for word in words)
+        row["of_boats"], row["case"] = (BOATS, selector) if is_of_boats else ("", changes)
+    return standing(rows, ("of_boats", "case"), ("settings",))
 
 
 def on_goal() -> dict[tuple[str, str, str], Rows]:
     """Return the runs on Goal and Hard Goal by domain, learner and selector, those of `domains` without one."""
-    runs = standing(read_csv(HERE / "goal.csv"), "domain", *PAIR)
+    runs = standing(read_csv(HERE / "goal.csv"), ("domain", *PAIR))
     alone = [
         {**row, "low": row["learner"], "high": ALONE}
         for row in standing_rows(DOMAINS)
@@ -95,7 +108,8 @@ def on_goal() -> dict[tuple[str, str, str], Rows]:
 
 def by_pair(name: str) -> dict[tuple[str, str], Rows]:
     """Return the runs on Crossing or Rooms by learner and selector."""
-    return standing(read_csv(HERE / f"{name}.csv"), *PAIR)
+    rows = read_csv(HERE / f"{name}.csv")
+    return standing(rows, PAIR, [column for column in SETTINGS if column in rows[0]])
 
 
 def boats_table(compares_changes: bool) -> str:

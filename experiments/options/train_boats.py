@@ -51,8 +51,8 @@ def row_of(summary: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
 
 def main(words: Sequence[str]) -> None:
     """Train and add the row."""
-    if not words:
-        raise SystemExit("give words of the command line, such as high=linucb low=hppo")
+    if not all(any(word.startswith(f"{level}=") for word in words) for level in ("high", "low")):
+        raise SystemExit("give words of the command line, high=... and low=... among them; nothing was trained")
     add_to_tables(HERE, {"boats": [train(words)]}, ("words", "seed"), sorts=False)
     print(f"{HERE / 'boats.csv'}: a row added; study.py tabulates it")
 

@@ -9,15 +9,15 @@ The words are those of the command line, and all combinations of their values ar
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from train_rooms import DLPA_PLANS, PETS_PLANS, learned_values, make_config, train_all, trained, value_errors
+from train_rooms import DLPA_PLANS, PETS_PLANS, Recipe, learned_values, train_all, trained, value_errors
 
 from hpamdp import keys
+from hpamdp.config.schema import Config
 from hpamdp.messages import exit_code
 from hpamdp.run.assemble import AssembledRun
 
@@ -123,9 +123,11 @@ LEARNERS = {
 }
 
 
-def train(words: Sequence[str]) -> dict[str, Any]:
+RECIPE = Recipe(COMMON, SELECTORS, LEARNERS)
+
+
+def train(config: Config) -> dict[str, Any]:
     """Train one agent and return its row."""
-    config = make_config(words, COMMON, SELECTORS, LEARNERS)
     parts, frames, cpu = trained(config)
     best = torch.tensor(best_values(GAMMA, config.run.agent.option_length or 1), dtype=torch.float64)
     share, success, num_due = evaluate(parts, best)
@@ -173,4 +175,4 @@ def evaluate(parts: AssembledRun, best: torch.Tensor) -> tuple[float, float, tor
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(lambda: train_all(sys.argv[1:], train, FILE, RUN)))
+    sys.exit(exit_code(lambda: train_all(sys.argv[1:], RECIPE, train, FILE, RUN)))

@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -39,6 +39,16 @@ FILE = HERE / "rooms.csv"
 RUN = ("high", "low", "sharing", "termination", "option_length", "seed")
 GAMMA = 0.95
 Settings: TypeAlias = Mapping[str, Sequence[str]]  # words of the command line, by the selector or the learner
+
+
+class Recipe(NamedTuple):
+    """Words of the command line for every run, for each selector and for each learner."""
+
+    common: Sequence[str]
+    selectors: Settings
+    learners: Settings
+
+
 # Settings of every run, before the words of the command line.
 COMMON = [
     "env=rooms",
@@ -183,11 +193,14 @@ LEARNERS = {
 }
 
 
-def make_config(words: Sequence[str], common: Sequence[str], selectors: Settings, learners: Settings) -> Config:
-    """Return the checked config of a run, from settings of all runs, its selector and its learner, and the words."""
+RECIPE = Recipe(COMMON, SELECTORS, LEARNERS)
+
+
+def make_config(words: Sequence[str], recipe: Recipe) -> Config:
+    """Return the checked config of a run: the recipe with the words' selector and learner, changed by the words."""
     chosen = dict(word.split("=", 1) for word in words)
-    own = [*selectors.get(chosen.get("high", ""), []), *learners.get(chosen.get("low", ""), [])]
-    with composed([*common, *own, *words]) as cfg:
+    own = [*recipe.selectors.get(chosen.get("high", ""), []), *recipe.learners.get(chosen.get("low", ""), [])]
+    with composed([*recipe.common, *own, *words]) as cfg:
         return read(cfg)
 
 
@@ -216,9 +229,8 @@ def value_errors(value: torch.Tensor, best: torch.Tensor, num_due: torch.Tensor)
     }
 
 
-def train(words: Sequence[str]) -> dict[str, Any]:
+def train(config: Config) -> dict[str, Any]:
     """Train one agent and return its row."""
-    config = make_config(words, COMMON, SELECTORS, LEARNERS)
     parts, frames, cpu = trained(config)
     length = config.run.agent.option_length
     steps = length or 1
@@ -298,13 +310,14 @@ def values_of_cells(agent: HierarchicalAgent) -> torch.Tensor:
 
 
 def train_all(
-    words: Sequence[str], train: Callable[[Sequence[str]], dict[str, Any]], file: Path, run: Sequence[str]
+    words: Sequence[str], recipe: Recipe, train: Callable[[Config], dict[str, Any]], file: Path, run: Sequence[str]
 ) -> None:
-    """Train with every combination of the words' values, and add a row each to a csv file.
+    """Check all combinations of the words' values, then train with each one and add its row to a csv file.
 
     Args:
         words: of the command line, such as `low=hppo,pdqn`.
-        train: trains with the words of one run and returns its row.
+        recipe: gives the settings that the words do not.
+        train: trains with the config of one run and returns its row.
         file: the csv file.
         run: its columns that name a run.
 
@@ -316,14 +329,19 @@ def train_all(
         raise SystemExit(f"give words such as low=hppo,pdqn{'' if wrong is None else f', not {wrong}'}")
     names, values = zip(*(word.split("=", 1) for word in words), strict=True)
     # A comma inside brackets separates no values, as in low.hidden_dims=[64,64].
-    for chosen in itertools.product(*(re.split(r",(?![^\[]*\])", each) for each in values)):
-        try:
-            row = train([f"{name}={value}" for name, value in zip(names, chosen, strict=True)])
-        except ConfigError as error:
-            raise SystemExit(str(error)) from error
+    combinations = itertools.product(*(re.split(r",(?![^\[]*\])", each) for each in values))
+    try:
+        configs = [
+            make_config([f"{name}={value}" for name, value in zip(names, chosen, strict=True)], recipe)
+            for chosen in combinations
+        ]
+    except ConfigError as error:
+        raise SystemExit(f"{error}\nno run was trained") from error
+    for config in configs:
+        row = train(config)
         add_to_tables(file.parent, {file.stem: [row]}, run, steps="steps")
     print(f"{file}: rows added; study.py tabulates them")
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(lambda: train_all(sys.argv[1:], train, FILE, RUN)))
+    sys.exit(exit_code(lambda: train_all(sys.argv[1:], RECIPE, train, FILE, RUN)))

@@ -258,13 +258,21 @@ class PAMDPEnv(EnvBase):
         """
         return None
 
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Set the seed, and return the next one; see TorchRL's `EnvBase.set_seed`.
+
+        Raises:
+            ValueError: the seed is no whole number of at least 0.
+        """
+        return super().set_seed(None if seed is None else _checked_seed(seed), static_seed)
+
     def seed_evaluation(self, seed: int) -> None:
         """Seed the episodes and the noise of an evaluation, which should differ from those of training with any seed.
 
         The default is `set_seed` with another seed. With random numbers from `counter_rng`, draw them from the streams
         EVALUATION and EVALUATION_NOISE until the next `set_seed`.
         """
-        self.set_seed(seed ^ _EVALUATION)
+        self.set_seed(_checked_seed(seed) ^ _EVALUATION)
 
     def describe(self) -> dict[str, Tensor]:
         """Return facts about the episodes that have just begun, first dimension `N`. A run asks once."""
@@ -507,3 +515,9 @@ def checked_option_names(given: object) -> tuple[str, ...]:
     if len({*given}) < len(given):
         raise ProblemError(f"option_names has a name twice: {', '.join(given)}")
     return tuple(given)
+
+
+def _checked_seed(seed: Any) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"seed={as_code(seed)}: must be a whole number of at least 0")
+    return int(seed)

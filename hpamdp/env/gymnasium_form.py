@@ -163,7 +163,7 @@ class VectorForm(GymnasiumForm):
             vectors = np.array(given, np.float32)
             if self._picture is not None and vectors.shape[-len(self._picture) :] == self._picture:
                 vectors = vectors.reshape(*vectors.shape[: -len(self._picture)], -1)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RuntimeError) as error:  # a TensorDict gives the last
             raise ValueError(
                 f"the observation must hold {self.num_entries} numbers, but is {as_code(observation)}"
             ) from error
