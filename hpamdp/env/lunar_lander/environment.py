@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial, update_wrapper
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
+from pydantic import NonNegativeInt, PositiveInt
 
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
-from hpamdp.env.lunar_lander.lander import SOLVED, HybridLunarLander
+from hpamdp.env.lunar_lander.lander import SOLVED, HybridLunarLander, LanderRules
 from hpamdp.env.lunar_lander.registration import MAX_STEPS
-from hpamdp.settings import OnlyWith, PositiveFraction, Settings
+from hpamdp.settings import PositiveFraction, Settings
 
 # Mean return, fraction of solved episodes and length of Gymnasium's own hand-written player, over 500 episodes with the
 # default settings; experiments/hybrid_control/study.py measures it.
@@ -21,19 +21,11 @@ HEURISTIC = {"score": 282.8, "success": 0.998, "steps": 200.7}
 _RULES = ("max_steps", "gravity", "enable_wind")  # settings on which these figures depend
 
 
-class LunarLanderOptions(Settings):
+class LunarLanderOptions(LanderRules):
     """Settings of `LunarLanderEnv`."""
 
     max_steps: PositiveInt = MAX_STEPS
     """Steps after which an episode is truncated."""
-    gravity: Annotated[float, Field(gt=-12.0, lt=0.0)] = -10.0
-    """Gravity in Box2D's units, negative downwards."""
-    enable_wind: bool = False
-    """Whether wind pushes and turns the lander, with a strength that changes from step to step."""
-    wind_power: Annotated[NonNegativeFloat, OnlyWith("enable_wind")] = 15.0
-    """With `enable_wind`: largest force of the wind."""
-    turbulence_power: Annotated[NonNegativeFloat, OnlyWith("enable_wind")] = 1.5
-    """With `enable_wind`: largest torque of the wind."""
     render: bool = False
     """Draw the lander, for films; steps then take longer."""
     reward_scaling: PositiveFraction | None = None
@@ -74,7 +66,7 @@ class LunarLanderEnv(GymnasiumEnv):
     ) -> None:
         given = LunarLanderOptions.of(options, settings)
         self._has_default_rules = all(getattr(given, name) == getattr(LunarLanderOptions(), name) for name in _RULES)
-        lander = {name: getattr(given, name) for name in ("gravity", "enable_wind", "wind_power", "turbulence_power")}
+        rules = LanderRules(**{name: getattr(given, name) for name in LanderRules.model_fields})
         # LunarLander's observations are already of order 1, and sometimes exceed the bounds that it declares.
         reading = GymnasiumOptions(
             max_steps=given.max_steps,
@@ -83,7 +75,7 @@ class LunarLanderEnv(GymnasiumEnv):
             reward_scaling=given.reward_scaling,
             num_workers=given.num_workers,
         )
-        make = partial(HybridLunarLander, render_mode="rgb_array" if given.render else None, **lander)
+        make = partial(HybridLunarLander, render_mode="rgb_array" if given.render else None, options=rules)
         update_wrapper(make, HybridLunarLander)  # so that errors name HybridLunarLander
         super().__init__(
             num_envs,

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from pydantic import Field, NonNegativeFloat
 
 from hpamdp.env.gymnasium_checks import check_render_mode, describe, reset_options, single_action
-from hpamdp.settings import SettingError
+from hpamdp.settings import OnlyWith, SettingError, Settings
 
 SOLVED = 200.0
 """Return from which Gymnasium counts an episode as solved."""
@@ -22,6 +23,19 @@ _LEAST_MAIN = np.float32(1e-6)
 _LEAST_SIDE = np.nextafter(np.float32(0.5), np.float32(1.0))
 _DIMS = {"main": (0, 1), "side": (0, 1, 1)}  # parameters of each discrete action
 _SIDES = (0.0, -1.0, 1.0)  # signs of off, left and right in LunarLander's action
+
+
+class LanderRules(Settings):
+    """Settings of `HybridLunarLander`."""
+
+    gravity: Annotated[float, Field(gt=-12.0, lt=0.0)] = -10.0
+    """Gravity in Box2D's units, negative downwards."""
+    enable_wind: bool = False
+    """Whether wind pushes and turns the lander, with a strength that changes from step to step."""
+    wind_power: Annotated[NonNegativeFloat, OnlyWith("enable_wind")] = 15.0
+    """With `enable_wind`: largest force of the wind."""
+    turbulence_power: Annotated[NonNegativeFloat, OnlyWith("enable_wind")] = 1.5
+    """With `enable_wind`: largest torque of the wind."""
 
 
 class HybridLunarLander(gymnasium.Wrapper):
@@ -39,44 +53,23 @@ class HybridLunarLander(gymnasium.Wrapper):
 
     Args:
         render_mode: None or `rgb_array`.
-        gravity, enable_wind, wind_power, turbulence_power: those of LunarLander.
+        options: the rules; None for those of LunarLander.
+        settings: single rules, instead of those of `options`.
 
     Raises:
-        SettingError: LunarLander refuses an argument, or Box2D is not installed.
+        SettingError: an argument is wrong, or Box2D is not installed.
     """
 
-    def __init__(
-        self,
-        *,
-        render_mode: str | None = None,
-        gravity: float = -10.0,
-        enable_wind: bool = False,
-        wind_power: float = 15.0,
-        turbulence_power: float = 1.5,
-    ) -> None:
+    Options = LanderRules
+
+    def __init__(self, *, render_mode: str | None = None, options: LanderRules | None = None, **settings: Any) -> None:
         check_render_mode("HybridLunarLander", render_mode)
-        for name, number in (("gravity", gravity), ("wind_power", wind_power), ("turbulence_power", turbulence_power)):
-            if isinstance(number, bool) or not isinstance(number, int | float | np.number) or not np.isfinite(number):
-                raise SettingError(f"HybridLunarLander: {name}={number}, but must be a finite number")
-        if min(wind_power, turbulence_power) < 0.0:
-            given = f"wind_power={wind_power}, turbulence_power={turbulence_power}"
-            raise SettingError(f"HybridLunarLander: {given}, but must be at least 0")
-        if not isinstance(enable_wind, bool | np.bool_):
-            raise SettingError(f"HybridLunarLander: enable_wind={enable_wind}, but must be True or False")
+        rules = LanderRules.of(options, settings)
         try:
             from gymnasium.envs.box2d.lunar_lander import LunarLander
         except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
             raise SettingError("Box2D is not installed; pip install 'hpamdp[box2d]'") from error
-        wind: dict[str, Any] = {
-            "enable_wind": enable_wind,
-            "wind_power": wind_power,
-            "turbulence_power": turbulence_power,
-        }
-        try:
-            lander = LunarLander(render_mode=render_mode, continuous=True, gravity=gravity, **wind)
-        except AssertionError as error:
-            raise SettingError(f"LunarLander: {error}") from error
-        super().__init__(lander)
+        super().__init__(LunarLander(render_mode=render_mode, continuous=True, **dict(rules)))
         self.action_space = spaces.Dict(
             main=spaces.Tuple([spaces.Discrete(2), spaces.Tuple([_NONE, _THROTTLE])]),
             side=spaces.Tuple([spaces.Discrete(3), spaces.Tuple([_NONE, _THROTTLE, _THROTTLE])]),
