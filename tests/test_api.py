@@ -730,7 +730,10 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make_gymnasium("platform", max_steps=-1), "max_steps=-1"),
         (lambda: hpamdp.make_gymnasium("lunar_lander", gravty=-3.0), r"no such setting .*; did you mean gravity\? It"),
         (lambda: hpamdp.make_gymnasium("lunar_lander", gravity=3.0), r"gravity=3\.0: must be less than 0"),
-        (lambda: hpamdp.make_gymnasium("lunar_lander", 2, max_step=3), r"no such setting .*; it has enable_wind, gravity"),
+        (
+            lambda: hpamdp.make_gymnasium("lunar_lander", 2, max_step=3),
+            r"no such setting .*; it has enable_wind, gravity",
+        ),
         (lambda: hpamdp.make_gymnasium("soccer", decision=3), r"such argument; did you mean decisions\? It"),
         (lambda: hpamdp.make_gymnasium("TrafficCrossing", minute=3), r"no such argument; did you mean minutes\?"),
         (lambda: hpamdp.Patience(evaluations=0), "evaluations=0: must be greater than 0"),
