@@ -555,7 +555,7 @@ def test_domains_names_learners_that_differ_from_the_best_by_chance():
 
     results = runs("hppo", 0.9, 0.8, 0.7) + runs("pdqn", 0.9, 0.7, 0.7) + runs("hyar", 0.1, 0.1, 0.2)
     cells = domains.best_table(results, []).splitlines()[-1].split("|")
-    assert [cell.strip() for cell in cells[5:9]] == ["0.552 to 1.048", "pdqn (3)", "0.61", "pdqn"]
+    assert [cell.strip() for cell in cells[5:9]] == ["0.552 to 1.048", "pdqn (3†)", "0.61", "pdqn"]
 
 
 def test_cells_with_one_or_two_seeds_get_no_place_in_a_table():

@@ -185,7 +185,11 @@ def _cell(rows: Rows) -> str:
     if not values:
         return ""
     middle = f", IQM {interquartile_mean(values)[0]:.3f}" if len(values) >= MIN_SEEDS_MIDDLE else ""
-    return f"{spread(values)} ({len(values)}{EARLIER if rows[0]['seed'] < FIRST_PROTOCOL_SEED else ''}){middle}"
+    return f"{spread(values)} ({_num_seeds(rows)}){middle}"
+
+
+def _num_seeds(rows: Rows) -> str:
+    return f"{len(rows)}{EARLIER if rows[0]['seed'] < FIRST_PROTOCOL_SEED else ''}"
 
 
 def best_table(results: Rows, published: Rows) -> str:
@@ -204,7 +208,7 @@ def best_table(results: Rows, published: Rows) -> str:
         if not values:
             continue
         best, *others = sorted(values, key=lambda low: -float(np.mean(values[low])))
-        second = f"{others[0]} ({len(values[others[0]])})" if others else ""
+        second = f"{others[0]} ({_num_seeds(cells[(others[0],)])})" if others else ""
         improvement = f"{difference(values[best], values[others[0]]).improvement:.2f}" if others else ""
         low, high = mean_interval(values[best])
         top = best_published(published, name)

@@ -114,7 +114,10 @@ def by_pair(name: str) -> dict[tuple[str, str], Rows]:
 
 def boats_table(compares_changes: bool) -> str:
     """Return a line for each selector over three boats, or for agents that change boats and agents that keep them."""
-    head = "| {} | n | score | ceiling | of it | changes an episode | planner's | weighted | success | presses | CPU |"
+    head = (
+        "| {} | seeds | score | ceiling | of the ceiling | changes per episode | planner's choice | weighted | success "
+        "| presses | CPU |"
+    )
     lines = [head.format("" if compares_changes else "selector"), "|---" * 11 + "|"]
     for (boats_word, name), rows in boats().items():
         if bool(boats_word) == compares_changes:
@@ -139,7 +142,7 @@ def boats_table(compares_changes: bool) -> str:
 
 def goal_table() -> str:
     """Return a line for each selector on each domain, and for the learner without one."""
-    lines = ["| domain | learner | selector | n | goals | 95 % | steps | CPU |", "|---" * 8 + "|"]
+    lines = ["| domain | learner | selector | seeds | goals | 95 % | steps | CPU |", "|---" * 8 + "|"]
     for (domain, low, high), rows in sorted(on_goal().items(), key=lambda item: (item[0][:2], item[0][2] == ALONE)):
         scores = _column(rows, "success")
         cells = [
@@ -158,7 +161,9 @@ def goal_table() -> str:
 
 def pairs_table(name: str) -> str:
     """Return a line for each learner under each selector on Crossing or Rooms."""
-    head = "| learner | selector | seeds | steps | share | lowest | success | value error | everywhere | CPU |"
+    head = (
+        "| learner | selector | seeds | steps | share | lowest seed | success | value error | error everywhere | CPU |"
+    )
     lines = [head, "|---" * 10 + "|"]
     for (low, high), rows in by_pair(name).items():
         cells = [
