@@ -472,7 +472,8 @@ def hierarchy() -> list[Claim]:
         ),
         Claim(
             page("hierarchy"),
-            "The meta-critic scores {mean:.3f} with {agreement:.0f} %, in {cpu:.0f} s. The ceilings of the episodes are {fixed:.3f} and {ceiling:.3f},",
+            "The meta-critic scores {mean:.3f} with {agreement:.0f} %, in {cpu:.0f} s. The ceilings of the episodes "
+            "are {fixed:.3f} and {ceiling:.3f},",
             meta_critic,
         ),
         Claim(
