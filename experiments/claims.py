@@ -29,6 +29,7 @@ from scipy import stats
 from sentences import Claim, compare, uncovered
 
 from hpamdp.analysis.study import (
+    FEWEST_SEEDS,
     FIRST_PROTOCOL_SEED,
     Rows,
     difference,
@@ -250,9 +251,9 @@ def table1() -> list[Claim]:
         Claim(RESULTS, "`experiment=table1`, {minutes:.0f} minutes of CPU time with {early:word} seeds).", numbers),
         Claim(
             page("table1"),
-            "All {learners:word} learners score above people with both controllers; H-PPO is within {hppo_below:.2f} "
-            "of the ceiling, and neither controller is harder. DLPA matches people after {dlpa} presses, Q-PAMDP "
-            "after {qpamdp} million.",
+            "All {learners:word} learners score above people with both controllers; H-PPO is within "
+            "{hppo_below:.2f} of the ceiling, and no learner finds one controller clearly harder. DLPA matches "
+            "people after {dlpa} presses, Q-PAMDP after {qpamdp} million.",
             numbers,
             holds=above_people,
         ),
@@ -383,6 +384,9 @@ def hierarchy() -> list[Claim]:
     seeing += means(runs(("meta_critic", "linucb", "actor"), half, 500_000), "high")
     gains = [score - max(means(one_boat, "high")) for score in seeing]
 
+    over_hyar = rows("hierarchy/results.csv", low="hyar", total=150_000, uniform_option_steps=0)
+    over_hyar = with_enough_seeds(over_hyar, "high")
+
     def recovery(run: Rows) -> float:
         """Return the decisions after the change until four of five choices are right again; a row is 200 decisions."""
         return next((200.0 * number for number, row in enumerate(run, start=1) if row["better"] >= 0.8), math.inf)
@@ -420,8 +424,12 @@ def hierarchy() -> list[Claim]:
         people=people(),
         people_agreement=100.0 * people("oracle_agreement"),
         ceiling=ceiling(),
-        actor=actor["mean"],
-        meta_critic=meta_critic["mean"],
+        actor_below=actor["below"],
+        meta_critic_below=meta_critic["below"],
+        actor_gain=mean(runs("actor", half)) - max(means(one_boat, "high")),
+        over_hyar=len(groups(over_hyar, "high")),
+        over_hyar_seeds=seeds(over_hyar),
+        over_hyar_presses=mean(over_hyar, "total"),
         half={high: mean(runs(high, half)) for high in ("actor", "exp3", "human", "lin_thompson", "linucb")},
         uniform=linucb_uniform["agreement"],
         linucb=linucb["agreement"],
@@ -452,12 +460,20 @@ def hierarchy() -> list[Claim]:
         Claim(RESULTS, "| people | | {people:.3f} | | {people_agreement:.1f} % |", numbers),
         Claim(RESULTS, "The mean ceiling of {seeds:word} seeds is {ceiling:.3f},", meta_critic),
         Claim(RESULTS, "that of the fixed layouts {ceiling:.3f}.", numbers),
-        Claim(RESULTS, "Selectors that see the layout gain another {mean_gain:.1f}.", numbers),
+        Claim(RESULTS, "Over H-PPO, selectors that see the layout gain another {mean_gain:.1f}.", numbers),
         Claim(
             page("hierarchy"),
-            "`actor` scores {actor:.3f} and `meta_critic` {meta_critic:.3f} (ceiling {ceiling:.3f}, people "
-            "{people:.3f}). They gain {gains} over one boat.",
+            "the `actor`, with uniform options at first, and the `meta_critic` end {actor_below:.2f} and "
+            "{meta_critic_below:.2f} below the ceiling. People score {people:.3f}. Selectors that see the layout gain "
+            "{gains} over one boat, except the `actor` without uniform options, which gains {actor_gain:.2f}.",
             numbers,
+        ),
+        Claim(
+            page("hierarchy"),
+            "Over HyAR, none of the {over_hyar:word} selectors with {over_hyar_seeds:word} seeds chooses better than "
+            "chance after {over_hyar_presses:,.0f} presses.",
+            numbers,
+            holds=max(column(over_hyar, "agreement")) < 0.55,
         ),
         Claim(
             page("hierarchy"),
@@ -671,6 +687,7 @@ def domains() -> list[Claim]:
         all=len(published),
         seeds=span(map(seeds, best_runs)),
         learners=span(num_learners),
+        fewest=FEWEST_SEEDS,
         cpu_hours=sum(column(read_csv(ROOT / "experiments/domains/results.csv"), "cpu_s")) / 3600.0,
     )
     return [
@@ -693,7 +710,7 @@ def domains() -> list[Claim]:
             page("domains"),
             "On each of the {all:word} domains with published scores, the highest mean among our learners ({seeds} "
             "seeds that nobody had used before) lies above the best published mean. The learner with this mean is one "
-            "of {learners}.",
+            "of {learners} with {fewest:word} seeds or more.",
             numbers,
             holds=all(is_above) and all(are_fresh),
         ),
@@ -842,15 +859,15 @@ def generalisation() -> list[Claim]:
             ceiling=best,
         )
 
-    def last_trips(**cell: Any) -> list[float]:
-        """Return the scores of PETS from the fourth trip on, with turned boats."""
+    def trips(first: int, **cell: Any) -> np.ndarray:
+        """Return the scores of PETS from this trip on, with turned boats, in the order of the seeds."""
         runs = rows("generalisation/results.csv", family="turned", low="pets", fleet_size="new", **cell)
-        return [later(row, first=4) for row in sorted(runs, key=lambda row: row["seed"])]
+        return np.array([later(row, first=first) for row in sorted(runs, key=lambda row: row["seed"])])
 
-    by_value, by_ucb, one_boat = (
-        np.array(last_trips(**cell)) for cell in (dict(high="value"), dict(high="ucb"), dict(boats=1))
-    )
-    over_ucb, over_one = by_value - by_ucb, by_value - one_boat  # seed by seed
+    by_value, by_ucb, one_boat = (trips(4, **cell) for cell in (dict(high="value"), dict(high="ucb"), dict(boats=1)))
+    # Seed by seed. The first five seeds were looked at before the others were added, so these count alone.
+    over_ucb, over_one = (by_value - by_ucb)[5:], (by_value - one_boat)[5:]
+    all_low, all_high = mean_interval(trips(1, high="value") - trips(1, boats=1))
     (ucb_low, ucb_high), (one_low, one_high) = mean_interval(over_ucb), mean_interval(over_one)
     two_boats = rows("generalisation/results.csv", family="turned", high="value", low="pets")
     fleets = study("generalisation").by_fleet(rows("generalisation/results.csv"))
@@ -914,10 +931,12 @@ def generalisation() -> list[Claim]:
         ),
         Claim(
             page("generalisation"),
-            "With two turned boats to choose from, PETS under `high=value` scores {value:.2f} from the fourth trip on "
-            "({seeds:word} seeds, {presses:,.0f} presses each; ceiling {ceiling:.2f}). That is {over_ucb:.2f} more "
-            "than under UCB within the session (95 % interval {ucb_low:.2f} to {ucb_high:.2f}) and {over_one:.2f} more "
-            "than with one boat ({one_low:.2f} to {one_high:.2f}).",
+            "With two turned boats to choose from, PETS under `high=value` scores {value:.2f} from the fourth trip "
+            "on ({seeds:word} seeds, {presses:,.0f} presses each; ceiling {ceiling:.2f}). With the {added:word} "
+            "seeds that were added last, that is {over_ucb:.2f} more than under UCB within the session (95 % "
+            "interval {ucb_low:.2f} to {ucb_high:.2f}) and {over_one:.2f} more than with one boat ({one_low:.2f} to "
+            "{one_high:.2f}). Over all eight trips there is no gain over one boat ({all_low:.2f} to {all_high:.2f}; "
+            "{seeds:word} seeds).",
             dict(
                 value=by_value.mean(),
                 over_ucb=over_ucb.mean(),
@@ -926,11 +945,14 @@ def generalisation() -> list[Claim]:
                 ucb_high=ucb_high,
                 one_low=one_low,
                 one_high=one_high,
+                added=len(over_ucb),
+                all_low=all_low,
+                all_high=all_high,
                 ceiling=mean(two_boats, "ceiling"),
                 seeds=seeds(two_boats),
                 presses=mean(two_boats, "frames"),
             ),
-            holds=ucb_low > 0.0 and one_low > 0.0,
+            holds=ucb_low > 0.0 and one_low > 0.0 and all_low < 0.0 < all_high,
         ),
     ]
 
@@ -1072,7 +1094,7 @@ def exploration() -> list[Claim]:
             holds=not any(successful("office", kind) for kind in ("none", "novelty", "options"))
             and min(column(runs("office", "held"), "success")) == 0.0,
         ),
-        Claim(page("exploration"), "no kind helps there. {seeds:Word} seeds each:", dict(seeds=num)),
+        Claim(page("exploration"), "no kind helps there. {seeds:Word} seeds each;", dict(seeds=num)),
         Claim(
             page("exploration"),
             "With `counts` {counts:word} of {seeds:word} seeds deliver after {steps:,.0f} steps (returns {returns}), "
@@ -1443,18 +1465,25 @@ def offline() -> list[Claim]:
         gain=mean(pretrained) - mean(scratch),
         td3_bc_scratch=mean(runs("td3_bc", "scratch", "none")),
         clone_presses=mean(runs("bc"), "presses"),
+        updates=max(column(rows("offline/curves.csv", start="offline", data="rest-to-rest"), "frames")),
         people_presses=people("presses"),
     )
     return [
         Claim(
             RESULTS,
-            "From people's presses alone, `td3_bc` scores {td3_bc} and `iql` {iql}; people score {people:.3f}",
+            "After {updates:,.0f} updates from people's presses alone, `td3_bc` scores {td3_bc} and `iql` {iql}; "
+            "people score {people:.3f}",
             numbers,
         ),
         Claim(
             page("offline"),
-            "`td3_bc` scores {means[td3_bc]:.2f} and `iql` {means[iql]:.2f}; people score {people:.3f}. A clone (`bc`) "
-            "scores {means[bc]:.2f},",
+            "After {updates:,.0f} updates `td3_bc` scores {means[td3_bc]:.2f} and `iql` {means[iql]:.2f}; people score "
+            "{people:.3f}.",
+            numbers,
+        ),
+        Claim(
+            page("offline"),
+            "A clone (`bc`) scores {means[bc]:.2f},",
             numbers,
         ),
         Claim(
@@ -1500,7 +1529,16 @@ def options() -> list[Claim]:
         for (domain, _, _), runs in goal.items()
     )
     gain = difference(column(changing, "score"), column(kept, "score"))
+    of_three = {high: runs for (case, high), runs in boats.items() if case == study_of_options.BOATS}
+    of_two = {
+        high: rows("hierarchy/results.csv", high=high, low="hppo", total=2_000_000, uniform_option_steps=500_000)
+        for high in of_three
+    }
+    linucb_loss = difference(column(of_three["linucb"], "oracle_agreement"), column(of_two["linucb"], "agreement"))
+    chooses_less = linucb_loss.high < 0.0
     numbers = dict(
+        three_choices=span([100.0 * mean(runs, "oracle_agreement") for runs in of_three.values()], ".0f"),
+        two_choices=span([100.0 * mean(runs, "agreement") for runs in of_two.values()], ".0f"),
         bar=bar,
         ceiling=mean(changing, "ceiling") - mean(kept, "ceiling"),
         pets=100.0 * mean(single["pets", "option_critic"], "share"),
@@ -1534,6 +1572,13 @@ def options() -> list[Claim]:
     return [
         Claim(
             page("options"),
+            "Yes, in {three_choices} % of the layouts. With two boats it is {two_choices} %, so LinUCB chooses less "
+            "well among three.",
+            numbers,
+            holds=chooses_less,
+        ),
+        Claim(
+            page("options"),
             "- Three boats: selectors choose well, and reach {three_boats} % of the ceiling. "
             "- Changes inside an episode: agents that may change boats reach {changing:.0f} % of the ceiling with each "
             "of {seeds:word} seeds. "
@@ -1563,10 +1608,13 @@ def options() -> list[Claim]:
             page("options"),
             "With {seeds:word} seeds under each selector it scores {goal} on Goal, and alone {alone:.2f} with "
             "{seeds_alone:word} seeds. On "
-            "Hard Goal it scores {hard_goal:.2f} under the option-critic, and {hard_alone:.2f} alone. No difference is "
-            "clear.",
+            "Hard Goal it scores {hard_goal:.2f} under the option-critic, and {hard_alone:.2f} alone. No difference to "
+            "H-PPO alone is clear. On Goal the option-critic is clearly above the actor.",
             numbers,
-            holds=is_unclear,
+            holds=is_unclear
+            and difference(
+                *(column(goal["goal", "hppo", high], "success") for high in ("option_critic", "actor"))
+            ).is_clear,
         ),
         Claim(
             page("options"),
@@ -2046,6 +2094,8 @@ GIVEN = {
     "of greedy agents on 1,000 episodes": "the episodes of an evaluation",
     "Seeds from 100 on": "the first seed of the protocol",
     "the interquartile mean with its 95 % interval": "the level of the interval",
+    "`iql` scored 0.20 less after 2,000 updates": "the page's table of discounts, of three runs each",
+    "The gain of three seeds is unclear": "the seeds of the study",
     "on 1,000 layouts": "the episodes of an evaluation",
     "5 \u00d7 the remaining fuel on success and \u22121 otherwise": "the rule of the score",
     "95 % intervals": "the level of the intervals",

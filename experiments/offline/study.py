@@ -37,6 +37,7 @@ COLOURS = {"bc": "#8c8c8c", "iql": "#0072B2", "td3_bc": "#D55E00"}
 OUTCOMES = ("success", "too_fast", "out_of_bounds", "out_of_fuel")
 OFFLINE, PRETRAINED, SCRATCH = "offline", "pretrained", "scratch"  # start of a run
 REST_TO_REST, RECORDED = "rest-to-rest", "recorded"  # form of the data's presses
+CASE = ("low", "start", "data", "episodes")
 # Comparisons of the page: learner, start, presses and episodes of both sides.
 COMPARISONS = (
     ("bc: rest-to-rest less recorded", ("bc", OFFLINE, REST_TO_REST, "all"), ("bc", OFFLINE, RECORDED, "all")),
@@ -95,12 +96,14 @@ def _data(run: Run) -> tuple[str, str]:
     return data, "successes" if run.config["data"]["successes"] else "all"
 
 
-def table(results: Rows) -> str:
-    """Return the offline learners' scores, and then the presses that pre-training saves."""
+def table(results: Rows, curves: Rows) -> str:
+    """Return the offline learners' scores, then the presses that pre-training saves, then the comparisons."""
     lines = [
-        "| learner | presses as | episodes | seeds | score | success | too fast | out | no fuel | presses | CPU |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| learner | presses as | episodes | updates | seeds | score | success | too fast | out | no fuel "
+        "| presses | CPU |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
+    ends = {case: _last(runs) for case, runs in groups(curves, *CASE).items()}
     offline = [row for row in results if row["start"] == OFFLINE]
     for (low, data, episodes), runs in groups(offline, "low", "data", "episodes").items():
         score = spread([run["score"] for run in runs])
@@ -108,7 +111,8 @@ def table(results: Rows) -> str:
         presses = _mean(runs, "presses")
         cpu_s = _mean(runs, "cpu_s")
         lines.append(
-            f"| {low} | {data} | {episodes} | {len(runs)} | {score} | {shares} | {presses:.2f} | {cpu_s:.0f} s |"
+            f"| {low} | {data} | {episodes} | {ends[low, OFFLINE, data, episodes]:,.0f} | {len(runs)} | {score} | "
+            f"{shares} | {presses:.2f} | {cpu_s:.0f} s |"
         )
     lines += ["", "| learner | start | presses to 1.97, by seed | score at the end |", "|---|---|---|---|"]
     online = [row for row in results if row["start"] != OFFLINE]
@@ -117,18 +121,22 @@ def table(results: Rows) -> str:
         frames = [run["frames_to_human"] for run in runs]
         reached = ", ".join("never" if value == "" else f"{value:,.0f}" for value in frames)
         lines.append(f"| {low} | {start} | {reached} | {score} |")
-    lines += ["", "| | difference (95 %) | probability of improvement |", "|---|---|---|"]
+    lines += ["", "| | after | difference (95 %) | probability of improvement |", "|---|---|---|---|"]
+    of_case = groups(curves, *CASE)
     for title, better, other in COMPARISONS:
-        scores = [_scores(results, *case) for case in (better, other)]
-        if all(scores):
-            found = difference(*scores)
-            lines.append(f"| {title} | {found} | {found.improvement:.2f} |")
+        if better in of_case and other in of_case:
+            end = min(ends[better], ends[other])  # at which both are compared
+            found = difference(
+                *([row["score"] for row in of_case[case] if row["frames"] == end] for case in (better, other))
+            )
+            unit = "updates" if better[1] == OFFLINE else "presses"
+            lines.append(f"| {title} | {end:,.0f} {unit} | {found} | {found.improvement:.2f} |")
     return "\n".join(lines)
 
 
-def _scores(results: Rows, low: str, start: str, data: str, episodes: str) -> list[float]:
-    case = (low, start, data, episodes)
-    return [row["score"] for row in results if (row["low"], row["start"], row["data"], row["episodes"]) == case]
+def _last(curves: Rows) -> float:
+    """Return the updates, or the agent's own presses, that all runs have made at an evaluation."""
+    return min(max(row["frames"] for row in run) for run in groups(curves, "seed").values())
 
 
 def _mean(rows: Rows, column: str) -> float:
@@ -167,8 +175,9 @@ def main(folders: Sequence[str]) -> None:
         results, curves = gathered(folders, gather, env=("boatdock",), low=COLOURS, high=("human",))
         names = ("low", "start", "data", "episodes", "seed")
         add_to_tables(HERE, {"results": results, "curves": curves}, names, sorts=False)
-    draw(read_csv(HERE / "curves.csv"), HERE / "curves.png")
-    print(table(read_csv(HERE / "results.csv")))
+    results, curves = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))
+    draw(curves, HERE / "curves.png")
+    print(table(results, curves))
 
 
 if __name__ == "__main__":
