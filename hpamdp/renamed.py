@@ -14,6 +14,7 @@ _NEW_NAMES = {
     "epsilon_frames": "epsilon_steps",
     "lr_frames": "lr_steps",
     "anneal_frames": "anneal_steps",
+    "lr_final": "lr_final_fraction",  # of replay learners; that of H-PPO is a rate, and keeps its name
     "weight_decay_frames": "weight_decay_steps",
     "twin_q": "twin",
     "rl": "twin",

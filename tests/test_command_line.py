@@ -28,6 +28,7 @@ MISTAKES = [
     (["eval.evry=3"], "eval.evry: no such value of eval; did you mean every? It has every, layouts, seed"),
     (["+eval.evry=3"], "eval.evry: no such value of the run (conf/config.yaml); did you mean every? It has every, "),
     (["low=pdqn", "low.twin_q=true"], "low.twin_q: is called low.twin now"),
+    (["low=pdqn", "low.lr_final=0.1"], "low.lr_final: is called low.lr_final_fraction now"),
     (["low.rl=td3"], "low.rl: is called low.twin now (rl=td3 is twin=true, rl=ddpg is twin=false)"),
     (["agent.uniform_option_frames=5"], "agent.uniform_option_frames: is called agent.uniform_option_steps now"),
     (["env.options=default"], "env.options: is called env.grouping now"),

@@ -24,8 +24,8 @@ OPTIONS = dict(
     codec_pretrain_updates=700, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
     latent_coverage=0.96, correction_factor=5.0, parameter_tolerance=None, relabelling="mean",
     buffer_size=20_000, batch_size=64, updates_per_step=0.25, gamma=0.9, reward_scale=1.0, tau=0.02, actor_lr=1e-3,
-    critic_lr=1e-3, augment=False,
-    lr_final=1.0, lr_steps=0, policy_delay=2, target_smoothing=0.1, target_smoothing_clip=0.2, parameter_noise=0.1,
+    critic_lr=1e-3, augment=False, lr_final_fraction=1.0,
+    lr_steps=0, policy_delay=2, target_smoothing=0.1, target_smoothing_clip=0.2, parameter_noise=0.1,
     preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
     greedy_samples=0, greedy_noise=0.3, epsilon_final=0.05, epsilon_steps=3000,
 )  # fmt: skip
@@ -379,7 +379,7 @@ def test_a_problem_without_parameters_is_refused():
 
 
 def test_the_learning_rates_fall_to_their_final_fraction():
-    learner = make(lr_final=0.1, lr_steps=1000, codec_lr=2e-3, actor_lr=1e-3, critic_lr=3e-3)
+    learner = make(lr_final_fraction=0.1, lr_steps=1000, codec_lr=2e-3, actor_lr=1e-3, critic_lr=3e-3)
     rates = []
     for frames in (0, 500, 1000, 5000):
         learner.on_progress(frames)
@@ -515,8 +515,8 @@ def test_the_published_recipe_has_the_published_settings_and_learns():
         dynamics_weight=1.0, codec_loss="mean", latent_coverage=0.96, correction_factor=5.0, relabelling="sample",
         gamma=0.99, tau=0.005, actor_lr=3e-4, critic_lr=3e-4, policy_delay=2, target_smoothing=0.1,
         target_smoothing_clip=0.5, batch_size=128, updates_per_step=1.0, critic_window=100_000, noise_initial=1.0,
-        noise_episodes=1000, parameter_noise=0.1, actor_max_grad_norm=10.0, inverting_gradients=True, lr_final=1.0,
-        augment=False, parameter_tolerance=None, greedy_samples=0, search_samples=0, preactivation_penalty=0.0,
+        noise_episodes=1000, parameter_noise=0.1, actor_max_grad_norm=10.0, inverting_gradients=True,
+        lr_final_fraction=1.0, augment=False, parameter_tolerance=None, greedy_samples=0, search_samples=0, preactivation_penalty=0.0,
     )  # fmt: skip
     assert {name: settings[name] for name in expected} == expected
     short = dict(warmup_steps=200, codec_pretrain_updates=2, updates_per_step=0.02, critic_window=150)

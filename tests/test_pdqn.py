@@ -19,7 +19,7 @@ OPTIONS = dict(
     n_step=1, bounding="tanh", hidden_dims=[64, 64], layer_norm=False, warmup_steps=1000, buffer_size=20_000,
     batch_size=64, updates_per_step=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02,
     critic_tau=0.02, max_grad_norm=None, parameter_noise=0.1, greedy_samples=0, greedy_noise=0.3, epsilon_final=0.1,
-    epsilon_steps=3000, epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final=1.0,
+    epsilon_steps=3000, epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final_fraction=1.0,
     lr_steps=1000, preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
 )  # fmt: skip
 PUBLISHED = dict(twin=False, target_smoothing=0.0, policy_delay=1)
@@ -394,7 +394,7 @@ def test_epsilon_can_fall_with_the_episodes():
 
 
 def test_the_learning_rates_fall_to_their_final_fraction():
-    learner = make(lr_final=0.1, lr_steps=1000, actor_lr=1e-3, critic_lr=3e-3)
+    learner = make(lr_final_fraction=0.1, lr_steps=1000, actor_lr=1e-3, critic_lr=3e-3)
     rates = []
     for frames in (0, 500, 1000, 5000):
         learner.on_progress(frames)

@@ -350,6 +350,16 @@ def test_old_names_are_read_in_the_learners_of_options_too():
     assert learner.settings["warmup_steps"] == 77 and learner.settings["twin"] is False
 
 
+@pytest.mark.parametrize(
+    ("learner", "name"), [("pdqn", "lr_final_fraction"), ("hyar", "lr_final_fraction"), ("hppo", "lr_final")]
+)
+def test_a_saved_final_learning_rate_stays_a_rate_or_a_fraction(learner, name):
+    saved = make_config([f"low={learner}"]).to_dict()
+    saved["low"].pop(name)
+    saved["low"]["lr_final"] = 5e-4
+    assert read_saved(saved).low.settings[name] == 5e-4
+
+
 def test_a_word_may_need_a_setting_that_the_saved_run_has(command):
     words = ["env=boatdock_unseen", "env.fleet_size=2", "env.frame=first_press", "high=none", "low=random"]
     words += ["total_frames=64", "num_envs=8", "steps_per_batch=8", "eval.every=0", "eval.layouts=2", "film=false"]

@@ -136,7 +136,7 @@ class HyAROptions(CodecOptions, TargetRateOptions, SearchingActorOptions):
 
     The means lie on a line in the latent space. Off that line, where the actor goes, only samples teach the critics.
     """
-    lr_final: PositiveFraction = 0.1
+    lr_final_fraction: PositiveFraction = 0.1
     """Fraction of the three learning rates that is left after `lr_steps`; 1 keeps them constant."""
     epsilon_steps: NonNegativeInt = 15_000
     """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
@@ -585,7 +585,7 @@ class HyAR(ReplayLearner):
             final = options.parameter_noise / options.noise_initial
             part = linear_schedule(int(self.episodes), options.noise_episodes, final)
             self.policy.noise.fill_(options.noise_initial * part)
-        fraction = linear_schedule(steps, options.lr_steps, options.lr_final)
+        fraction = linear_schedule(steps, options.lr_steps, options.lr_final_fraction)
         set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
     def fit_latent_range(self) -> None:

@@ -426,7 +426,7 @@ class PDQN(ReplayLearner):
         if options.epsilon_episodes is not None:
             time, over = int(self.episodes), options.epsilon_episodes
         self.policy.epsilon.fill_(linear_schedule(time, over, options.epsilon_final))
-        fraction = linear_schedule(steps, options.lr_steps, options.lr_final)
+        fraction = linear_schedule(steps, options.lr_steps, options.lr_final_fraction)
         set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:

@@ -50,7 +50,7 @@ class TwinCriticOptions(SmoothedTargetOptions):
 class AnnealedRateOptions(Settings):
     """Learning rates that fall linearly."""
 
-    lr_final: PositiveFraction = 1.0
+    lr_final_fraction: PositiveFraction = 1.0
     """Fraction of the learning rates that is left after `lr_steps`; 1 keeps them constant."""
     lr_steps: NonNegativeInt = 100_000
     """The learner's own steps, after its warm-up, within which the learning rates fall."""
