@@ -516,7 +516,8 @@ def test_the_published_recipe_has_the_published_settings_and_learns():
         gamma=0.99, tau=0.005, actor_lr=3e-4, critic_lr=3e-4, policy_delay=2, target_smoothing=0.1,
         target_smoothing_clip=0.5, batch_size=128, updates_per_step=1.0, critic_window=100_000, noise_initial=1.0,
         noise_episodes=1000, parameter_noise=0.1, actor_max_grad_norm=10.0, inverting_gradients=True,
-        lr_final_fraction=1.0, augment=False, parameter_tolerance=None, greedy_samples=0, search_samples=0, preactivation_penalty=0.0,
+        lr_final_fraction=1.0, augment=False, parameter_tolerance=None,
+        greedy_samples=0, search_samples=0, preactivation_penalty=0.0,
     )  # fmt: skip
     assert {name: settings[name] for name in expected} == expected
     short = dict(warmup_steps=200, codec_pretrain_updates=2, updates_per_step=0.02, critic_window=150)
