@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import warnings
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -25,6 +26,7 @@ from hpamdp.env.circuit.environment import CircuitEnv
 from hpamdp.env.circuit.registration import CIRCUIT_IDS
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.office.environment import OfficeEnv
 from hpamdp.env.pinball.environment import PinballEnv
@@ -470,8 +472,10 @@ def test_a_problem_without_pictures_or_player_says_so():
 
 
 @pytest.mark.parametrize("seed", [1.5, "a", True, -1])
-def test_a_seed_that_is_no_whole_number_of_at_least_0_is_refused(seed):
-    env = PlatformEnv(2, seed=3)
+@pytest.mark.parametrize("make", [PlatformEnv, partial(GymnasiumEnv, id="toy_environments:Toy-v0")])
+def test_a_seed_that_is_no_whole_number_of_at_least_0_is_refused(make, seed):
+    env = make(2, seed=3)
+    env.set_seed(3)
     first = env.reset()[keys.OBSERVATION]
     for method in (env.set_seed, env.seed_evaluation):
         with pytest.raises(ValueError, match=f"seed={seed!r}: must be a whole number of at least 0"):

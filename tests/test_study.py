@@ -273,6 +273,45 @@ def test_the_hierarchy_is_tabulated_from_its_stored_runs():
     assert any(line.startswith("| actor | hppo | 4,000,000, 1,000,000 | 3 | 3.579 ± 0.001 |") for line in lines)
 
 
+def test_the_hierarchy_ranks_selectors_by_their_distances_to_the_ceilings_of_their_own_layouts():
+    hierarchy = study("hierarchy")
+    cell = {"low": "hppo", "total": 100, "uniform_option_steps": 0} | dict.fromkeys(hierarchy.COLUMNS, 0.5)
+
+    def runs(high, ceiling, *scores):
+        return [
+            cell | {"high": high, "seed": seed, "ceiling": ceiling, "score": each} for seed, each in enumerate(scores)
+        ]
+
+    rows = runs("actor", 3.7, 3.5, 3.51, 3.52) + runs("ucb", 3.5, 3.4, 3.41, 3.42)
+    first, second = hierarchy.table(rows).splitlines()[2:]
+    assert first.startswith("| ucb | hppo | 100, 0 | 3 | 3.410 ± 0.010 | 0.090 | +0.100 (+0.077 to +0.123) |")
+    assert second.startswith("| actor | hppo | 100, 0 | 3 | 3.510 ± 0.010 | 0.190 |  |")
+
+
+def test_offline_compares_data_sets_after_the_same_number_of_updates():
+    offline = study("offline")
+
+    def runs(data, **scores_by_updates):
+        name = {"low": "bc", "start": "offline", "data": data, "episodes": "all"}
+        return [
+            name | {"seed": seed, "frames": int(updates[1:]), "score": score + 0.01 * seed}
+            for updates, score in scores_by_updates.items()
+            for seed in (0, 1, 2)
+        ]
+
+    curves = runs("rest-to-rest", _1000=0.2, _2000=0.5, _5000=0.9) + runs("recorded", _1000=0.1, _2000=0.3)
+    line = offline.comparison(
+        "bc: a less b", ("bc", "offline", "rest-to-rest", "all"), ("bc", "offline", "recorded", "all"), curves
+    )
+    assert line.startswith("| bc: a less b | 2,000 updates | +0.200 (")
+    assert (
+        offline.comparison(
+            "no runs", ("iql", "offline", "recorded", "all"), ("bc", "offline", "recorded", "all"), curves
+        )
+        is None
+    )
+
+
 def test_domains_scores_each_learner_by_its_longest_runs_within_the_published_steps():
     domains = study("domains")
 

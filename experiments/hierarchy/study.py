@@ -124,12 +124,12 @@ def table(results: Rows) -> str:
     for place, ((low, total, uniform, high), runs) in enumerate(cases, start=1):
         above = ""
         if place < len(cases) and cases[place][0][:3] == (low, total, uniform):
-            above = str(difference(*(_above_ceiling(rows) for rows in (runs, cases[place][1]))))
+            above = str(difference(_below_ceiling(cases[place][1]), _below_ceiling(runs)))
         mean = {column: np.mean([run[column] for run in runs]) for column in COLUMNS}
         score = spread([run["score"] for run in runs])
         lines.append(
             f"| {high} | {low} | {total:,.0f}, {uniform:,.0f} | {len(runs)} | {score} | "
-            f"{-np.mean(_above_ceiling(runs)):.3f} | {above} | "
+            f"{np.mean(_below_ceiling(runs)):.3f} | {above} | "
             f"{mean['agreement']:.1%} | "
             f"{mean['weighted_agreement']:.1%} | {mean['regret']:.3f} | {mean['choice_gain']:.3f} | "
             f"{mean['success']:.1%} | {mean['cpu_s']:.0f} s |"
@@ -140,11 +140,11 @@ def table(results: Rows) -> str:
 def _order(case: tuple[tuple[Any, ...], Rows]) -> tuple[Any, ...]:
     """Return the place of a line: by learner, length and uniform options, then the one closest to its ceiling first."""
     (low, total, uniform, _), runs = case
-    return low, total, uniform, -np.mean(_above_ceiling(runs))
+    return low, total, uniform, np.mean(_below_ceiling(runs))
 
 
-def _above_ceiling(runs: Rows) -> list[float]:
-    return [run["score"] - run["ceiling"] for run in runs]
+def _below_ceiling(runs: Rows) -> list[float]:
+    return [run["ceiling"] - run["score"] for run in runs]
 
 
 def of_the_map(rows: Rows) -> Rows:

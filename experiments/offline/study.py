@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -38,6 +39,7 @@ OUTCOMES = ("success", "too_fast", "out_of_bounds", "out_of_fuel")
 OFFLINE, PRETRAINED, SCRATCH = "offline", "pretrained", "scratch"  # start of a run
 REST_TO_REST, RECORDED = "rest-to-rest", "recorded"  # form of the data's presses
 CASE = ("low", "start", "data", "episodes")
+Case: TypeAlias = tuple[str, str, str, str]
 # Comparisons of the page: learner, start, presses and episodes of both sides.
 COMPARISONS = (
     ("bc: rest-to-rest less recorded", ("bc", OFFLINE, REST_TO_REST, "all"), ("bc", OFFLINE, RECORDED, "all")),
@@ -103,7 +105,7 @@ def table(results: Rows, curves: Rows) -> str:
         "| presses | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    ends = {case: _last(runs) for case, runs in groups(curves, *CASE).items()}
+    updates = {case: max(row["frames"] for row in rows) for case, rows in groups(curves, *CASE).items()}
     offline = [row for row in results if row["start"] == OFFLINE]
     for (low, data, episodes), runs in groups(offline, "low", "data", "episodes").items():
         score = spread([run["score"] for run in runs])
@@ -111,7 +113,7 @@ def table(results: Rows, curves: Rows) -> str:
         presses = _mean(runs, "presses")
         cpu_s = _mean(runs, "cpu_s")
         lines.append(
-            f"| {low} | {data} | {episodes} | {ends[low, OFFLINE, data, episodes]:,.0f} | {len(runs)} | {score} | "
+            f"| {low} | {data} | {episodes} | {updates[low, OFFLINE, data, episodes]:,.0f} | {len(runs)} | {score} | "
             f"{shares} | {presses:.2f} | {cpu_s:.0f} s |"
         )
     lines += ["", "| learner | start | presses to 1.97, by seed | score at the end |", "|---|---|---|---|"]
@@ -122,21 +124,24 @@ def table(results: Rows, curves: Rows) -> str:
         reached = ", ".join("never" if value == "" else f"{value:,.0f}" for value in frames)
         lines.append(f"| {low} | {start} | {reached} | {score} |")
     lines += ["", "| | after | difference (95 %) | probability of improvement |", "|---|---|---|---|"]
-    of_case = groups(curves, *CASE)
-    for title, better, other in COMPARISONS:
-        if better in of_case and other in of_case:
-            end = min(ends[better], ends[other])  # at which both are compared
-            found = difference(
-                *([row["score"] for row in of_case[case] if row["frames"] == end] for case in (better, other))
-            )
-            unit = "updates" if better[1] == OFFLINE else "presses"
-            lines.append(f"| {title} | {end:,.0f} {unit} | {found} | {found.improvement:.2f} |")
+    lines += [line for case in COMPARISONS if (line := comparison(*case, curves)) is not None]
     return "\n".join(lines)
 
 
-def _last(curves: Rows) -> float:
-    """Return the updates, or the agent's own presses, that all runs have made at an evaluation."""
-    return min(max(row["frames"] for row in run) for run in groups(curves, "seed").values())
+def comparison(title: str, better: Case, other: Case, curves: Rows) -> str | None:
+    """Return a line with the difference of two cases; None if one has no runs.
+
+    They are compared at the last evaluation that all their runs have, after as many updates or presses of their own.
+    """
+    of_case = groups(curves, *CASE)
+    if better not in of_case or other not in of_case:
+        return None
+    runs = [run for case in (better, other) for run in groups(of_case[case], "seed").values()]
+    end = max(set.intersection(*({row["frames"] for row in run} for run in runs)))
+    scores = ([row["score"] for row in of_case[case] if row["frames"] == end] for case in (better, other))
+    found = difference(*scores)
+    unit = "updates" if better[1] == OFFLINE else "presses"
+    return f"| {title} | {end:,.0f} {unit} | {found} | {found.improvement:.2f} |"
 
 
 def _mean(rows: Rows, column: str) -> float:

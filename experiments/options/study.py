@@ -69,7 +69,7 @@ def standing(rows: Rows, names: Sequence[str], settings: Sequence[str] = ()) -> 
         settings: columns in which the runs of a cell must agree.
 
     Raises:
-        SystemExit: they do not agree.
+        SystemExit: the runs of a cell have different settings.
     """
     cells = {}
     for cell, of_cell in groups(rows, *names).items():
@@ -78,7 +78,7 @@ def standing(rows: Rows, names: Sequence[str], settings: Sequence[str] = ()) -> 
         if len(chosen) >= FEWEST_SEEDS:
             cells[cell] = chosen
             if len(groups(chosen, *settings)) > 1:
-                raise SystemExit(f"{', '.join(cell)}: has runs with different {', '.join(settings)}")
+                raise SystemExit(f"{', '.join(filter(None, cell))}: has runs with different {', '.join(settings)}")
     return cells
 
 
@@ -87,7 +87,7 @@ def boats() -> dict[tuple[str, str], Rows]:
     rows = read_csv(HERE / "boats.csv")
     for row in rows:
         words = row["words"].split()
-        row["settings"] = " ".join(word for word in words if not word.startswith(("seed=", "eval.seed=")))
+        row["settings"] = " ".join(sorted(word for word in words if not word.startswith(("seed=", "eval.seed="))))
         selector = next(word.removeprefix("high=") for word in words if word.startswith("high="))
         changes = CHANGED if any(word.startswith("env.switch_cost=") for word in words) else KEPT
         is_of_boats = any(word.startswith(BOATS) for word in words)

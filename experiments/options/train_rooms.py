@@ -312,7 +312,7 @@ def values_of_cells(agent: HierarchicalAgent) -> torch.Tensor:
 def train_all(
     words: Sequence[str], recipe: Recipe, train: Callable[[Config], dict[str, Any]], file: Path, run: Sequence[str]
 ) -> None:
-    """Check all combinations of the words' values, then train with each one and add its row to a csv file.
+    """Check the settings of all combinations of the words' values, then train with each and add its row to a csv file.
 
     Args:
         words: of the command line, such as `low=hppo,pdqn`.
@@ -322,7 +322,7 @@ def train_all(
         run: its columns that name a run.
 
     Raises:
-        SystemExit: there is no word, or one is wrong.
+        SystemExit: there is no word, one is wrong, or they do not go together.
     """
     wrong = next((word for word in words if "=" not in word), None)
     if wrong is not None or not words:
@@ -338,7 +338,10 @@ def train_all(
     except ConfigError as error:
         raise SystemExit(f"{error}\nno run was trained") from error
     for config in configs:
-        row = train(config)
+        try:
+            row = train(config)
+        except ConfigError as error:  # such as a selector that refuses the options of its run
+            raise SystemExit(str(error)) from error
         add_to_tables(file.parent, {file.stem: [row]}, run, steps="steps")
     print(f"{file}: rows added; study.py tabulates them")
 

@@ -255,9 +255,16 @@ def _name_of(row: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ...]:
     return tuple(str(row[name]) for name in names)
 
 
-def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str], **checks: Any) -> None:
-    """Add rows to csv files, or nothing if one is refused: write what `merged_tables` returns."""
-    write_tables(folder, merged_tables(folder, tables, names, **checks))
+def add_to_tables(folder: Path, tables: Mapping[str, Rows], names: Sequence[str], **how: Any) -> None:
+    """Add rows to csv files, in the place of those of the runs that they repeat.
+
+    Args:
+        folder, tables, names, how: the arguments of `merged_tables`.
+
+    Raises:
+        SystemExit: `merged_tables` refuses a row. Then nothing is written.
+    """
+    write_tables(folder, merged_tables(folder, tables, names, **how))
 
 
 def merged_tables(
@@ -270,7 +277,7 @@ def merged_tables(
     lengths_differ: bool = False,
     sorts: bool = True,
 ) -> dict[str, Rows]:
-    """Return the rows of csv files with new rows, which replace those of the runs that they repeat.
+    """Check new rows, and return the rows of csv files with them. They replace those of the runs that they repeat.
 
     Args:
         folder: of the files.

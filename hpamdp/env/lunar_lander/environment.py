@@ -66,7 +66,7 @@ class LunarLanderEnv(GymnasiumEnv):
     ) -> None:
         given = LunarLanderOptions.of(options, settings)
         self._has_default_rules = all(getattr(given, name) == getattr(LunarLanderOptions(), name) for name in _RULES)
-        rules = LanderRules(**{name: getattr(given, name) for name in LanderRules.model_fields})
+        rules = {name: getattr(given, name) for name in LanderRules.model_fields}
         # LunarLander's observations are already of order 1, and sometimes exceed the bounds that it declares.
         reading = GymnasiumOptions(
             max_steps=given.max_steps,
@@ -75,7 +75,7 @@ class LunarLanderEnv(GymnasiumEnv):
             reward_scaling=given.reward_scaling,
             num_workers=given.num_workers,
         )
-        make = partial(HybridLunarLander, render_mode="rgb_array" if given.render else None, options=rules)
+        make = partial(HybridLunarLander, render_mode="rgb_array" if given.render else None, **rules)
         update_wrapper(make, HybridLunarLander)  # so that errors name HybridLunarLander
         super().__init__(
             num_envs,

@@ -53,18 +53,15 @@ class HybridLunarLander(gymnasium.Wrapper):
 
     Args:
         render_mode: None or `rgb_array`.
-        options: the rules; None for those of LunarLander.
-        settings: single rules, instead of those of `options`.
+        settings: rules that differ from LunarLander's, see `LanderRules`.
 
     Raises:
         SettingError: an argument is wrong, or Box2D is not installed.
     """
 
-    Options = LanderRules
-
-    def __init__(self, *, render_mode: str | None = None, options: LanderRules | None = None, **settings: Any) -> None:
+    def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
         check_render_mode("HybridLunarLander", render_mode)
-        rules = LanderRules.of(options, settings)
+        rules = LanderRules.of(None, settings)
         try:
             from gymnasium.envs.box2d.lunar_lander import LunarLander
         except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
