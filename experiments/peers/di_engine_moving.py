@@ -129,8 +129,8 @@ class Greedy:
         logit = self.model(td.get(keys.OBSERVATION), mode="compute_actor")["logit"]
         td.set(keys.DISCRETE, self._discrete(logit["action_type"]))
         mean, deviation = logit["action_args"]["mu"], logit["action_args"]["sigma"]
-        drawn = torch.normal(mean, deviation) if self.draws_parameters else mean
-        push, turn = drawn.clamp(-1.0, 1.0).unbind(-1)
+        sampled = torch.normal(mean, deviation) if self.draws_parameters else mean
+        push, turn = sampled.clamp(-1.0, 1.0).unbind(-1)
         return td.set(keys.PARAMETERS, torch.stack([(push + 1.0) / 2.0, turn], -1))
 
     def _discrete(self, logits: Tensor) -> Tensor:
@@ -156,8 +156,8 @@ def main(seed: int, file: Path, limit: float) -> None:
     form = partial(Greedy, policy._model)
     policies = {
         "most probable": form(draws_discrete=False, draws_parameters=False),
-        "drawn": form(draws_discrete=True, draws_parameters=False),
-        "all drawn": form(draws_discrete=True, draws_parameters=True),
+        "sampled": form(draws_discrete=True, draws_parameters=False),
+        "all sampled": form(draws_discrete=True, draws_parameters=True),
     }
     name = {"library": "di-engine", "version": ding.__version__.lstrip("v"), "learner": "hppo", "seed": seed}
     curve = Curve("moving", policies, name, file, limit)

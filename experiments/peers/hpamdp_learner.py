@@ -27,8 +27,8 @@ class Clock(hpamdp.Callback):
         """Start the clock after the run's own first evaluation."""
         if self.curve is None:
             problem, name, file, limit = self.given
-            is_drawn = trainer.config.to_dict()["low"].get("greedy_discrete") == "sampled"
-            acts = "drawn" if is_drawn else "greedy"
+            is_sampled = trainer.config.to_dict()["low"].get("greedy_discrete") == "sampled"
+            acts = "sampled" if is_sampled else "greedy"
             self.curve = Curve(problem, {acts: trainer.parts.agent.policy}, name, file, limit)
             self.curve.begin()
 

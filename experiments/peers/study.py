@@ -24,7 +24,7 @@ HERE = Path(__file__).resolve().parent
 TIMES = (0.1, 0.25, 0.5, 1.0)  # columns of the table, as fractions of the CPU time of training
 FIRST = 5.0  # start of the figure's axes, CPU seconds
 # DI-engine's H-PPO is scored in three ways; the figure shows the one of hpamdp's H-PPO on Moving.
-SHOWN = ("greedy", "drawn")
+SHOWN = ("greedy", "sampled")
 PROBLEMS = {"platform": "Platform", "moving": "Moving"}
 COLOURS = {("xuance", "mpdqn"): INK, ("xuance", "pdqn"): FAINT, ("di-engine", "hppo"): INK}
 NAME = ("problem", "library", "version", "learner", "acts")
