@@ -85,6 +85,7 @@ def test_the_networks_of_an_agent_start_a_run(tmp_path):
         "num_envs=64",
         "low.warmup_steps=1000",
         "low.updates_per_step=0.001",
+        "film=false",
     ]
     assert run(compose_config(words), tmp_path, words) == 0
     assert json.loads((tmp_path / "summary.json").read_text())["success"] > 0.6

@@ -266,7 +266,7 @@ def test_a_run_does_not_continue_on_a_map_that_was_edited_since(tmp_path):
 def test_an_evaluation_on_a_map_that_was_edited_since_says_so(grouping, tmp_path, capfd):
     file, folder = written(tmp_path, TABLE), tmp_path / "run"
     words = ["env=pinball", *grouping, "low=hppo", "low.minibatch_size=16", f"env.map={file}", *SMALL]
-    words.append("total_frames=64")
+    words += ["total_frames=64", "env.max_steps=20", "film=false"]
     assert run(compose_config(words), folder, words) == 0
     line = "the agent was trained with another file of env.map, or it was edited since"
     for table, is_other in ((TABLE, False), (TABLE | {"start": [0.2, 0.6]}, True)):
