@@ -288,6 +288,16 @@ def test_the_hierarchy_ranks_selectors_by_their_distances_to_the_ceilings_of_the
     assert second.startswith("| actor | hppo | 100, 0 | 3 | 3.510 ± 0.010 | 0.190 |  |")
 
 
+def test_the_map_of_the_hierarchy_shows_the_length_of_most_selectors_whatever_the_number_of_their_runs():
+    rows = [
+        {"low": "hppo", "total": total, "uniform_option_steps": 0, "high": high, "seed": seed}
+        for total, highs, seeds in ((200, ("ucb", "actor", "exp3"), 3), (400, ("ucb",), 20))
+        for high in highs
+        for seed in range(seeds)
+    ]
+    assert {row["total"] for row in study("hierarchy").of_the_map(rows)} == {200}
+
+
 def test_offline_compares_data_sets_after_the_same_number_of_updates():
     offline = study("offline")
 

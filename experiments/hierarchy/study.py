@@ -10,7 +10,6 @@ python experiments/hierarchy/study.py              draws and tabulates the store
 from __future__ import annotations
 
 import sys
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -148,12 +147,15 @@ def _below_ceiling(runs: Rows) -> list[float]:
 
 
 def of_the_map(rows: Rows) -> Rows:
-    """Return the runs of each learner's most common length without uniform options, which all selectors have."""
-    commonest = {}
-    for (low,), of_learner in groups(rows, "low").items():
-        lengths = Counter(row["total"] for row in of_learner)
-        commonest[low], _ = lengths.most_common(1)[0]
-    return [row for row in rows if row["total"] == commonest[row["low"]] and row["uniform_option_steps"] == 0]
+    """Return the runs without uniform options, of the length that most selectors have over the learner."""
+    plain = [row for row in rows if row["uniform_option_steps"] == 0]
+    length = {}
+    for (low,), of_learner in groups(plain, "low").items():
+        selectors = {
+            total: len(groups(of_length, "high")) for (total,), of_length in groups(of_learner, "total").items()
+        }
+        length[low] = max(selectors, key=lambda total: selectors[total])
+    return [row for row in plain if row["total"] == length[row["low"]]]
 
 
 def draw_map(results: Rows, path: Path) -> None:
