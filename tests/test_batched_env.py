@@ -411,6 +411,19 @@ def test_bad_actions_and_options_of_a_adapter_are_refused_in_one_line():
         BatchedEnvAdapter("hpamdp.env.catch_point.environment:CatchPointEnv", render_mode="human")
 
 
+def test_a_closed_environment_needs_a_reset_before_the_next_step():
+    env = gymnasium.make("hpamdp/CatchPoint-v0")
+    env.reset(seed=0)
+    env.close()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(env.action_space.sample())
+    envs = gymnasium.make_vec("hpamdp/CatchPoint-v0", num_envs=2)
+    envs.reset(seed=0)
+    envs.close()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step(envs.action_space.sample())
+
+
 @pytest.mark.parametrize(
     "env_id",
     [

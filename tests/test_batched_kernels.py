@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from numba import njit
 
 from hpamdp import keys
 from hpamdp.env import counter_rng, kernels
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.circuit.environment import CircuitEnv
 from hpamdp.env.circuit.rules import TASKS
@@ -130,7 +133,7 @@ def play(env, num_steps: int, tolerance: float) -> tuple[set[int], int]:
     "name", [pytest.param(each, marks=[pytest.mark.slow] if each == "hard_goal" else []) for each in PROBLEMS]
 )
 @settings(max_examples=4, deadline=None)
-@given(data=st.data(), seed=st.integers(0, 2**31 - 1), is_evaluation=st.booleans())
+@given(data=st.data(), seed=st.integers(0, 2**32 - 1), is_evaluation=st.booleans())
 def test_a_kernel_does_what_the_rules_say_with_all_settings(name, data, seed, is_evaluation):
     problem, choices, tolerance = PROBLEMS[name]
     env = problem(200, seed=seed, first_env=5, **data.draw(st.fixed_dictionaries(choices)))
@@ -193,6 +196,17 @@ def test_a_row_is_the_same_to_the_bit_in_every_batch(name, num):
                 assert torch.equal(alone["next", entry], after["next", entry][row : row + 1])
             for own, column in zip(one.state, many.state, strict=True):
                 assert torch.equal(own, column[row : row + 1])
+
+
+@pytest.mark.parametrize("problem", [CatchPointEnv, BoatDockEnv])
+def test_every_seed_has_episodes_of_its_own_with_and_without_a_kernel(problem):
+    shown = []
+    for seed in (4, 2**31 - 5, 2**31 + 4, 2**32 - 5, 2**32 + 4, 2**64 + 4):
+        fast, slow = problem(8, seed=seed), problem(8, seed=seed)
+        slow.leave_kernel()
+        shown.append(fast.reset()[keys.OBSERVATION])
+        assert torch.allclose(shown[-1], slow.reset()[keys.OBSERVATION], atol=1e-5), seed
+    assert not any(torch.equal(one, other) for one, other in itertools.combinations(shown, 2))
 
 
 def test_a_subclass_with_rules_of_its_own_has_no_kernel():

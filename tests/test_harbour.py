@@ -203,10 +203,10 @@ def test_normal_numbers_have_the_moments_of_the_normal_distribution():
     assert torch.stack([first, second]).corrcoef()[0, 1].abs() < 0.012
 
 
-def test_seeds_of_any_size_are_accepted_and_those_of_32_bits_differ():
+def test_seeds_of_any_size_are_accepted_and_large_ones_do_not_stand_for_small_ones():
     for seed in (-1, 2**32, 2**63 - 1, 12345678901234567890):
         assert counter_rng.seed_tensor(seed).dtype == torch.int32
-    seeds = [0, 1, 2**16, 2**31 - 1, 2**31, 2**32 - 1]
+    seeds = [0, 1, 2, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**32 + 1, 2**33, 2**64, 2**64 + 1]
     assert len({counter_rng.seed_tensor(seed).item() for seed in seeds}) == len(seeds)
 
 

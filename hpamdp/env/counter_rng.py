@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from hpamdp.env.rng_streams import EVALUATION, EVALUATION_NOISE, NOISE, STEPS, TRAINING
+from hpamdp.env.rng_streams import EVALUATION, EVALUATION_NOISE, NOISE, STEPS, TRAINING, folded
 
 # Arguments for compiling functions that draw random numbers. Each operation of the hash reads its input twice. By
 # default the compiler inlines these operations into one another, which takes two minutes.
@@ -84,6 +84,5 @@ def normal(key: RngKey, index: int | Tensor) -> Tensor:
 
 def seed_tensor(seed: int, device: torch.device | None = None) -> Tensor:
     """Fold a Python integer of any size into the int32 scalar for `rng_key`."""
-    folded = (seed ^ (seed >> 32)) & 0xFFFFFFFF
-    signed = folded - (1 << 32) if folded >= 1 << 31 else folded
-    return torch.tensor(signed, dtype=torch.int32, device=device)
+    bits = folded(seed)
+    return torch.tensor(bits - 2**32 if bits >= 2**31 else bits, dtype=torch.int32, device=device)

@@ -169,6 +169,10 @@ class GymnasiumAdapter(gymnasium.Env):
             self._track.append(self._problem.state)
         return observations[0], rewards.item(), terminations.item(), truncations.item(), self._problem.info()
 
+    def close(self) -> None:
+        """End the episode; the environment must be reset before it is used again."""
+        self._problem.is_reset = False
+
     def render(self) -> np.ndarray | None:
         """Return a picture of the episode so far, uint8 `[480, 480, 3]`; None without a render mode."""
         if self.render_mode is None:
@@ -248,6 +252,10 @@ class GymnasiumVectorAdapter(VectorEnv):
             observations = self._problem.reset(None, None, is_done)
         infos.update(self._masked_infos(np.ones(self.num_envs, bool)))
         return observations, rewards, terminations, truncations, infos
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End the episodes, as Gymnasium's `close` asks; the environments must be reset before they are used again."""
+        self._problem.is_reset = False
 
     def _check_mask(self, mask: Any, seed: int | None) -> None:
         if mask is None:

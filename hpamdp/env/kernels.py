@@ -23,11 +23,11 @@ import numpy as np
 from numba import int32, njit, uint32, uint64
 
 from hpamdp.env.rng_streams import STEPS
+from hpamdp.env.rng_streams import folded as folded  # kernels take folded seeds
 
 _STREAM_STEPS = tuple(step & 0xFFFFFFFF for step in STEPS)
 # The multipliers of `counter_rng`.
 _FIRST, _SECOND = np.uint32(0x7FEB352D), np.uint32(0x846CA68B)
-_MASK = 0xFFFFFFFF
 
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 TURN = np.float32(2.0 * math.pi)
@@ -101,11 +101,6 @@ def unsigned(index: Any) -> Any:
     keeps a loop from being vectorised.
     """
     return uint64(index)
-
-
-def folded(seed: int) -> int:
-    """Fold an integer of any size into 32 bits, as `counter_rng.seed_tensor` does."""
-    return (seed ^ (seed >> 32)) & _MASK
 
 
 @inlined
