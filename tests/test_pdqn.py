@@ -385,9 +385,9 @@ def test_the_search_is_refused_where_values_depend_on_other_actions_parameters()
         make(search_samples=8, multipass=False)
 
 
-def test_epsilon_can_fall_with_the_episodes():
-    learner = make(warmup_steps=20, updates_per_step=0.01, epsilon_episodes=100, epsilon_final=0.2)
-    learn(learner, 1, size=50)
+def test_epsilon_can_fall_with_the_episodes_from_the_start():
+    learner = make(warmup_steps=80, updates_per_step=0.01, epsilon_episodes=100, epsilon_final=0.2)
+    learn(learner, 1, size=50)  # in the warm-up
     assert learner.policy.epsilon == pytest.approx(1.0 - 0.8 * 0.5)
     learn(learner, 2, size=50)
     assert learner.policy.epsilon == pytest.approx(0.2)

@@ -21,8 +21,10 @@ Differs from the source:
   weight is their gain in value. A gradient alone stays on the hill that it began on;
 - with `layer_norm` the critics' layers are normalised (Ball et al. 2023, arXiv 2302.02948);
 - critic updates compute only the chosen action's pass, and all passes share the state's part of the first layer;
-- networks start as PyTorch's, not as Kaiming et al. proposed;
-- executed and stored parameters are clipped to their bounds; the code of Bester et al. stores what the actor gave;
+- networks start as PyTorch's, the actor's last layer at a hundredth of that. The code of Bester et al. starts layers as
+  Kaiming et al. proposed, biases at 0, the actor's outputs near 0 and, on Goal, the critic's;
+- parameters are clipped to their bounds before a critic sees them and before they are stored, also with inverting
+  gradients. In the code of Bester et al. critics see and the buffer stores what the actor gave;
 - the defaults add what TD3 adds to DDPG: twin critics, target smoothing and a delayed actor. The actor, too, increases
   the minimum of both critics; TD3's actor uses the first one;
 - the defaults squash parameters by tanh, do not clip gradients, draw the parameters of random actions uniformly, and
@@ -115,7 +117,7 @@ class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
     epsilon_episodes: PositiveInt | None = None
     """Episodes that end with the learner's own steps, within which the probability of a random action falls.
 
-    They are counted from the start and take the place of `epsilon_steps`.
+    They are counted from the start, those of the warm-up too, and take the place of `epsilon_steps`.
     """
 
     @model_validator(mode="after")
@@ -281,6 +283,7 @@ class PDQN(ReplayLearner):
     takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
     takes_pictures = True
     exploring_keys = frozenset({PROCESS})
+    progress = ReplayLearner.progress | {"episodes"}
 
     options: PDQNOptions
     policy: PDQNPolicy
@@ -417,15 +420,17 @@ class PDQN(ReplayLearner):
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Store the batch's transitions, count its episodes; after the warm-up, make the updates that are due."""
         self.episodes += (batch["next", keys.DONE].squeeze(-1) & mask).sum()
+        options = self.options
+        if options.epsilon_episodes is not None:
+            fallen = linear_schedule(int(self.episodes), options.epsilon_episodes, options.epsilon_final)
+            self.policy.epsilon.fill_(fallen)
         return super().learn(batch, mask)
 
     def on_progress(self, steps: int) -> None:
         """Lower the probability of random actions, and the learning rates."""
         options = self.options
-        time, over = steps, options.epsilon_steps
-        if options.epsilon_episodes is not None:
-            time, over = int(self.episodes), options.epsilon_episodes
-        self.policy.epsilon.fill_(linear_schedule(time, over, options.epsilon_final))
+        if options.epsilon_episodes is None:
+            self.policy.epsilon.fill_(linear_schedule(steps, options.epsilon_steps, options.epsilon_final))
         fraction = linear_schedule(steps, options.lr_steps, options.lr_final_fraction)
         set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
