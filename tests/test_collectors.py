@@ -155,7 +155,8 @@ def test_a_copy_takes_all_that_a_policy_acts_by(low):
     warmup = ["low.warmup_steps=8"] if low in ("hyar", "hsac", "iql", "pdqn", "qpamdp", "td3_bc") else []
     small = [word for word in SHORT.get(low, []) if "warmup_steps" not in word]
     sizes = ["num_envs=8", "steps_per_batch=8", "eval.layouts=4", "compile_updates=false"]
-    config = make_config([*sizes, "high=ucb", f"low={low}", *small, *warmup])
+    annealed = ["low.max_scale_final=0.7", "low.anneal_steps=64"] if low == "hppo" else []
+    config = make_config([*sizes, "high=ucb", f"low={low}", *small, *warmup, *annealed])
     parts = assemble(config)
     collection = config.collector.build(config=config, parts=parts, frames=0)
     torch.manual_seed(1)
@@ -165,6 +166,8 @@ def test_a_copy_takes_all_that_a_policy_acts_by(low):
     batch = collection.next()[:, 0].select(*parts.policy.in_keys, strict=False)
     assert copy.receive(packed(parts.policy)) > 0.0
     assert_same_state(parts.policy.state_dict(), copy.policy.state_dict())
+    buffers, copied = (sorted(each.named_buffers(remove_duplicate=False)) for each in (parts.policy, copy.policy))
+    assert_same_state(dict(buffers), dict(copied))  # those too that no state dict has
     torch.manual_seed(2)
     expected = parts.policy(batch.clone())
     torch.manual_seed(2)

@@ -300,7 +300,7 @@ def test_learning_rate_and_scale_are_annealed_over_the_steps_of_the_whole_run():
     assert scales == pytest.approx([0.05, 0.0005**0.5, 0.01, 0.01])
 
 
-def test_the_largest_scale_is_annealed_and_follows_from_the_steps_in_a_state_dict():
+def test_the_largest_scale_is_annealed_and_part_of_the_state_dict():
     options = dict(max_scale_final=0.1, initial_scale=0.9, lr=1e-6, lr_final=0.0, anneal_steps=512)
     learner, resumed, started = make(**options), make(**options), make(**options)
     observation = torch.zeros(1, 4)
@@ -312,10 +312,13 @@ def test_the_largest_scale_is_annealed_and_follows_from_the_steps_in_a_state_dic
     assert scales[0] > 0.8
     assert 0.1 < scales[1] < 0.32
     assert scales[2] < 0.1
+    few = one_step_rows(learner, 2)  # they wait for more: the scale must not move before an update
+    learner.learn(few, everything(few))
     resumed.load_state_dict(learner.state_dict())
     torch.testing.assert_close(resumed.actor.log_max_scale, learner.actor.log_max_scale, rtol=0.0, atol=0.0)
     started.load_networks(learner.state_dict())
     assert started.actor.log_max_scale.exp().item() == pytest.approx(1.0)
+    assert started.actor.log_min_scale.exp().item() == pytest.approx(started.options.min_scale)
 
 
 def test_too_few_rows_wait_for_more_and_are_part_of_the_state_dict():

@@ -164,6 +164,7 @@ class HPPO(OnPolicy, Learner):
     takes_pictures = True
     counts_durations = True
     explores_with = frozenset({"actions", "rewards"})
+    progress = Learner.progress | {"log_min_scale", "log_max_scale"}
 
     frames: Tensor
 
@@ -189,6 +190,7 @@ class HPPO(OnPolicy, Learner):
             options.initial_scale,
             options.initial_parameters,
             vector_products=options.vector_products,
+            anneals_max_scale=options.max_scale_final is not None,
         )
         products = [] if self.actor.products is None else [self.actor.products]
         self.critic = nn.Sequential(
@@ -205,7 +207,6 @@ class HPPO(OnPolicy, Learner):
             self.actor, specs, writes_raw=True, samples_when_greedy=samples, perception=self.perception
         )
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
-        self.register_load_state_dict_post_hook(lambda *_: self._limit_scale())
         self.to(device)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=options.lr, eps=1e-5, fused=True)
 
@@ -231,15 +232,10 @@ class HPPO(OnPolicy, Learner):
         entropy_weight = torch.tensor(left, device=rows.device, dtype=torch.float32)
         steps = [self.gradient_step(self.loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]
         self.actor.set_min_scale(options.min_scale * (options.min_scale_final / options.min_scale) ** progress)
-        self._limit_scale()
+        if options.max_scale_final is not None:
+            progress = min(1.0, self.frames.item() / options.anneal_steps)  # of the steps to come
+            self.actor.set_max_scale(options.max_scale * (options.max_scale_final / options.max_scale) ** progress)
         return mean_scalars(steps)
-
-    def _limit_scale(self) -> None:
-        """Set the largest standard deviation for the steps to come, from the number of steps so far."""
-        start, final = self.options.max_scale, self.options.max_scale_final
-        if final is not None:
-            progress = min(1.0, self.frames.item() / self.options.anneal_steps)
-            self.actor.set_max_scale(start * (final / start) ** progress)
 
     def loss(self, rows: Mapping[str, Tensor], entropy_weight: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of actors and critic on a minibatch `[B]`, and scalars to log."""
