@@ -500,6 +500,17 @@ def test_scripts_of_options_check_all_runs_before_they_train(script, words, comp
             module.train_all(words, module.RECIPE, train, module.FILE, module.RUN)
 
 
+def test_scripts_of_options_show_the_row_of_a_run_that_its_table_refuses(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(EXPERIMENTS / "options"))
+    module = load_script(EXPERIMENTS / "options" / "train_rooms.py")
+    file = tmp_path / "rooms.csv"
+    file.write_text("low,seed,steps,share\nhppo,0,100,0.5\n", encoding="utf-8")
+    before = file.read_bytes()
+    with pytest.raises(SystemExit, match=r"hppo: has runs of .*\. The row of the run: hppo,1,200,0\.75"):
+        module.add_row(file, {"low": "hppo", "seed": 1, "steps": 200, "share": 0.75}, ("low", "seed"), steps="steps")
+    assert file.read_bytes() == before
+
+
 GATHERING = [
     file.parent.name
     for file in sorted(EXPERIMENTS.glob("*/study.py"))

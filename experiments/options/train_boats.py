@@ -14,10 +14,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hpamdp.analysis.study import add_to_tables
+from train_rooms import add_row
+
 from hpamdp.messages import exit_code
 
-HERE = Path(__file__).resolve().parent
+FILE = Path(__file__).resolve().parent / "boats.csv"
 FIGURES = (
     "score",
     "success",
@@ -53,8 +54,8 @@ def main(words: Sequence[str]) -> None:
     """Train and add the row."""
     if not all(any(word.startswith(f"{level}=") for word in words) for level in ("high", "low")):
         raise SystemExit("give words of the command line, high=... and low=... among them; nothing was trained")
-    add_to_tables(HERE, {"boats": [train(words)]}, ("words", "seed"), sorts=False)
-    print(f"{HERE / 'boats.csv'}: a row added; study.py tabulates it")
+    add_row(FILE, train(words), ("words", "seed"), sorts=False)
+    print(f"{FILE}: a row added; study.py tabulates it")
 
 
 if __name__ == "__main__":

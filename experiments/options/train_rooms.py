@@ -342,8 +342,26 @@ def train_all(
             row = train(config)
         except ConfigError as error:  # such as a selector that refuses the options of its run
             raise SystemExit(str(error)) from error
-        add_to_tables(file.parent, {file.stem: [row]}, run, steps="steps")
+        add_row(file, row, run, steps="steps")
     print(f"{file}: rows added; study.py tabulates them")
+
+
+def add_row(file: Path, row: Mapping[str, Any], run: Sequence[str], **how: Any) -> None:
+    """Add the row of a run to a csv file. If it is refused, show it, since the run is over.
+
+    Args:
+        file: the csv file.
+        row: the row.
+        run: its columns that name the run.
+        how: further arguments of `add_to_tables`.
+
+    Raises:
+        SystemExit: the row does not go with those in the file.
+    """
+    try:
+        add_to_tables(file.parent, {file.stem: [row]}, run, **how)
+    except SystemExit as refused:
+        raise SystemExit(f"{refused}. The row of the run: {','.join(map(str, row.values()))}") from refused
 
 
 if __name__ == "__main__":

@@ -20,7 +20,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from hpamdp.analysis.study import Rows, Run, difference, gathered, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    difference,
+    gathered,
+    groups,
+    read_csv,
+    refuse_repeats,
+    spread,
+    with_repeats_replaced,
+    write_tables,
+)
 from hpamdp.config.compose import conf_dir
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.messages import exit_code
@@ -84,17 +95,15 @@ def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, fl
 
 
 def add(runs: Sequence[Run]) -> None:
-    """Score the agents of runs, and replace each agent's rows in results.csv."""
+    """Score the agents of runs, and replace each agent's rows in results.csv.
+
+    Raises:
+        SystemExit: two of the runs have the same agent.
+    """
     evaluations: dict[str, Evaluation] = {}
-    for run in tqdm(runs):
-        new = list(score(run, evaluations))
-        old = read_csv(HERE / "results.csv") if (HERE / "results.csv").exists() else []
-        kept = [row for row in old if _agent(row) != _agent(new[0])]
-        write_tables(HERE, {"results": kept + new})
-
-
-def _agent(row: dict[str, Any]) -> list[Any]:
-    return [row[column] for column in AGENT_COLUMNS]
+    new = [row for run in tqdm(runs) for row in score(run, evaluations)]
+    refuse_repeats(new, (*AGENT_COLUMNS, "noise", "level"), AGENT_COLUMNS)
+    write_tables(HERE, {"results": with_repeats_replaced(read_csv(HERE / "results.csv"), new, AGENT_COLUMNS)})
 
 
 def table(rows: Rows) -> str:

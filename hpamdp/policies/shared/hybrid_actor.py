@@ -70,7 +70,7 @@ class HybridActor(nn.Module):
         initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
         vector_products: whether the hidden layers also see `VectorProducts`.
         has_values: whether integer parameters with at most `MAX_VALUES` values have a categorical.
-        anneals_max_scale: whether `set_max_scale` will be called. Then the state dict has the largest standard deviation.
+        anneals_max_scale: whether `set_max_scale` will be called. Then the state dict has the largest deviation, too.
 
     Attributes:
         products: appends vector products to observations; None without `vector_products`.
