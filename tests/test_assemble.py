@@ -16,7 +16,6 @@ from hpamdp.env.base import ProblemError
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.env.rooms.environment import RoomsEnv
-from hpamdp.policies.base import Learner
 from hpamdp.run.assemble import AssembledRun, assemble
 from hpamdp.run.trainer import Trainer
 
@@ -197,7 +196,8 @@ def test_learners_of_another_run_bring_their_networks_and_begin_their_schedules_
     parts = make(make_config([*words, f"low.checkpoint={tmp_path / 'first'}"]), tmp_path / "second")
     loaded = copied(parts.agent.learners)
     assert trained["0.frames"] > 0
-    restarted = {name for name in loaded if name.rpartition(".")[2] in Learner.progress}
+    progress = parts.agent.learners[0].progress
+    restarted = {name for name in loaded if name.rpartition(".")[2] in progress}
     assert "0.frames" in restarted
     for name, value in loaded.items():
         assert torch.equal(value, (fresh if name in restarted else trained)[name]), name

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from hpamdp.policies.shared import contingent_planning
 from hpamdp.policies.shared.contingent_planning import ContingentSearch
-from hpamdp.policies.shared.planning import SequenceSearchOptions
+from hpamdp.policies.shared.planning import SequenceSearchOptions, absolute_temperature
 
 ASKS, GUESSES = 1, 0
 TARGETS = torch.tensor([-0.5, 0.5])  # of the second step's parameter, under either hypothesis
@@ -44,6 +45,20 @@ def test_a_forbidden_action_finds_nothing_out():
     allowed = torch.ones(3, 1, 2, dtype=torch.bool)
     allowed[..., ASKS] = False
     assert (planned(0.0, allowed=allowed).discrete == GUESSES).all()
+
+
+def test_the_temperature_does_not_count_what_is_forbidden(monkeypatch):
+    spreads = []
+
+    def temperature(temperature, returns):
+        spreads.append(returns.abs().max())
+        return absolute_temperature(temperature, returns)
+
+    monkeypatch.setattr(contingent_planning, "absolute_temperature", temperature)
+    allowed = torch.ones(3, 1, 2, dtype=torch.bool)
+    allowed[..., ASKS] = False
+    planned(0.0, allowed=allowed)
+    assert max(spreads) < 10.0
 
 
 def test_the_first_action_is_the_best_one_for_all_hypotheses():

@@ -158,6 +158,13 @@ def test_actor_learns_which_option_is_better_where():
     assert greedy_regret(actor) < 0.2
 
 
+@pytest.mark.parametrize("scale", [0.01, 1e4])
+def test_actor_learns_from_returns_of_any_size(scale):
+    actor = make(Actor)
+    play(actor, lambda observation: scale * by_sign(observation), 4000, 50, noise=0.5 * scale)
+    assert greedy_regret(actor) < 0.2
+
+
 def test_actor_samples_options_by_its_probabilities_and_writes_them():
     actor = make(Actor)
     observation = torch.tensor([[0.5, -0.5]]).expand(40_000, 2)

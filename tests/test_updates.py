@@ -18,13 +18,16 @@ from toy_steps import SPECS, sample
 
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.hyar import LATENT, HyAR
+from hpamdp.policies.low_level.iql import IQL
 from hpamdp.policies.low_level.paddpg import SCORES
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.policies.low_level.pets.learner import PETS
+from hpamdp.policies.low_level.pets.model import MemberNet
 from hpamdp.policies.shared.gradients import gradients_of
-from hpamdp.policies.shared.networks import EnsembleMLP, HybridCritics, mlp
+from hpamdp.policies.shared.networks import EnsembleMLP, HybridCritics, InitialLayer, mlp
 from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.run.assemble import assemble
 from hpamdp.specs import PAMDPSpecs
@@ -211,7 +214,9 @@ def test_in_bfloat16_the_ratios_before_any_update_are_1_at_the_final_scale(is_pa
         torch.testing.assert_close(ratio, torch.ones_like(ratio), atol=1e-3, rtol=0.0)
 
 
-@pytest.mark.parametrize("name", ["mlp", "ensemble", "one value", "pdqn", "multipass", "no hidden layer", "hppo"])
+@pytest.mark.parametrize(
+    "name", ["mlp", "ensemble", "one value", "pdqn", "multipass", "no hidden layer", "hppo", "pets"]
+)
 def test_in_bfloat16_values_near_50_are_as_fine_as_in_float32(name):
     torch.manual_seed(0)
     critics = partial(HybridCritics, SPECS, 2)
@@ -223,16 +228,39 @@ def test_in_bfloat16_values_near_50_are_as_fine_as_in_float32(name):
         "multipass": lambda: ((net := critics([128, 128], is_multipass=True)), net.net.layers[-1]),
         "no hidden layer": lambda: ((net := critics([], is_multipass=True)), net.net.layers[-1]),
         "hppo": lambda: ((net := test_hppo.make().critic), net[-1]),
+        "pets": lambda: ((net := MemberNet(2, 4, [128, 128], 3)), net.layers[-1]),
     }[name]()
     with torch.no_grad():
         last.bias.fill_(50.0)
-        inputs = (torch.rand(500, 4),) + ((torch.rand(500, 3),) if isinstance(net, HybridCritics) else ())
+        inputs = (torch.rand(2, 500, 4) if name == "pets" else torch.rand(500, 4),)
+        inputs += (torch.rand(500, 3),) if isinstance(net, HybridCritics) else ()
         exact = net(*inputs)
         with torch.autocast("cpu", torch.bfloat16):
             lower = net(*inputs)
     assert lower.dtype == torch.float32
     assert (lower - exact).abs().max() < 0.01
     assert len(lower.unique()) > 400, "bfloat16 has steps of 0.25 there"
+
+
+def test_schedules_start_again_in_a_learner_that_takes_over_networks():
+    small = dict(hidden_dims=(8,), batch_size=4, buffer_size=100)
+
+    def taken_over(cls, **settings):
+        old, new = cls(SPECS, **settings), cls(SPECS, **settings)
+        for name, buffer in old.named_buffers():
+            if name.rpartition(".")[2] in ("frames", "updates", "episodes", "actor_updates"):
+                buffer.fill_(5000)
+        old.on_progress(5000)
+        new.load_networks(old.state_dict())
+        new.on_progress(0)
+        return new
+
+    learner = taken_over(PDQN, epsilon_episodes=100, **small)
+    assert learner.episodes == 0 and learner.policy.epsilon == 1.0
+    learner = taken_over(HyAR, noise_initial=1.0, noise_episodes=100, parameter_noise=0.1, **small)
+    assert learner.policy.noise == 1.0
+    learner = taken_over(IQL, actor_lr_updates=1000, **small)
+    assert learner.actor_updates == 0 and learner.updates == 5000
 
 
 def test_plans_in_bfloat16_tell_rewards_near_50_apart():
@@ -250,6 +278,24 @@ def test_plans_in_bfloat16_tell_rewards_near_50_apart():
         exact = planner.returns(state, discrete, unit)
     assert (lower - exact).abs().max() < 0.01
     assert (lower.argmax(1) == exact.argmax(1)).float().mean() >= 0.9
+
+
+def test_the_last_layer_of_a_plan_of_pets_is_float32():
+    torch.manual_seed(0)
+    net = MemberNet(2, 4, [128, 128], 3)
+    with torch.no_grad():
+        net.layers[-1].bias.fill_(50.0)
+        states = torch.rand(2, 500, 4)
+        lower, exact = net(states, torch.bfloat16), net(states)
+    assert 0.0 < (lower - exact).abs().max() < 0.02
+
+
+def test_in_bfloat16_initial_parameters_are_as_fine_as_in_float32():
+    layer = InitialLayer(PAMDPSpecs.from_env(PlatformEnv(1)), "domain", is_squashed=True)
+    states = torch.rand(500, 9)
+    with torch.autocast("cpu", torch.bfloat16):
+        lower = layer(states)
+    torch.testing.assert_close(lower, layer(states), rtol=0.0, atol=0.0)
 
 
 @pytest.mark.parametrize("name", ["pdqn", "hyar", "hsac"])

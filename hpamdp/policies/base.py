@@ -667,7 +667,7 @@ class Learner(Level, nn.Module):
             RuntimeError: it is of another class or size.
         """
         fresh = {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in self.progress}
-        self.load_state_dict({name: fresh.get(name, value) for name, value in state.items()})
+        self.load_state_dict({**state, **fresh})
 
     def steps_to_update(self) -> dict[str, int]:
         """Return the least number of own steps before the first update, by the name of each setting that requires one.

@@ -41,6 +41,7 @@ from hpamdp.policies.base import Learner, Level
 from hpamdp.run.state_checks import (
     Progress,
     SavedPart,
+    added_later,
     buffers_sized_by_data,
     check_form,
     check_generator,
@@ -439,7 +440,8 @@ class _Opened:
             saved: the state dict, not yet read.
             module: the module that will load the state.
             device: the device of the returned tensors.
-            may_lack: entries whose names begin so may be missing; then the returned state lacks them, too.
+            may_lack: entries whose names begin so may be missing, as those `added_later` may; then the returned state
+                lacks them, too.
 
         Raises:
             ValueError: the state is of another module, or holds invalid numbers.
@@ -448,8 +450,10 @@ class _Opened:
         archive = self._parts[name]
         own = module.state_dict(keep_vars=True)
         any_size = buffers_sized_by_data(module)
-        if may_lack and isinstance(saved, Mapping):
-            own = {key: value for key, value in own.items() if key in saved or not key.startswith(may_lack)}
+        if isinstance(saved, Mapping):
+            later = added_later(module)
+            lacks = {key for key in own if key in later or (may_lack and key.startswith(may_lack))} - saved.keys()
+            own = {key: value for key, value in own.items() if key not in lacks}
         check_names(saved, own)
         for key, value in own.items():
             if isinstance(value, Tensor):

@@ -313,6 +313,7 @@ class HyAR(ReplayLearner):
     takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
     may_be_nan: ClassVar[frozenset[str]] = frozenset({LATENT})
+    progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"episodes", "noise"}
 
     options: HyAROptions
     policy: HyARPolicy
@@ -332,7 +333,6 @@ class HyAR(ReplayLearner):
         super().__init__(specs, device, options)
         if specs.num_parameters == 0:
             raise SettingError("HyAR encodes parameters, but no discrete action of the problem has one; use low=pdqn")
-        self.reward_scale = options.reward_scale
         self.policy_delay = options.policy_delay if options.twin else 1
         self.smoothing = options.target_smoothing if options.twin else 0.0, options.target_smoothing_clip
 

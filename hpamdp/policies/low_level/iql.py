@@ -58,7 +58,10 @@ class IQLOptions(HeadOptions, ActorCriticOptions, TargetRateOptions, ScaleOption
     expectile: Expectile = 0.8
     """Expectile of the actions' values that V estimates: 0.5 is their mean, 1 their maximum."""
     temperature: PositiveFloat = 10.0
-    """An action has weight exp(temperature * advantage) in the policy's likelihood."""
+    """An action has weight exp(temperature * advantage) in the policy's likelihood.
+
+    With advantages much larger than a tenth most weights are 0 or `max_weight`; then `reward_scale` should be smaller.
+    """
     max_weight: PositiveFloat = 100.0
     """Largest weight of an action."""
 
@@ -70,8 +73,10 @@ class IQL(ReplayLearner):
     takes = frozenset(ActionFeature)
     explores_with: ClassVar[frozenset[str]] = frozenset()  # its policy stays near the actions in the data
     stores_own_parameters = True
+    progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"actor_updates"}
 
     options: IQLOptions
+    actor_updates: Tensor
 
     def __init__(
         self,
@@ -93,6 +98,9 @@ class IQL(ReplayLearner):
         )
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = HybridPolicy(self.actor, specs)
+        # Those of this run, for the schedule of the learning rate.
+        has_schedule = options.actor_lr_updates > 0
+        self.register_buffer("actor_updates", torch.zeros((), dtype=torch.long), persistent=has_schedule)
         self.to(device)
         self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
@@ -108,8 +116,9 @@ class IQL(ReplayLearner):
         scalars = self.gradient_step("critics", self.critic_loss, sample) | of_value | {"q": q.mean()}
         polyak_update(self.target_critics, self.critics, self.options.tau)
         if self.options.actor_lr_updates > 0:
-            fraction = cosine_schedule(int(self.updates) - 1, self.options.actor_lr_updates)
+            fraction = cosine_schedule(int(self.actor_updates), self.options.actor_lr_updates)
             set_learning_rates(self.optimizers, {"actor": self.options.actor_lr}, fraction)
+            self.actor_updates += 1
         return scalars | self.gradient_step("actor", self.actor_loss, sample, self.allowed(sample), q)
 
     def value_loss(self, state: Tensor, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

@@ -300,7 +300,6 @@ class PDQN(ReplayLearner):
         options = PDQNOptions.of(options, settings)
         super().__init__(specs, device, options)
         self.stores_own_parameters = options.multipass and specs.components.is_single
-        self.reward_scale = options.reward_scale
         self.max_grad_norm = options.max_grad_norm
         self.register_buffer("episodes", torch.zeros((), dtype=torch.long))
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Annotated
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
@@ -27,8 +27,6 @@ class SearchingActorOptions(EpsilonOptions, AnnealedRateOptions, TwinCriticOptio
 
     layer_norm: bool = False
     """Normalise the critics' layers, which bounds the values of actions far from all that were tried."""
-    reward_scale: PositiveFloat = 1.0
-    """Factor on the rewards that are learned from."""
     preactivation_penalty: NonNegativeFloat = 0.0
     """Weight of the squared preactivations of tanh in the actor's loss.
 

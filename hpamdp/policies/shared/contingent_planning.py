@@ -87,14 +87,16 @@ class ContingentSearch:
             allowed = torch.cat([allowed, allowed[:, -1:]], 1)
         first_returns = returns if first_returns is None or self.options.num_iterations == 1 else first_returns
         found = self._first(shows, num_hypotheses, is_greedy)
-        found = self._with_values(found, first_returns, allowed)
-        temperature = absolute_temperature(self.options.temperature, found.value)
+        value = self._values(found, first_returns)
+        temperature = absolute_temperature(self.options.temperature, value)
+        found = self._with_values(found, value, allowed)
         for refinement in range(self.options.num_iterations - 1):
             if refinement > 0:
                 found = _with_best_first(found)
             found = _with_best_following(found, self.options.num_kept >> refinement)
             own = self._refined(found, temperature, self.search.lower_bound(refinement))
-            found = self._with_values(found._replace(own=own), returns, allowed)
+            found = found._replace(own=own)
+            found = self._with_values(found, self._values(found, returns), allowed)
         best_value, place = found.of_first().flatten(1).max(-1)
         row, num_samples = torch.arange(len(shows), device=shows.device), found.value.shape[-1]
         first, sample = place // num_samples, place % num_samples
@@ -117,12 +119,16 @@ class ContingentSearch:
         discrete = discrete.expand(-1, num_hypotheses, -1, -1, -1)
         return _Candidates(discrete, own.expand(-1, num_hypotheses, *own.shape[2:]), own.new_empty(0), shows)
 
-    def _with_values(self, found: _Candidates, returns: Returns, allowed: Tensor | None) -> _Candidates:
-        """Return candidates with their values: the mean of all hypotheses where the first action shows nothing."""
+    def _values(self, found: _Candidates, returns: Returns) -> Tensor:
+        """Return the values of candidates: the mean of all hypotheses where the first action shows nothing."""
         discrete, own = (part.flatten(2, 3).flatten(0, 1) for part in (found.discrete, found.own))
         value = returns([SequenceStep(discrete[..., h], own[..., h, :]) for h in range(self.options.horizon)])
         value = value.reshape(found.own.shape[:-2])
-        value = torch.where(found.shows[:, None, :, None, None], value, value.mean(1, keepdim=True))
+        return torch.where(found.shows[:, None, :, None, None], value, value.mean(1, keepdim=True))
+
+    @staticmethod
+    def _with_values(found: _Candidates, value: Tensor, allowed: Tensor | None) -> _Candidates:
+        """Return candidates with these values, those of forbidden sequences below all others."""
         if allowed is not None:
             of_steps = allowed[:, None, None, None].expand(*found.discrete.shape, -1)
             is_allowed = of_steps.gather(-1, found.discrete.unsqueeze(-1)).squeeze(-1).all(-1)

@@ -243,7 +243,7 @@ class InitialLayer(nn.Module):
         """Return what to add for observations `[*B, observation_dim]`: `[*B, num_parameters]`, or 0."""
         if not self.exists:
             return 0.0
-        unit_parameters = nn.functional.linear(observation, self.weight, self.bias)
+        unit_parameters = in_float32(lambda x: nn.functional.linear(x, self.weight, self.bias), observation)
         return unsquashed(unit_parameters, _LARGEST_INITIAL) if self.is_squashed else unit_parameters
 
     def shrink(self, output: nn.Module, rows: slice = slice(None)) -> None:

@@ -28,7 +28,8 @@ class OnPolicyOptions(Settings):
     lr: LearningRate = 3e-4
     """Learning rate of Adam."""
     max_grad_norm: PositiveFloat = 0.5
-    """Largest gradient norm of an optimisation step; longer gradients are scaled down."""
+    """Largest gradient norm of an optimisation step; longer gradients are scaled down. `high=actor` limits the norms
+    of its policy and of its critic one by one."""
 
 
 class OnPolicy(nn.Module):

@@ -42,7 +42,7 @@ class PlanningOptions(SearchOptions, EndValueOptions, ReplayOptions):
     epsilon: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.05
     """Probability of a uniformly random action in place of an exploring plan's."""
     planning_precision: Literal["float32", "bfloat16"] = "bfloat16"
-    """Precision of the networks when planning; training is always in float32.
+    """Precision of the networks' hidden layers when planning; `update_precision` is that of updates.
 
     bfloat16 is faster on hardware with instructions for it (AVX-512 BF16, AMX, GPUs) and slower elsewhere.
     """

@@ -55,6 +55,8 @@ class ReplayOptions(BufferOptions):
     """Map each sampled transition by a random symmetry that the problem declares. `auto` does so if there is any."""
     gamma: PositiveFraction = 0.99
     """Discount of a step."""
+    reward_scale: PositiveFloat = 1.0
+    """Factor on the rewards that are stored, and so on values and predicted rewards."""
 
     @model_validator(mode="after")
     def _check_replay(self) -> Self:
@@ -90,7 +92,6 @@ class ReplayLearner(Learner):
         slots: for each discrete action the places of its parameters among all, int64 `[num_discrete, D]`.
         owner: the discrete action that each parameter belongs to, int64 `[num_parameters]`.
         catches_up: true if the first updates make up for the steps of the warm-up.
-        reward_scale: factor on the rewards that are stored.
         max_grad_norm: largest gradient norm of a gradient step; if None, there is no limit.
     """
 
@@ -101,7 +102,6 @@ class ReplayLearner(Learner):
     counts_durations: ClassVar[bool] = True
     stores_own_parameters: bool = False
     catches_up: bool = False
-    reward_scale: float = 1.0
     max_grad_norm: float | None = None
 
     options: ReplayOptions
@@ -187,7 +187,7 @@ class ReplayLearner(Learner):
     def with_bonus(self, sample: TensorDictBase, bonus: Bonus) -> TensorDictBase:
         """Return a sample whose rewards include the bonus for the next states, as new as they are now."""
         assert bonus.of is not None
-        more = self.reward_scale * bonus.weight * bonus.of(sample["next_state"])
+        more = self.options.reward_scale * bonus.weight * bonus.of(sample["next_state"])
         return sample.set("reward", sample["reward"] + more)
 
     @abstractmethod
@@ -305,7 +305,7 @@ class ReplayLearner(Learner):
                 "state": batch[keys.OBSERVATION],
                 "discrete": batch[keys.DISCRETE],
                 "unit": self.specs.to_unit(batch[keys.PARAMETERS], batch),
-                "reward": self.reward_scale * batch["next", keys.REWARD].squeeze(-1),
+                "reward": self.options.reward_scale * batch["next", keys.REWARD].squeeze(-1),
                 "next_state": batch["next", keys.OBSERVATION],
                 "discount": (step_discounts(batch, self.options.gamma) * goes_on).squeeze(-1),
             },

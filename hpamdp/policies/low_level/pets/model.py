@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from hpamdp.policies.shared.canonical_frame import CanonicalFrame, joined
 from hpamdp.policies.shared.joint_choice import JointChoice
-from hpamdp.policies.shared.networks import EnsembleLinear
+from hpamdp.policies.shared.networks import EnsembleLinear, in_float32
 from hpamdp.policies.shared.planning import Prediction
 from hpamdp.policies.shared.planning_policy import PlanningOptions
 from hpamdp.policies.shared.scales import scale_of
@@ -65,20 +65,21 @@ class MemberNet(nn.Module):
 
         Args:
             x: `[E, B, in]`.
-            precision: of the layers.
+            precision: of all layers but the last one, which is computed in float32 (see `in_float32`).
             output_map: `[out, M]`, by which the output is multiplied; as part of the last layer, it costs nothing.
         """
         x = x.mT.to(precision)  # [E, in, B]: see `joined`
-        for place, layer in enumerate(self.layers):
-            assert isinstance(layer, EnsembleLinear)
-            terms: tuple[Tensor, Tensor] = layer.bias, layer.weight
-            if output_map is not None and place == len(self.layers) - 1:
+        *hidden, last = (layer for layer in self.layers if isinstance(layer, EnsembleLinear))
+        for layer in hidden:
+            x = torch.baddbmm(layer.bias.to(precision).mT, layer.weight.to(precision).mT, x).relu_()
+
+        def output(x: Tensor) -> Tensor:
+            terms: tuple[Tensor, Tensor] = last.bias, last.weight
+            if output_map is not None:
                 terms = terms[0] @ output_map, terms[1] @ output_map
-            bias, weight = (term.to(precision) for term in terms)
-            x = torch.baddbmm(bias.mT, weight.mT, x)
-            if place < len(self.layers) - 1:
-                x = x.relu_()
-        return x.mT.float()
+            return torch.baddbmm(terms[0].mT, terms[1].mT, x)
+
+        return in_float32(output, x.float()).mT
 
 
 class PETSModel(nn.Module):
@@ -188,11 +189,11 @@ class PETSModel(nn.Module):
         x = self._inputs(turned, self.action_inputs(kind, own, certainty))
         seen = self._with_context(context, x)
         if self.is_probabilistic:
-            change = self._sampled(self.transition(seen, precision)) @ self._change_map()
+            change = self._changed(self._sampled(self.transition(seen, precision)))
         else:
             change = self.transition(seen, precision, self._change_map())
         if self.has_linear_part:
-            change = change + self._linear_part(x) @ self._change_map()
+            change = change + self._changed(self._linear_part(x))
         outcome = self._outcome(seen, turned, turned + change, precision)
         logit, terminating, continuing = outcome.unbind(-1)
         mean, scale = self.reward_mean, self.reward_scale
@@ -250,7 +251,7 @@ class PETSModel(nn.Module):
             scaled = self._sampled(scaled)
         if self.has_linear_part:
             scaled = scaled + self._linear_part(x)
-        return transition, self._outcome(seen, turned, turned + scaled @ self._change_map(), torch.float32)
+        return transition, self._outcome(seen, turned, turned + self._changed(scaled), torch.float32)
 
     def target_change(self, turned: Tensor, action: Tensor, next_turned: Tensor) -> Tensor:
         """Return the scaled change that is left to the transition networks, `[B, observation_dim]`.
@@ -265,7 +266,7 @@ class PETSModel(nn.Module):
     def _linear_part(self, x: Tensor) -> Tensor:
         """Return the scaled change by the linear model, of the networks' inputs `[*B, in]`."""
         weight, of_cubes, bias = self.linear_weight.split([x.shape[-1], len(self.slot_kind), 1])
-        return x @ weight + self._parameters_in(x) ** 3 @ of_cubes + bias
+        return in_float32(lambda x: x @ weight + self._parameters_in(x) ** 3 @ of_cubes + bias, x)
 
     def _parameters_in(self, x: Tensor) -> Tensor:
         """Return the parameters of all slots, of the networks' inputs."""
@@ -283,6 +284,10 @@ class PETSModel(nn.Module):
     def _change_map(self) -> Tensor:
         """Return what makes changes of the state of scaled changes, `[observation_dim, observation_dim]`."""
         return (self.is_predicted * self.change_scale).unsqueeze(-1) * self.derivation
+
+    def _changed(self, scaled: Tensor) -> Tensor:
+        """Return the changes of the state, given scaled changes."""
+        return in_float32(lambda scaled: scaled @ self._change_map(), scaled)
 
     def _sampled(self, transition: Tensor) -> Tensor:
         """Return scaled changes, sampled from what the transition networks say."""
