@@ -168,6 +168,24 @@ def counting_batches(num_environments: int, num_batches: int, num_steps: int, op
     return batches
 
 
+def seen_with_learned_ends(batches: list) -> list:
+    """Return batches as learners see them if the selector decides on ends: a batch does not show that of its last step.
+
+    The first root of the next batch does.
+    """
+    is_begun = torch.ones(len(batches[0]), 1, 1, dtype=torch.bool)
+    seen = []
+    for batch in batches:
+        ended, done = batch["next", keys.IS_DECISION], batch["next", keys.DONE]
+        seen.append(batch.copy().set(keys.IS_DECISION, torch.cat([is_begun, ended[:, :-1]], 1)))
+        is_begun = ended[:, -1:]
+        known = torch.cat([ended[:, :-1], done[:, -1:]], 1)
+        seen[-1].set(keys.NEXT_OPTION, batch[keys.OPTION])
+        seen[-1].set(("next", keys.IS_DECISION), known)
+        seen[-1].set(("next", keys.OPTION_ENDED), torch.cat([(known & ~done)[:, :-1], torch.ones_like(is_begun)], 1))
+    return seen
+
+
 @pytest.mark.parametrize("buffer_size", [5000, 40])
 def test_windows_follow_an_episode_across_batches_and_cross_no_end_environment_or_option(buffer_size):
     learner = make(horizon=3, buffer_size=buffer_size, batch_size=min(64, buffer_size))
@@ -188,13 +206,15 @@ def test_windows_follow_an_episode_across_batches_and_cross_no_end_environment_o
     assert valid[:, 2].any()
 
 
+@pytest.mark.parametrize("are_learned", [False, True])
 @pytest.mark.parametrize("is_shared", [False, True])
 @pytest.mark.parametrize("buffer_size", [5000, 40, 20])
 @pytest.mark.parametrize("num_steps", [1, 2, 5])
-def test_windows_cross_no_option_that_changes_inside_an_episode(num_steps, buffer_size, is_shared):
+def test_windows_cross_no_option_that_changes_inside_an_episode(num_steps, buffer_size, is_shared, are_learned):
     option_length = 2
     learner = make(horizon=4, buffer_size=buffer_size, batch_size=min(512, buffer_size), warmup_steps=1000)
-    for batch in counting_batches(4, 60 // num_steps, num_steps, option_length):
+    batches = counting_batches(4, 60 // num_steps, num_steps, option_length)
+    for batch in seen_with_learned_ends(batches) if are_learned else batches:
         learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool) if is_shared else batch[keys.OPTION] == 1)
     windows = next_windows(learner)
     seen, valid = windows["state"], windows["valid"]

@@ -48,8 +48,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
+from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import ActionFeature, Bonus, option_ends
+from hpamdp.policies.base import ActionFeature, Bonus, known_ends
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
 from hpamdp.policies.low_level.dlpa.planner import Planner, PlannerOptions
 from hpamdp.policies.shared.end_values import EndValues
@@ -272,11 +273,13 @@ class DLPA(ReplayLearner):
         num_steps = mask.shape[-1]
         rows = self.linked(self.transitions(batch), batch, mask).reshape(-1, num_steps)
         mask = mask.reshape(-1, num_steps)
-        ends = option_ends(batch).reshape(-1, num_steps) | rows["terminated"]
+        ends = known_ends(batch).reshape(-1, num_steps) | rows["terminated"]
         # A step follows the one before it, which may be the last step of an earlier batch.
         last_place, last_trajectory = self._open_steps(rows["state"][:, 0])
         follows = torch.zeros_like(mask)
         follows[:, 0] = mask[:, 0] & (last_place >= 0)
+        if keys.IS_DECISION in batch.keys():  # the option of the batch before may have ended, see `known_ends`
+            follows[:, 0] &= ~batch.get(keys.IS_DECISION).reshape(-1, num_steps)[:, 0]
         follows[:, 1:] = mask[:, 1:] & mask[:, :-1] & ~ends[:, :-1]
 
         # New trajectories are numbered on from those in the buffer.
