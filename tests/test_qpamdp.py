@@ -320,6 +320,53 @@ def test_the_natural_gradient_finds_the_best_parameters():
     torch.testing.assert_close(mean, torch.tensor([-0.4, 0.6]).expand(200, 2), atol=0.08, rtol=0.0)
 
 
+class Always7:
+    """What follows any option is worth 7."""
+
+    decides_ends = True
+
+    def value(self, observation, option, *masks):
+        return torch.full((len(observation),), 7.0)
+
+
+@pytest.mark.parametrize("num_steps", [1, 3, 6])
+def test_options_whose_selector_ends_them_are_counted_once_however_long_batches_are(num_steps):
+    def learned(num_steps, phase):
+        torch.manual_seed(0)
+        learner = ready(parameter_updates=1000, rollouts=10_000, ridge=0.0, initial_episodes=10_000)
+        learner.next_options = Always7()
+        learner.phase.fill_(phase)
+        if phase == PARAMETERS:
+            num_features = len(learner.policy.phi.coefficients)
+            learner.enac.restart(learner.policy.theta.numel() + num_features, torch.ones(40, dtype=torch.bool))
+        whole = play(learner, 40, 24)
+        generator = torch.Generator().manual_seed(1)
+        done = torch.rand(40, 24, 1, generator=generator) < 0.1
+        ended = (torch.rand(40, 24, 1, generator=generator) < 0.3) | done
+        whole["next", keys.DONE] = whole["next", keys.TERMINATED] = done
+        begins = torch.cat([torch.ones_like(ended[:, :1]), ended[:, :-1]], 1)
+        whole[keys.IS_DECISION] = begins
+        whole[keys.NEXT_OPTION] = torch.zeros(40, 24, dtype=torch.long)
+        for start in range(0, 24, num_steps):
+            batch = whole[:, start : start + num_steps].clone()
+            known, is_done = ended[:, start : start + num_steps].clone(), done[:, start : start + num_steps]
+            known[:, -1] = is_done[:, -1]
+            taken = known & ~is_done
+            taken[:, -1] = True
+            batch["next", keys.IS_DECISION], batch["next", keys.OPTION_ENDED] = known, taken
+            learner.learn(batch, torch.ones(40, num_steps, dtype=torch.bool))
+        return learner, int(ended[:, :-1].sum() + done[:, -1].sum())
+
+    learner, num_ended = learned(num_steps, SARSA)
+    assert learner.window_episodes == num_ended
+    learner, num_ended = learned(num_steps, PARAMETERS)
+    whole, _ = learned(24, PARAMETERS)
+    assert learner.enac.num_episodes == whole.enac.num_episodes == num_ended
+    torch.testing.assert_close(learner.enac.gram, whole.enac.gram, rtol=1e-4, atol=1e-2)
+    torch.testing.assert_close(learner.enac.moment, whole.enac.moment, rtol=1e-4, atol=1e-2)
+    torch.testing.assert_close(learner.window_return, whole.window_return)
+
+
 def test_the_regression_is_least_squares_on_whole_episodes_across_batches():
     learner = ready(parameter_updates=1000, rollouts=10_000, ridge=0.0, initial_episodes=1)
     learn(learner, 1)

@@ -61,8 +61,8 @@ def option_ends(batch: TensorDictBase) -> Tensor:
 def known_ends(batch: TensorDictBase) -> Tensor:
     """Return where an episode or an option is known to end, bool `[*B, T, 1]`.
 
-    If the selector decides where options end, only the next batch shows whether one ends with the last step: `is_decision`
-    of its first root. `option_ends` counts the last step, this function does not.
+    If the selector decides where options end, only the next batch shows whether one ends with the last step, by
+    `is_decision` of its first root. `option_ends` counts the last step, this function does not.
     """
     return batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
 

@@ -41,7 +41,7 @@ from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import ActionFeature, Learner, option_ends
+from hpamdp.policies.base import ActionFeature, Learner, known_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters
@@ -338,17 +338,20 @@ class NaturalActorCritic(SizedByData):
         self.moment = self.moment.new_zeros(num_regressors)
         self.num_episodes.zero_()
 
-    def collect(self, rows: TensorDict) -> None:
-        """Add the episodes that end in a batch to the regression.
+    def collect(self, rows: TensorDict, ended_before: Tensor | None = None, value_before: float | Tensor = 0.0) -> None:
+        """Add the episodes that end in a batch, or ended with the one before, to the regression.
 
         Args:
             rows: `[N, T]` with `gradient` `[N, T, num_weights]`, `phi` `[N, T, num_features]`, and `reward`, `done` and
                 `mask` `[N, T]`; only the episodes whose last row is in `mask` count. `is_first` as for `SarsaLambda`.
+            ended_before: where an episode ended with the batch before, as this one shows, bool `[N]`; None: nowhere.
+            value_before: what to add to their returns, `[N]`.
         """
+        ended = torch.zeros_like(self.is_whole) if ended_before is None else ended_before & self.is_whole
+        ended_regressors = [self.regressors[ended]]
+        ended_returns = [(self.returns + value_before)[ended]]
         if "is_first" in rows.keys():
             self.is_fresh = self.is_fresh | rows["is_first"][:, 0]
-        ended_regressors: list[Tensor] = []
-        ended_returns: list[Tensor] = []
         for t in range(rows.shape[1]):
             row = rows[:, t]
             gradient = row["gradient"]
@@ -383,6 +386,36 @@ class NaturalActorCritic(SizedByData):
         solution = regression.solution[:num_weights, 0]
         fisher = self.gram[:num_weights, :num_weights] / self.num_episodes
         return solution.float(), (0.5 * solution @ fisher @ solution).float()
+
+
+class OpenOptions(SizedByData):
+    """Where a batch ended inside an option that may have ended with it, and the value of what follows if it has.
+
+    If the selector decides where options end, the next batch shows whether one ended with the last step.
+    """
+
+    added_later: ClassVar[tuple[str, ...]] = ("is_open", "value")  # checkpoints of 0.2 lack them
+
+    is_open: Tensor  # bool [N]
+    value: Tensor  # discounted, [N]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("is_open", torch.zeros(0, dtype=torch.bool))
+        self.register_buffer("value", torch.zeros(0, dtype=torch.float32))
+
+    def close(self, rows: TensorDict) -> tuple[Tensor, Tensor]:
+        """Return where an option ended with the batch before, bool `[N]`, and the values of what followed, `[N]`.
+
+        Then keep what these rows `[N, T]` leave open, by `is_open` and `open_value`. An episode that was given up
+        between the batches did not end.
+        """
+        num = len(rows)
+        is_open, value = self.is_open, self.value
+        if len(is_open) != num:
+            is_open, value = (each.new_zeros(num) for each in (is_open, value))
+        self.is_open, self.value = (rows[name][:, -1].clone() for name in ("is_open", "open_value"))
+        return is_open & rows["begins_option"][:, 0], value
 
 
 class QPAMDP(Learner):
@@ -424,6 +457,7 @@ class QPAMDP(Learner):
         self.policy = QPAMDPPolicy(specs, self.options)
         self.sarsa = SarsaLambda(self.options)
         self.enac = NaturalActorCritic(self.options.ridge)
+        self.open = OpenOptions()
         self.register_buffer("mask", specs.parameter_mask.float())
         self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf, dtype=torch.float32))
         self.register_buffer("high", torch.full((specs.observation_dim,), -torch.inf, dtype=torch.float32))
@@ -452,17 +486,21 @@ class QPAMDP(Learner):
             self.warm_up(batch[keys.OBSERVATION][mask])
             return {}
         rows = self.rows(batch, mask)
-        num_episodes = (rows["done"] & rows["mask"]).sum()
-        self.window_return += (rows["reward"] * rows["mask"]).sum()
+        ended_before, value_before = self.open.close(rows)
+        num_episodes = (rows["done"] & rows["mask"]).sum() + ended_before.sum()
+        self.window_return += (rows["reward"] * rows["mask"]).sum() + value_before[ended_before].sum()
         self.window_episodes += num_episodes
         scalars = {"phase": float(self.phase)}
         if self.phase == SARSA:
+            # Whether or not the option goes on, its next state has this value.
+            rows["reward"] = rows["reward"] + rows["open_value"]
+            rows["terminated"] = rows["terminated"] | rows["is_open"]
             scalars["td_error"] = self._update_values(rows, num_episodes)
             is_first = self.updates == 0 and self.windows == 0
             wanted = self.options.initial_episodes if is_first else self.options.relearning_episodes
             is_full = self.window_episodes >= wanted
         else:
-            self.enac.collect(rows)
+            self.enac.collect(rows, ended_before, value_before)
             is_full = self.enac.num_episodes >= self.options.rollouts
         if is_full:
             scalars["return"] = (self.window_return / self.window_episodes.clamp(min=1)).item()
@@ -548,30 +586,38 @@ class QPAMDP(Learner):
         """Return what the phase's update needs of a batch `[N, T]`.
 
         A step with which an option ends inside its episode is `terminated` and `done`, and its reward includes the
-        discounted value of what follows.
+        discounted value of what follows. If only the next batch shows whether it ends (`is_open`), that value is apart
+        (`open_value`).
         """
         observation = batch[keys.OBSERVATION]
         reward = batch["next", keys.REWARD].squeeze(-1)
         terminated = batch["next", keys.TERMINATED].squeeze(-1)
         option_ended = batch.get(("next", keys.OPTION_ENDED), None)
+        is_open, open_value = torch.zeros_like(mask), torch.zeros_like(reward)
         if option_ended is not None:
             is_followed = (option_ended & ~batch["next", keys.DONE]).squeeze(-1) & mask
             next_observation = batch["next", keys.OBSERVATION][is_followed]
             masks = [batch["next", keys.ACTION_MASK][is_followed]] if self.specs.has_action_mask else []
             value = self.next_options.value(next_observation, batch[keys.NEXT_OPTION][is_followed], *masks)
-            reward = reward.index_put((is_followed,), self.options.gamma * value, accumulate=True)
-            terminated = terminated | is_followed
+            followed = torch.zeros_like(reward).index_put((is_followed,), self.options.gamma * value)
+            is_open = is_followed & ~known_ends(batch).squeeze(-1)
+            open_value = followed * is_open
+            reward = reward + followed * ~is_open
+            terminated = terminated | (is_followed & ~is_open)
         rows = {
             "phi": self.policy.phi(observation),
             "discrete": batch[keys.DISCRETE],
             "reward": reward,
             "terminated": terminated,
-            "done": option_ends(batch).squeeze(-1),
+            "done": known_ends(batch).squeeze(-1),
             "mask": mask,
+            "is_open": is_open,
+            "open_value": open_value,
         }
-        episode_steps = batch.get(keys.EPISODE_STEPS, None)
-        if episode_steps is not None:
-            rows["is_first"] = episode_steps.squeeze(-1) == 0
+        unknown = torch.zeros_like(batch["next", keys.DONE])
+        begins = batch.get(keys.IS_DECISION, unknown).squeeze(-1)
+        begins_episode = (batch.get(keys.EPISODE_STEPS, ~unknown) == 0).squeeze(-1)
+        rows["is_first"], rows["begins_option"] = begins | begins_episode, begins & ~begins_episode
         if self.phase == SARSA:
             next_observation = batch["next", keys.OBSERVATION]
             rows["next_phi"] = self.policy.phi(next_observation)
@@ -612,6 +658,11 @@ class QPAMDP(Learner):
         expected |= {"gram": [num_regressors] * 2, "moment": [num_regressors], "num_episodes": []}
         if sizes != expected or (num_regressors and num_regressors != state["policy.theta"].numel() + num_features[0]):
             raise ValueError("the parts of the regression do not fit together")
+        if (
+            state.get("open.is_open", state["phase"].new_zeros(0)).shape
+            != state.get("open.value", traces[:0, 0, 0]).shape
+        ):
+            raise ValueError("open.is_open and open.value differ in length")
         if state["phase"] not in (SARSA, PARAMETERS):
             raise ValueError(f"phase is {int(state['phase'])}, but must be {SARSA} or {PARAMETERS}")
         for name in ("policy.temperature", "policy.sigma", "sarsa.step_size"):
