@@ -190,6 +190,7 @@ def test_the_option_that_follows_a_batch_is_the_selectors_greedy_one(monkeypatch
     monkeypatch.setattr(
         agent.selector, "choose", lambda td: {keys.OPTION: (td["observation"].argmax(-1) % 2 == 0).long()}
     )
+    monkeypatch.setattr(agent.selector, "option_probabilities", lambda td: None)
     heard = heard_by_learners(agent, batch, monkeypatch)
     ended = batch["next", keys.OPTION_ENDED].squeeze(-1)
     missing = ended & batch["next", keys.DONE].squeeze(-1)
@@ -264,6 +265,17 @@ def test_a_replayed_step_is_worth_the_mean_over_the_options_of_a_stochastic_sele
         first_value, second_value = (value(agent, option, state[i : i + 1]) for option in range(2))
         expected.append((1.0 - second) * first_value + second * second_value)
     assert agent.learners[0].next_value(sample).tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_option_after_the_last_step_of_a_batch_is_drawn_from_a_stochastic_selector():
+    torch.manual_seed(0)
+    agent = make_agent("hppo", Softly(SPECS), is_shared=False)
+    batch = two_options(agent, 4000)
+    is_end = torch.ones(*batch.shape, 1, dtype=torch.bool)
+    batch["next", keys.OBSERVATION] = torch.ones_like(batch["next", keys.OBSERVATION])
+    batch["next", keys.OPTION_ENDED], batch["next", keys.DONE] = is_end, ~is_end
+    followed = agent.next_options.with_next_option(batch)[keys.NEXT_OPTION][:, -1]
+    assert followed.float().mean() == pytest.approx(torch.tensor(1.0).sigmoid().item(), abs=0.03)
 
 
 def test_the_actor_and_uniform_choices_state_the_probabilities_of_their_options():

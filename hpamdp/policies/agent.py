@@ -357,7 +357,7 @@ class AgentNextOptions:
         """Return a shallow copy of a batch `[*B, T]` in which `("next", "option")` holds in the next state, `[*B, T]`.
 
         If an option ends, that is the option of the next step. If the next step is not in the batch, it is the
-        selector's greedy option.
+        selector's greedy option or, if its policy is stochastic, one drawn from that policy.
         """
         option = batch.get(keys.OPTION)
         is_ended = batch.get(("next", keys.OPTION_ENDED)).squeeze(-1)
@@ -368,7 +368,11 @@ class AgentNextOptions:
             states = batch.get("next")[is_missing]
             remembered = batch.select(*self.selector.remembered_keys)[is_missing]
             states = states.copy().update(remembered)
-            next_option[is_missing] = self.greedy(states, option[is_missing])
+            probabilities = self.probabilities(states.get(keys.OBSERVATION))
+            if probabilities is None:
+                next_option[is_missing] = self.greedy(states, option[is_missing])
+            else:
+                next_option[is_missing] = probabilities.multinomial(1).squeeze(-1)
         return batch.copy().set(keys.NEXT_OPTION, next_option)
 
     def _without_option(self, observation: Tensor) -> Tensor:

@@ -2,7 +2,8 @@
 
 Members predict the next state, the reward and the end of an episode. A plan tries every sequence of discrete actions,
 each with Gaussians of its own for their parameters. To explore, an environment follows the plans of a single member
-until its episode ends; a greedy plan takes the mean of all members' returns. It is meant for a few hundred steps.
+until its episode or option ends; a greedy plan takes the mean of all members' returns. It is meant for a few hundred
+steps.
 
 Sources: Chua, Calandra, McAllister and Levine 2018, *Deep Reinforcement Learning in a Handful of Trials using
 Probabilistic Dynamics Models*, arXiv 1805.12114: the ensemble, the probabilistic members, and a member for each
@@ -25,6 +26,8 @@ Differs from the sources:
 - if states are not turned, exploring plans maximise the mean of all members' returns plus their standard deviation
   (`posterior_sampling`, `optimism`). Every single member predicts no reward for actions that had none so far, so
   planning with one member does not explore;
+- where options end inside episodes, a member is followed for an option, and not for an episode. With options of a step
+  or two little is left of posterior sampling;
 - `epsilon` makes some exploratory actions random. If no ensemble member has seen a reward, all of them predict none,
   and planning alone never finds it;
 - some entries of the state change linearly with others, such as a target's offset with the agent's own place. They are
