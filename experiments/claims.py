@@ -350,7 +350,7 @@ def learners() -> list[Claim]:
         ),
         Claim(
             "docs/learners/pdqn.md",
-            "{published} with the congruent controller in either form, against {pdqn:.2f} after twice the presses",
+            "{published} with the congruent controller, multi-pass or not, against {pdqn:.2f} after twice the presses",
             numbers,
         ),
         Claim(

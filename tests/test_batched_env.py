@@ -25,6 +25,7 @@ from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.circuit.environment import CircuitEnv
 from hpamdp.env.circuit.registration import CIRCUIT_IDS
 from hpamdp.env.errors import ProblemError
+from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
@@ -141,12 +142,12 @@ def test_a_finished_episode_stays_finished_and_earns_nothing(problem):
 
 
 @pytest.mark.parametrize("by_kernel", [True, False])
-@pytest.mark.parametrize("problem", [MovingEnv, SlidingEnv])
-def test_the_limit_of_a_vehicle_may_terminate_instead(problem, by_kernel):
-    env = problem(64, max_steps=2, limit="terminated")
+@pytest.mark.parametrize("problem", [MovingEnv, SlidingEnv, GoalEnv, HardGoalEnv])
+def test_a_limit_that_costs_may_terminate_instead(problem, by_kernel):
+    env = problem(64, max_steps=1, limit="terminated")
     if not by_kernel:
         env.leave_kernel()
-    last, _ = play(env, random_player(), 2)
+    last, _ = play(env, random_player(), 1)
     assert (last[keys.OUTCOME] == len(env.outcomes) - 1).any()
     assert last[keys.TERMINATED].all() and last[keys.DONE].all() and not last[keys.TRUNCATED].any()
 

@@ -33,7 +33,12 @@ class GoalOptions(Settings):
     """Settings of `GoalEnv`."""
 
     max_steps: PositiveInt = 100
-    """Steps after which an episode is truncated. The last one is not played, as in the published code."""
+    """Steps after which an episode ends. The last one is not played, as in the published code."""
+    limit: Literal["truncated", "terminated"] = "truncated"
+    """Whether values bootstrap past this end (`truncated`) or stop there (`terminated`), as in the published code.
+
+    The time is not observed, and the end costs the ball's distance from the goal.
+    """
     observation: Literal["scaled", "raw"] = "scaled"
     """`scaled` to [-1, 1], which orientations and the ball can leave, or `raw` positions, velocities and angles."""
     noise: Annotated[float, Field(ge=0.0, le=5.0)] = 1.0
@@ -106,6 +111,7 @@ class GoalEnv(BatchedEnv[GoalState]):
         return ProblemFacts(title=cls.__name__, default_options=groups)
 
     def _prepare(self) -> None:
+        self.limit_terminates = self.options.limit == "terminated"
         self._tick, self._random_numbers = rules.masked_tick, rules.random_numbers
 
     def _compile(self) -> None:

@@ -20,8 +20,10 @@ Differs from the source:
   or to its range in the warm-up.
 - By default all weights of the values have the same step size. Dabney and Barto's bound limits it again at each step,
   whatever the sign of the change. The temperature is constant, also in the parameter phases, and sigma decays.
-  The published settings: step_scaling=true, step_bound=non_increasing, temperature=1, temperature_decay=0.995,
-  samples_in_parameter_phase=false, sigma_decay=1.
+  The settings of Bester et al.'s code on Platform: step_scaling=true, step_bound=non_increasing, temperature=1,
+  temperature_decay=0.995, samples_in_parameter_phase=false, sigma_decay=1. These are the ones called published below.
+  There each phase of Sarsa begins at the first temperature again, and the discount counts ticks. Its code on Goal has
+  no bound, a constant temperature, alpha 0.01, gradients of unit norm and a baseline of three features.
 - Parameters are in units where their bounds are [-1, 1], and sigma is a standard deviation. eNAC's returns are not
   discounted, and the divergence from the old policy bounds its step.
 """
