@@ -17,6 +17,7 @@ from hpamdp.env import counter_rng, kernels
 from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.task import MAX_PRESSES
+from hpamdp.env.rng_streams import folded
 
 POSITIONS = ("start_x", "start_y", "goal_x", "goal_y", "x", "y")
 SETTINGS = {
@@ -183,7 +184,7 @@ def test_random_numbers_are_the_same_bit_for_bit():
     drawn = np.empty((2000, 30), np.float32)
     for seed in (0, 1, -3, 2**40 + 7):
         for stream in range(4):
-            draw(kernels.folded(seed), stream, environments, episodes, drawn)
+            draw(folded(seed), stream, environments, episodes, drawn)
             where = torch.from_numpy(environments), torch.from_numpy(episodes)
             key = counter_rng.rng_key(counter_rng.seed_tensor(seed), stream, *where)
             right = torch.stack([counter_rng.uniform(key, index) for index in range(30)], -1)

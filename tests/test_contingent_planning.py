@@ -48,17 +48,19 @@ def test_a_forbidden_action_finds_nothing_out():
 
 
 def test_the_temperature_does_not_count_what_is_forbidden(monkeypatch):
-    spreads = []
+    seen = []
 
-    def temperature(temperature, returns):
-        spreads.append(returns.abs().max())
-        return absolute_temperature(temperature, returns)
+    def temperature(*given):
+        seen.append(absolute_temperature(*given))
+        return seen[-1]
 
     monkeypatch.setattr(contingent_planning, "absolute_temperature", temperature)
     allowed = torch.ones(3, 1, 2, dtype=torch.bool)
     allowed[..., ASKS] = False
-    planned(0.0, allowed=allowed)
-    assert max(spreads) < 10.0
+    for price in (0.0, 1000.0):
+        planned(price, allowed=allowed)
+    torch.testing.assert_close(seen[0], seen[1])
+    assert (seen[0] < 1.0).all()
 
 
 def test_the_first_action_is_the_best_one_for_all_hypotheses():

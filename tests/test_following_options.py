@@ -267,14 +267,16 @@ def test_a_replayed_step_is_worth_the_mean_over_the_options_of_a_stochastic_sele
     assert agent.learners[0].next_value(sample).tolist() == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_option_after_the_last_step_of_a_batch_is_drawn_from_a_stochastic_selector():
+@pytest.mark.parametrize("is_shared", [False, True], ids=["per_option", "shared"])
+def test_the_option_after_the_last_step_of_a_batch_is_drawn_from_a_stochastic_selector(is_shared):
     torch.manual_seed(0)
-    agent = make_agent("hppo", Softly(SPECS), is_shared=False)
+    agent = make_agent("hppo", Softly(SPECS), is_shared=is_shared)
     batch = two_options(agent, 4000)
     is_end = torch.ones(*batch.shape, 1, dtype=torch.bool)
     batch["next", keys.OBSERVATION] = torch.ones_like(batch["next", keys.OBSERVATION])
     batch["next", keys.OPTION_ENDED], batch["next", keys.DONE] = is_end, ~is_end
     followed = agent.next_options.with_next_option(batch)[keys.NEXT_OPTION][:, -1]
+    agent.learn(batch[:8])
     assert followed.float().mean() == pytest.approx(torch.tensor(1.0).sigmoid().item(), abs=0.03)
 
 

@@ -359,6 +359,17 @@ def test_options_whose_selector_ends_them_are_counted_once_however_long_batches_
 
     learner, num_ended = learned(num_steps, SARSA)
     assert learner.window_episodes == num_ended
+    rows = {}
+    learner.sarsa.update = lambda w, given, *_: (rows.update(given.items()), (w, torch.zeros(())))[1]
+    batch = play(learner, 40, 1)
+    batch["next", keys.DONE] = batch["next", keys.TERMINATED] = torch.zeros(40, 1, 1, dtype=torch.bool)
+    batch["next", keys.IS_DECISION] = batch["next", keys.DONE]
+    batch["next", keys.OPTION_ENDED] = torch.ones(40, 1, 1, dtype=torch.bool)
+    batch[keys.NEXT_OPTION] = torch.zeros(40, 1, dtype=torch.long)
+    learner.learn(batch, torch.ones(40, 1, dtype=torch.bool))
+    target = batch["next", keys.REWARD].squeeze(-1) + learner.options.gamma * 7.0
+    torch.testing.assert_close(rows["reward"], target)
+    assert rows["terminated"].all() and not rows["done"].any(), "its value is in the reward; its trace goes on"
     learner, num_ended = learned(num_steps, PARAMETERS)
     whole, _ = learned(24, PARAMETERS)
     assert learner.enac.num_episodes == whole.enac.num_episodes == num_ended

@@ -511,6 +511,22 @@ def test_scripts_of_options_show_the_row_of_a_run_that_its_table_refuses(tmp_pat
     assert file.read_bytes() == before
 
 
+def test_robustness_replaces_the_rows_of_an_agent_and_refuses_it_given_twice(tmp_path, monkeypatch):
+    robustness = study("robustness")
+    stored = read_csv(EXPERIMENTS / "robustness" / "results.csv")
+    first = {column: stored[0][column] for column in robustness.AGENT_COLUMNS}
+    of_first = [row for row in stored if all(row[column] == first[column] for column in first)]
+    shutil.copy(EXPERIMENTS / "robustness" / "results.csv", tmp_path)
+    monkeypatch.setattr(robustness, "HERE", tmp_path)
+    monkeypatch.setattr(robustness, "name_of", lambda run: {**first, "seed": int(first["seed"])})
+    monkeypatch.setattr(robustness, "score", lambda run, evaluations: iter([{**stored[0], "score": 99.0}]))
+    with pytest.raises(SystemExit, match="two runs of"):
+        robustness.add([None, None])
+    assert len(read_csv(tmp_path / "results.csv")) == len(stored)
+    robustness.add([None])
+    assert len(read_csv(tmp_path / "results.csv")) == len(stored) - len(of_first) + 1
+
+
 GATHERING = [
     file.parent.name
     for file in sorted(EXPERIMENTS.glob("*/study.py"))

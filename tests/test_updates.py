@@ -10,6 +10,7 @@ import test_hsac
 import test_hyar
 import test_paddpg
 import test_pdqn
+import test_qpamdp
 import torch
 from conftest import make_config
 from torch import Tensor, nn
@@ -19,6 +20,7 @@ from toy_steps import SPECS, sample
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.platform.environment import PlatformEnv
+from hpamdp.policies.base import added_later
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.hyar import LATENT, HyAR
 from hpamdp.policies.low_level.iql import IQL
@@ -261,6 +263,18 @@ def test_schedules_start_again_in_a_learner_that_takes_over_networks():
     assert learner.policy.noise == 1.0
     learner = taken_over(IQL, actor_lr_updates=1000, **small)
     assert learner.actor_updates == 0 and learner.updates == 5000
+
+
+@pytest.mark.parametrize("name", ["hppo", "iql", "qpamdp"])
+def test_networks_of_earlier_versions_are_taken_over_without_what_was_added_later(name):
+    make_learner = {"hppo": test_hppo.make, "iql": lambda: IQL(SPECS, hidden_dims=(8,)), "qpamdp": test_qpamdp.make}[
+        name
+    ]
+    old, new = make_learner(), make_learner()
+    later = added_later(old)
+    assert later
+    new.load_networks({key: value for key, value in old.state_dict().items() if key not in later})
+    assert added_later(new) <= new.state_dict().keys()
 
 
 def test_plans_in_bfloat16_tell_rewards_near_50_apart():

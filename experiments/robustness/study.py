@@ -29,7 +29,6 @@ from hpamdp.analysis.study import (
     read_csv,
     refuse_repeats,
     spread,
-    with_repeats_replaced,
     write_tables,
 )
 from hpamdp.config.compose import conf_dir
@@ -58,6 +57,18 @@ FIGURES = ("score", "success", "too_fast", "out_of_bounds")
 AGENT_COLUMNS = ("agent", "boat", "trained_with", "seed")
 
 
+def name_of(run: Run) -> dict[str, Any]:
+    """Return the columns that name a run's agent."""
+    high, low, env = run.summary["high"], run.summary["low"], run.config["env"]
+    trained_with = [f"{noise} {env[noise]:g}" for noise in LEVELS if env[noise]]
+    return {
+        "agent": low if high == "none" else f"{high} x {low}",
+        "boat": run.summary["controller"],
+        "trained_with": PLUS.join(trained_with) or NO_NOISE,
+        "seed": run.summary["seed"],
+    }
+
+
 def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, float | str]]:
     """Yield a row with the score of a run's agent for each noise and level.
 
@@ -73,15 +84,7 @@ def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, fl
     env = make_env(config, 1, device, 0)
     agent = make_agent(config, PAMDPSpecs.from_env(env), device)
     checkpoint.load(source, agent, device, with_training=False)
-    high, low = run.summary["high"], run.summary["low"]
-    options = config.env.settings
-    trained_with = [f"{noise} {options[noise]:g}" for noise in LEVELS if options[noise]]
-    name = {
-        "agent": low if high == "none" else f"{high} x {low}",
-        "boat": run.summary["controller"],
-        "trained_with": PLUS.join(trained_with) or NO_NOISE,
-        "seed": config.run.seed,
-    }
+    name, options = name_of(run), config.env.settings
     for noise, levels in LEVELS.items():
         for level in levels:
             noisy = {**options, **dict.fromkeys(LEVELS, 0.0), noise: level}
@@ -100,10 +103,14 @@ def add(runs: Sequence[Run]) -> None:
     Raises:
         SystemExit: two of the runs have the same agent.
     """
+    names = [name_of(run) for run in runs]
+    refuse_repeats(names, AGENT_COLUMNS, AGENT_COLUMNS)
     evaluations: dict[str, Evaluation] = {}
-    new = [row for run in tqdm(runs) for row in score(run, evaluations)]
-    refuse_repeats(new, (*AGENT_COLUMNS, "noise", "level"), AGENT_COLUMNS)
-    write_tables(HERE, {"results": with_repeats_replaced(read_csv(HERE / "results.csv"), new, AGENT_COLUMNS)})
+    for run, name in zip(tqdm(runs), names, strict=True):
+        new = list(score(run, evaluations))
+        old = read_csv(HERE / "results.csv") if (HERE / "results.csv").exists() else []
+        kept = [row for row in old if any(row[column] != name[column] for column in AGENT_COLUMNS)]
+        write_tables(HERE, {"results": kept + new})
 
 
 def table(rows: Rows) -> str:

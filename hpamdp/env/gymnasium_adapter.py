@@ -222,6 +222,7 @@ class GymnasiumVectorAdapter(VectorEnv):
         mask = options.pop("reset_mask", None)
         self._check_mask(mask, seed)
         super().reset(seed=seed)
+        self.closed = False
         if seed is None and not self._problem.is_reset:
             seed = int(self.np_random.integers(2**31))
         observations = self._problem.reset(seed, options, mask)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hpamdp.env import kernels
 from hpamdp.env.kernels import ACT, ACT_AND_RESTART, ACT_OR_RESTART, RESTART
-from hpamdp.env.rng_streams import NOISE, TRAINING
+from hpamdp.env.rng_streams import NOISE, TRAINING, folded
 from hpamdp.messages import invalid_action
 
 # A kernel that moves all rows. `KernelRows.advance` passes its arguments.
@@ -76,7 +76,7 @@ class KernelRows:
 
     def set_seed(self, seed: int, streams: tuple[int, int]) -> None:
         """Set the seed and the streams of episodes and of noise."""
-        self._settings[kernels.SEED] = kernels.folded(seed)
+        self._settings[kernels.SEED] = folded(seed)
         self._settings[kernels.EPISODE_STREAM], self._settings[kernels.NOISE_STREAM] = streams
 
     def begin(self, seed: int) -> None:

@@ -23,7 +23,6 @@ import numpy as np
 from numba import int32, njit, uint32, uint64
 
 from hpamdp.env.rng_streams import STEPS
-from hpamdp.env.rng_streams import folded as folded  # kernels take folded seeds
 
 _STREAM_STEPS = tuple(step & 0xFFFFFFFF for step in STEPS)
 # The multipliers of `counter_rng`.

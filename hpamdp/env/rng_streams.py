@@ -17,8 +17,8 @@ STEPS = (-0x7A143595, -0x61C88647, 0x27D4EB2F, 0x165667BD)
 def folded(seed: int) -> int:
     """Return the 32 bits of a seed that all random numbers depend on, unsigned.
 
-    An int32 or a uint32 keeps its own bits. Larger numbers are hashed, so that none of them stands for a small one that
-    somebody is likely to give.
+    An int32 or a uint32 keeps its own bits. Larger numbers are hashed, so that a large seed is unlikely to share its
+    episodes with a small one.
     """
     if -(2**31) <= seed < 2**32:
         return seed & 0xFFFFFFFF

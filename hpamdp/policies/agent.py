@@ -298,14 +298,22 @@ class AgentNextOptions:
     @torch.no_grad()
     def probabilities(self, observation: Tensor) -> Tensor | None:
         """Return the probabilities of the options `[N, num_options]`, see `NextOptions.probabilities`."""
-        if self.decides_ends or not self.sees_observation_alone:
+        if not self.sees_observation_alone:
             return None
-        is_decision = torch.ones(len(observation), 1, dtype=torch.bool, device=observation.device)
-        seen = {keys.OBSERVATION: self._without_option(observation), keys.IS_DECISION: is_decision}
-        probabilities = self.selector.option_probabilities(TensorDict(seen, [len(observation)]))
-        if probabilities is None or self.pairs is None:
-            return probabilities
-        return probabilities.unflatten(-1, (self.num_options, -1)).sum(-1)
+        return self._probabilities(
+            TensorDict({keys.OBSERVATION: self._without_option(observation)}, [len(observation)])
+        )
+
+    def _probabilities(self, td: TensorDictBase) -> Tensor | None:
+        """Return the probabilities of the options `[N, num_options]` in what the selector reads of states, or None."""
+        if self.decides_ends:
+            return None
+        is_decision = torch.ones(len(td), 1, dtype=torch.bool, device=td.get(keys.OBSERVATION).device)
+        td = td.copy().set(keys.IS_DECISION, is_decision)
+        if self.pairs is None:
+            return self.selector.option_probabilities(td)
+        probabilities = self.selector.option_probabilities(self.pairs.with_pairs(td))
+        return None if probabilities is None else probabilities.unflatten(-1, (self.num_options, -1)).sum(-1)
 
     @torch.no_grad()
     def greedy(self, td: TensorDictBase, held: Tensor) -> Tensor:
@@ -368,7 +376,7 @@ class AgentNextOptions:
             states = batch.get("next")[is_missing]
             remembered = batch.select(*self.selector.remembered_keys)[is_missing]
             states = states.copy().update(remembered)
-            probabilities = self.probabilities(states.get(keys.OBSERVATION))
+            probabilities = self._probabilities(states)
             if probabilities is None:
                 next_option[is_missing] = self.greedy(states, option[is_missing])
             else:

@@ -67,6 +67,15 @@ def known_ends(batch: TensorDictBase) -> Tensor:
     return batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
 
 
+def added_later(module: nn.Module) -> set[str]:
+    """Return the names of the entries of a state dict that checkpoints of earlier versions lack.
+
+    Modules list theirs in `added_later`. If they are missing, they stay as they are.
+    """
+    parts = module.named_modules(remove_duplicate=False)
+    return {f"{prefix}.{name}".lstrip(".") for prefix, part in parts for name in getattr(part, "added_later", ())}
+
+
 def step_discounts(batch: TensorDictBase, gamma: float) -> float | Tensor:
     """Return `gamma`, or if the environment writes durations, its power for each step, `[*B, T, 1]`.
 
@@ -675,8 +684,10 @@ class Learner(Level, nn.Module):
         Raises:
             RuntimeError: it is of another class or size.
         """
-        fresh = {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in self.progress}
-        self.load_state_dict({**state, **fresh})
+        own = self.state_dict()
+        fresh = {name: value for name, value in own.items() if name.rpartition(".")[2] in self.progress}
+        later = {name: own[name] for name in added_later(self) - state.keys()}
+        self.load_state_dict({**state, **later, **fresh})
 
     def steps_to_update(self) -> dict[str, int]:
         """Return the least number of own steps before the first update, by the name of each setting that requires one.

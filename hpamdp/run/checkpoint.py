@@ -37,11 +37,10 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.files import replacing
 from hpamdp.messages import first_line, warn
 from hpamdp.policies.agent import FOR_TRAINING, HierarchicalAgent
-from hpamdp.policies.base import Learner, Level
+from hpamdp.policies.base import Learner, Level, added_later
 from hpamdp.run.state_checks import (
     Progress,
     SavedPart,
-    added_later,
     buffers_sized_by_data,
     check_form,
     check_generator,
@@ -440,7 +439,7 @@ class _Opened:
             saved: the state dict, not yet read.
             module: the module that will load the state.
             device: the device of the returned tensors.
-            may_lack: entries whose names begin so may be missing, as those `added_later` may; then the returned state
+            may_lack: entries whose names begin so, and those of `added_later`, may be missing. The returned state then
                 lacks them, too.
 
         Raises:

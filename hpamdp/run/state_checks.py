@@ -204,15 +204,6 @@ def check_names(saved: object, own: Mapping[str, Any]) -> Mapping[str, Any]:
     return saved
 
 
-def added_later(module: nn.Module) -> set[str]:
-    """Return the names of the entries of a state dict that checkpoints of earlier versions lack.
-
-    Modules list theirs in `added_later`. If they are missing, they stay as they are.
-    """
-    parts = module.named_modules(remove_duplicate=False)
-    return {f"{prefix}.{name}".lstrip(".") for prefix, part in parts for name in getattr(part, "added_later", ())}
-
-
 def buffers_sized_by_data(module: nn.Module) -> set[int]:
     """Return the ids of a module's buffers whose sizes depend on data."""
     sized = [part for part in module.modules() if isinstance(part, SizedByData)]

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, TensorSpec, Unbounded
 
 from hpamdp import keys
-from hpamdp.env import counter_rng, kernels
+from hpamdp.env import counter_rng
 from hpamdp.env.base import Metric
 from hpamdp.env.batched_env import Action, BatchedEnv, StateArrays
 from hpamdp.env.boatdock import harbour, task
@@ -27,7 +27,7 @@ from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
 from hpamdp.env.boatdock_unseen.rules import SessionRules, SessionState
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
-from hpamdp.env.rng_streams import EVALUATION, TRAINING
+from hpamdp.env.rng_streams import EVALUATION, TRAINING, folded
 from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry, RevealedDirections
 
@@ -124,7 +124,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
             options.fleet.separation,
             options.spread,
             options.fleet_size or 0,
-            kernels.folded(options.fleet_seed),
+            folded(options.fleet_seed),
             options.scored_boats == "new",
             options.frame == "first_press",
         ]

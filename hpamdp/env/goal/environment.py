@@ -35,9 +35,9 @@ class GoalOptions(Settings):
     max_steps: PositiveInt = 100
     """Steps after which an episode ends. The last one is not played, as in the published code."""
     limit: Literal["truncated", "terminated"] = "truncated"
-    """Whether values bootstrap past this end (`truncated`) or stop there (`terminated`), as in the published code.
+    """If `terminated`, values stop at the time limit, as in the published code; if `truncated`, they bootstrap past it.
 
-    The time is not observed, and the end costs the ball's distance from the goal.
+    The observation does not show the time, and the limit costs the ball's distance from the goal.
     """
     observation: Literal["scaled", "raw"] = "scaled"
     """`scaled` to [-1, 1], which orientations and the ball can leave, or `raw` positions, velocities and angles."""

@@ -9,7 +9,7 @@ Differs from the sources:
 - decisions with uniform options are weighted by the ratio of the policy's probability to the uniform one. The clip is
   around the policy at the time of the decision (the decoupled objective of Hilton, Cobbe and Schulman 2021, *Batch
   size-invariance for policy optimization*, arXiv 2110.00641);
-- the gradients of policy and critic are clipped one by one, since returns may be of any size;
+- the gradients of policy, critic and their common perception are clipped separately, since returns may be of any size;
 - with `memory` policy and value also see the observations at earlier decisions of the episode;
 - the advantage is the option's return minus a learned value of the state. It bootstraps if the episode goes on, but not
   past a time limit.
@@ -150,10 +150,10 @@ class Actor(OnPolicy, RemembersDecisions):
         return mean_scalars([self._gradient_step(minibatch) for minibatch in self.minibatches(rows)])
 
     def _gradient_step(self, minibatch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Take a step down the loss. Returns are of any size, so the critic's gradient is clipped on its own."""
+        """Take a step down the loss. Returns may be of any size, so what the critic's loss reaches is clipped apart."""
         limit = self.options.max_grad_norm
-        critic = self.critic.parameters()
-        return self.descent.step(self.optimizer, self.loss, minibatch, max_grad_norm=limit, clipped_apart=critic)
+        apart = self.critic.parameters(), self.perception.parameters()
+        return self.descent.step(self.optimizer, self.loss, minibatch, max_grad_norm=limit, clipped_apart=apart)
 
     @torch.no_grad()
     def rows(self, decisions: TensorDictBase) -> TensorDict:

@@ -190,7 +190,6 @@ class HPPO(OnPolicy, Learner):
             options.initial_scale,
             options.initial_parameters,
             vector_products=options.vector_products,
-            anneals_max_scale=options.max_scale_final is not None,
         )
         products = [] if self.actor.products is None else [self.actor.products]
         self.critic = nn.Sequential(
@@ -233,8 +232,9 @@ class HPPO(OnPolicy, Learner):
         steps = [self.gradient_step(self.loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]
         self.actor.set_min_scale(options.min_scale * (options.min_scale_final / options.min_scale) ** progress)
         if options.max_scale_final is not None:
-            progress = min(1.0, self.frames.item() / options.anneal_steps)  # of the steps to come
-            self.actor.set_max_scale(options.max_scale * (options.max_scale_final / options.max_scale) ** progress)
+            fall = options.max_scale_final / options.max_scale
+            next_progress = min(1.0, self.frames.item() / options.anneal_steps)
+            self.actor.set_max_scale(options.max_scale * fall**next_progress)
         return mean_scalars(steps)
 
     def loss(self, rows: Mapping[str, Tensor], entropy_weight: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

@@ -313,7 +313,7 @@ class HyAR(ReplayLearner):
     takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
     may_be_nan: ClassVar[frozenset[str]] = frozenset({LATENT})
-    progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"episodes", "noise"}
+    progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"episodes"}
 
     options: HyAROptions
     policy: HyARPolicy

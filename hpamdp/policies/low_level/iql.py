@@ -60,7 +60,8 @@ class IQLOptions(HeadOptions, ActorCriticOptions, TargetRateOptions, ScaleOption
     temperature: PositiveFloat = 10.0
     """An action has weight exp(temperature * advantage) in the policy's likelihood.
 
-    With advantages much larger than a tenth most weights are 0 or `max_weight`; then `reward_scale` should be smaller.
+    If advantages are much larger than 1 / `temperature`, most weights are near 0 or equal `max_weight`. Then reduce
+    `reward_scale`.
     """
     max_weight: PositiveFloat = 100.0
     """Largest weight of an action."""
@@ -74,6 +75,7 @@ class IQL(ReplayLearner):
     explores_with: ClassVar[frozenset[str]] = frozenset()  # its policy stays near the actions in the data
     stores_own_parameters = True
     progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"actor_updates"}
+    added_later: ClassVar[tuple[str, ...]] = ("actor_updates",)  # checkpoints of 0.2 lack it
 
     options: IQLOptions
     actor_updates: Tensor
@@ -99,8 +101,7 @@ class IQL(ReplayLearner):
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = HybridPolicy(self.actor, specs)
         # Those of this run, for the schedule of the learning rate.
-        has_schedule = options.actor_lr_updates > 0
-        self.register_buffer("actor_updates", torch.zeros((), dtype=torch.long), persistent=has_schedule)
+        self.register_buffer("actor_updates", torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),

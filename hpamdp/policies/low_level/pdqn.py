@@ -21,8 +21,8 @@ Differs from the source:
   weight is their gain in value. A gradient alone stays on the hill that it began on;
 - with `layer_norm` the critics' layers are normalised (Ball et al. 2023, arXiv 2302.02948);
 - critic updates compute only the chosen action's pass, and all passes share the state's part of the first layer;
-- networks start as PyTorch's, the actor's last layer at a hundredth of that. The code of Bester et al. starts layers as
-  Kaiming et al. proposed, biases at 0, the actor's outputs near 0 and, on Goal, the critic's;
+- networks have PyTorch's initialisation, the actor's last layer scaled by 0.01. In the code of Bester et al. layers
+  start as Kaiming et al. proposed, biases at 0, and the actor's outputs near 0. On Goal the critic's outputs do, too;
 - parameters are clipped to their bounds before a critic sees them and before they are stored, also with inverting
   gradients. In the code of Bester et al. critics see and the buffer stores what the actor gave;
 - the defaults add what TD3 adds to DDPG: twin critics, target smoothing and a delayed actor. The actor, too, increases

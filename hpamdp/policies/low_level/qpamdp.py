@@ -21,9 +21,9 @@ Differs from the source:
 - By default all weights of the values have the same step size. Dabney and Barto's bound limits it again at each step,
   whatever the sign of the change. The temperature is constant, also in the parameter phases, and sigma decays.
   The settings of Bester et al.'s code on Platform: step_scaling=true, step_bound=non_increasing, temperature=1,
-  temperature_decay=0.995, samples_in_parameter_phase=false, sigma_decay=1. These are the ones called published below.
-  There each phase of Sarsa begins at the first temperature again, and the discount counts ticks. Its code on Goal has
-  no bound, a constant temperature, alpha 0.01, gradients of unit norm and a baseline of three features.
+  temperature_decay=0.995, samples_in_parameter_phase=false, sigma_decay=1. Below, "published" means these. There each
+  phase of Sarsa restarts at the initial temperature, and the discount counts ticks. Their code on Goal has no bound, a
+  constant temperature, alpha 0.01, gradients of unit norm and a baseline of three features.
 - Parameters are in units where their bounds are [-1, 1], and sigma is a standard deviation. eNAC's returns are not
   discounted, and the divergence from the old policy bounds its step.
 """
@@ -229,7 +229,7 @@ class SarsaLambda(SizedByData):
             rows: `[N, T]` with `phi` and `next_phi` `[N, T, num_features]`, and `discrete`, `reward`, `terminated`,
                 `done` and `mask` `[N, T]`; only the rows in `mask` count. `next_allowed` `[N, T, num_discrete]`: the
                 discrete actions that may be taken in the next states, if not all. `is_first` `[N, T]`, if known:
-                whether a row begins an episode; the episode before it may have been abandoned.
+                whether a row begins an episode or an option; the one before it may have been abandoned.
             temperature: of the softmax policy, `[]`.
             step_scale: factors on the steps of the features' weights, `[num_features]`.
 
@@ -391,9 +391,9 @@ class NaturalActorCritic(SizedByData):
 
 
 class OpenOptions(SizedByData):
-    """Where a batch ended inside an option that may have ended with it, and the value of what follows if it has.
+    """Remembers options that may have ended with a batch's last step, and the discounted values of their next states.
 
-    If the selector decides where options end, the next batch shows whether one ended with the last step.
+    If the selector decides where options end, the next batch shows whether one ended.
     """
 
     added_later: ClassVar[tuple[str, ...]] = ("is_open", "value")  # checkpoints of 0.2 lack them
@@ -602,10 +602,11 @@ class QPAMDP(Learner):
             masks = [batch["next", keys.ACTION_MASK][is_followed]] if self.specs.has_action_mask else []
             value = self.next_options.value(next_observation, batch[keys.NEXT_OPTION][is_followed], *masks)
             followed = torch.zeros_like(reward).index_put((is_followed,), self.options.gamma * value)
-            is_open = is_followed & ~known_ends(batch).squeeze(-1)
+            is_over = is_followed & known_ends(batch).squeeze(-1)
+            is_open = is_followed & ~is_over
             open_value = followed * is_open
-            reward = reward + followed * ~is_open
-            terminated = terminated | (is_followed & ~is_open)
+            reward = reward + followed * is_over
+            terminated = terminated | is_over
         rows = {
             "phi": self.policy.phi(observation),
             "discrete": batch[keys.DISCRETE],
@@ -616,9 +617,11 @@ class QPAMDP(Learner):
             "is_open": is_open,
             "open_value": open_value,
         }
-        unknown = torch.zeros_like(batch["next", keys.DONE])
-        begins = batch.get(keys.IS_DECISION, unknown).squeeze(-1)
-        begins_episode = (batch.get(keys.EPISODE_STEPS, ~unknown) == 0).squeeze(-1)
+        begins, begins_episode = torch.zeros_like(mask), torch.zeros_like(mask)
+        if keys.IS_DECISION in batch.keys():
+            begins = batch[keys.IS_DECISION].squeeze(-1)
+        if keys.EPISODE_STEPS in batch.keys():
+            begins_episode = (batch[keys.EPISODE_STEPS] == 0).squeeze(-1)
         rows["is_first"], rows["begins_option"] = begins | begins_episode, begins & ~begins_episode
         if self.phase == SARSA:
             next_observation = batch["next", keys.OBSERVATION]
@@ -660,10 +663,8 @@ class QPAMDP(Learner):
         expected |= {"gram": [num_regressors] * 2, "moment": [num_regressors], "num_episodes": []}
         if sizes != expected or (num_regressors and num_regressors != state["policy.theta"].numel() + num_features[0]):
             raise ValueError("the parts of the regression do not fit together")
-        if (
-            state.get("open.is_open", state["phase"].new_zeros(0)).shape
-            != state.get("open.value", traces[:0, 0, 0]).shape
-        ):
+        lengths = {len(state[name]) for name in ("open.is_open", "open.value") if name in state}
+        if len(lengths) > 1:
             raise ValueError("open.is_open and open.value differ in length")
         if state["phase"] not in (SARSA, PARAMETERS):
             raise ValueError(f"phase is {int(state['phase'])}, but must be {SARSA} or {PARAMETERS}")

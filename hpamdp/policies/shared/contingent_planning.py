@@ -87,16 +87,18 @@ class ContingentSearch:
             allowed = torch.cat([allowed, allowed[:, -1:]], 1)
         first_returns = returns if first_returns is None or self.options.num_iterations == 1 else first_returns
         found = self._first(shows, num_hypotheses, is_greedy)
+        is_allowed = None if allowed is None else _are_allowed(found.discrete, allowed)
         value = self._values(found, first_returns)
-        temperature = absolute_temperature(self.options.temperature, value)
-        found = self._with_values(found, value, allowed)
+        temperature = absolute_temperature(self.options.temperature, value, is_allowed)
+        found = found._replace(value=without_forbidden(value, is_allowed))
         for refinement in range(self.options.num_iterations - 1):
             if refinement > 0:
                 found = _with_best_first(found)
             found = _with_best_following(found, self.options.num_kept >> refinement)
             own = self._refined(found, temperature, self.search.lower_bound(refinement))
             found = found._replace(own=own)
-            found = self._with_values(found, self._values(found, returns), allowed)
+            is_allowed = None if allowed is None else _are_allowed(found.discrete, allowed)
+            found = found._replace(value=without_forbidden(self._values(found, returns), is_allowed))
         best_value, place = found.of_first().flatten(1).max(-1)
         row, num_samples = torch.arange(len(shows), device=shows.device), found.value.shape[-1]
         first, sample = place // num_samples, place % num_samples
@@ -126,15 +128,6 @@ class ContingentSearch:
         value = value.reshape(found.own.shape[:-2])
         return torch.where(found.shows[:, None, :, None, None], value, value.mean(1, keepdim=True))
 
-    @staticmethod
-    def _with_values(found: _Candidates, value: Tensor, allowed: Tensor | None) -> _Candidates:
-        """Return candidates with these values, those of forbidden sequences below all others."""
-        if allowed is not None:
-            of_steps = allowed[:, None, None, None].expand(*found.discrete.shape, -1)
-            is_allowed = of_steps.gather(-1, found.discrete.unsqueeze(-1)).squeeze(-1).all(-1)
-            value = without_forbidden(value, is_allowed)
-        return found._replace(value=value)
-
     def _refined(self, found: _Candidates, temperature: Tensor, lower_bound: float) -> Tensor:
         """Return new samples of the parameters, `[N, M, A, C, S, H, D]`. The draws are those of all hypotheses."""
         own, of_first, num = found.own, found.of_first(), self.options.num_elites
@@ -152,6 +145,17 @@ class ContingentSearch:
         samples[:, :, :, :, -1] = mean
         samples[:, :, :, :, 0] = own.take_along_dim(best, 4).squeeze(4)
         return samples.clamp_(-1.0, 1.0) * self.search.has_slot.to(own.device)[found.discrete].unsqueeze(4)
+
+
+def _are_allowed(discrete: Tensor, allowed: Tensor) -> Tensor:
+    """Return which sequences of discrete actions `[N, M, A, C, H]` have allowed steps only, bool `[N, M, A, C]`.
+
+    Args:
+        discrete: the sequences.
+        allowed: the discrete actions that each step may take, bool `[N, H, num_discrete]`.
+    """
+    of_steps = allowed[:, None, None, None].expand(*discrete.shape, -1)
+    return of_steps.gather(-1, discrete.unsqueeze(-1)).squeeze(-1).all(-1)
 
 
 def _with_best_first(found: _Candidates) -> _Candidates:

@@ -62,7 +62,7 @@ class Descent:
         loss_of: LossFunction,
         *inputs: Inputs,
         max_grad_norm: float | None = None,
-        clipped_apart: Iterable[Tensor] = (),
+        clipped_apart: Sequence[Iterable[Tensor]] = (),
     ) -> dict[str, Tensor]:
         """Take one step of an optimizer down the gradient of a loss; return the scalars of the loss.
 
@@ -73,7 +73,7 @@ class Descent:
             loss_of: maps the inputs to the loss and to scalars to log.
             inputs: tensors, tensors by name, or None.
             max_grad_norm: largest norm of the gradient; if None, there is no limit.
-            clipped_apart: parameters whose gradient has a norm of its own, so that it takes nothing of the others'.
+            clipped_apart: groups of parameters, the gradient of each of which is clipped separately.
         """
         groups = optimizer.param_groups
         parameters = [parameter for group in groups for parameter in group["params"] if parameter.requires_grad]
@@ -85,8 +85,9 @@ class Descent:
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         if max_grad_norm is not None:
-            apart = dict.fromkeys(clipped_apart)  # the order, unlike that of a set, is the same in every run
-            for part in ([each for each in parameters if each not in apart], list(apart)):
+            groups_apart = [list(group) for group in clipped_apart]
+            apart = {id(parameter) for group in groups_apart for parameter in group}
+            for part in ([each for each in parameters if id(each) not in apart], *groups_apart):
                 nn.utils.clip_grad_norm_(part, max_grad_norm)
         optimizer.step()
         return scalars

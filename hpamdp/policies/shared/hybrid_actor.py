@@ -70,7 +70,6 @@ class HybridActor(nn.Module):
         initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
         vector_products: whether the hidden layers also see `VectorProducts`.
         has_values: whether integer parameters with at most `MAX_VALUES` values have a categorical.
-        anneals_max_scale: whether `set_max_scale` will be called. Then the state dict has the largest deviation, too.
 
     Attributes:
         products: appends vector products to observations; None without `vector_products`.
@@ -100,7 +99,6 @@ class HybridActor(nn.Module):
         *,
         vector_products: bool = False,
         has_values: bool = True,
-        anneals_max_scale: bool = False,
     ) -> None:
         super().__init__()
         if specs.has_pair_mask and not self.takes_pairs:
@@ -120,8 +118,7 @@ class HybridActor(nn.Module):
         fraction = (math.log(initial_scale) - log_min_scale) / (log_max_scale - log_min_scale)
         self.make_heads(specs, hidden_dims[-1], math.log(fraction / (1.0 - fraction)))
         self.register_buffer("log_min_scale", torch.tensor(log_min_scale, dtype=torch.float32))
-        largest = torch.tensor(log_max_scale, dtype=torch.float32)
-        self.register_buffer("log_max_scale", largest, persistent=anneals_max_scale)
+        self.register_buffer("log_max_scale", torch.tensor(log_max_scale, dtype=torch.float32))
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
 
     def make_heads(self, specs: PAMDPSpecs, width: int, raw_scale: float) -> None:

@@ -29,7 +29,7 @@ class OnPolicyOptions(Settings):
     """Learning rate of Adam."""
     max_grad_norm: PositiveFloat = 0.5
     """Largest gradient norm of an optimisation step; longer gradients are scaled down. `high=actor` limits the norms
-    of its policy and of its critic one by one."""
+    of its policy, its critic and their common perception separately."""
 
 
 class OnPolicy(nn.Module):

@@ -135,9 +135,21 @@ def elite_weights(returns: Tensor, num_elites: int, temperature: Tensor) -> tupl
     return place, ((best - best[..., :1]) / temperature).softmax(-1)
 
 
-def absolute_temperature(temperature: float, returns: Tensor) -> Tensor:
-    """Return a plan's temperature in units of returns, given those of its first samples `[N, ...]`: `[N]`, positive."""
-    spread = returns.flatten(1).std(-1, correction=0)
+def absolute_temperature(temperature: float, returns: Tensor, is_allowed: Tensor | None = None) -> Tensor:
+    """Return a plan's temperature in units of returns, `[N]`, positive.
+
+    Args:
+        temperature: relative to the standard deviation of the returns.
+        returns: of its first samples, `[N, ..., S]`.
+        is_allowed: the sequences that count, bool `[N, ...]`. If None, all.
+    """
+    if is_allowed is None:
+        spread = returns.flatten(1).std(-1, correction=0)
+    else:
+        weight = is_allowed.unsqueeze(-1).expand_as(returns).flatten(1).to(returns.dtype)
+        weight = weight / weight.sum(-1, keepdim=True).clamp(min=1.0)
+        mean = (weight * returns.flatten(1)).sum(-1, keepdim=True)
+        spread = (weight * (returns.flatten(1) - mean).square()).sum(-1).sqrt()
     return (temperature * spread).clamp(min=torch.finfo(spread.dtype).tiny)
 
 
@@ -265,7 +277,7 @@ class SequenceSearch:
         is_last = self.options.num_iterations == 1
         value = returns(steps) if first_returns is None or is_last else first_returns(steps)
         is_allowed = None if allowed is None else self._are_allowed(steps, allowed)
-        temperature = absolute_temperature(self.options.temperature, value)
+        temperature = absolute_temperature(self.options.temperature, value, is_allowed)
         value = without_forbidden(value, is_allowed)
         kept = self._best_sequences(value, self.options.num_kept)
         value = value.take_along_dim(kept.unsqueeze(-1), 1)

@@ -56,7 +56,7 @@ class ReplayOptions(BufferOptions):
     gamma: PositiveFraction = 0.99
     """Discount of a step."""
     reward_scale: PositiveFloat = 1.0
-    """Factor on the rewards that are stored, and so on values and predicted rewards."""
+    """Factor on the stored rewards. It scales values and predicted rewards, too."""
 
     @model_validator(mode="after")
     def _check_replay(self) -> Self:

@@ -85,7 +85,7 @@ class DLPAOptions(ReplayMemoryOptions, PlannerOptions):
     state_weight: PositiveFloat = 2.0
     """Weight of the change of the state, in standard deviations, in the H-step loss."""
     reward_weight: PositiveFloat = 0.5
-    """Weight of the reward's squared error in the H-step loss, in the units of rewards times `reward_scale`.
+    """Weight of the reward's squared error in the H-step loss, in the units of scaled rewards.
 
     One network predicts rewards and terminations. With rewards much larger than 1, it learns terminations worse.
     """

@@ -26,8 +26,8 @@ Differs from the sources:
 - if states are not turned, exploring plans maximise the mean of all members' returns plus their standard deviation
   (`posterior_sampling`, `optimism`). Every single member predicts no reward for actions that had none so far, so
   planning with one member does not explore;
-- where options end inside episodes, a member is followed for an option, and not for an episode. With options of a step
-  or two little is left of posterior sampling;
+- if options end inside episodes, a member is followed for one option, not for an episode. With options of one or two
+  steps, little of posterior sampling is left;
 - `epsilon` makes some exploratory actions random. If no ensemble member has seen a reward, all of them predict none,
   and planning alone never finds it;
 - some entries of the state change linearly with others, such as a target's offset with the agent's own place. They are

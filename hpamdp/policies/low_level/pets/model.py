@@ -65,7 +65,7 @@ class MemberNet(nn.Module):
 
         Args:
             x: `[E, B, in]`.
-            precision: of all layers but the last one, which is computed in float32 (see `in_float32`).
+            precision: of the inputs and the hidden layers; the last layer is computed in float32 (see `in_float32`).
             output_map: `[out, M]`, by which the output is multiplied; as part of the last layer, it costs nothing.
         """
         x = x.mT.to(precision)  # [E, in, B]: see `joined`
