@@ -419,7 +419,7 @@ def test_the_option_after_a_batch_is_chosen_with_what_the_selector_remembers():
     selector, batches = decided("actor", "gru", minibatch_size=1000)
     batch = batches[0]
     seen = []
-    selector.choose = lambda td: seen.append(td) or {keys.OPTION: td[keys.OPTION]}
+    selector.option_probabilities = lambda td: seen.append(td) or torch.full((len(td), 2), 0.5)
     options = AgentNextOptions(selector, [], 2, is_shared=False)
     options.with_next_option(batch)
     is_missing = (batch["next", keys.OPTION_ENDED] & batch["next", keys.DONE]).squeeze(-1)
