@@ -152,6 +152,19 @@ def test_a_limit_that_costs_may_terminate_instead(problem, by_kernel):
     assert last[keys.TERMINATED].all() and last[keys.DONE].all() and not last[keys.TRUNCATED].any()
 
 
+@pytest.mark.parametrize("env_id", ["hpamdp/Moving-v0", "hpamdp/Goal-v0", "hpamdp/HardGoal-v0"])
+def test_a_limit_that_terminates_does_so_in_every_gymnasium_form(env_id):
+    one = gymnasium.make(env_id, limit="terminated", max_steps=1)
+    one.reset(seed=0)
+    assert one.step(one.action_space.sample())[2:4] == (True, False)
+    many = gymnasium.make_vec(
+        env_id, num_envs=3, vectorization_mode="vector_entry_point", limit="terminated", max_steps=1
+    )
+    many.reset(seed=0)
+    _, _, terminated, truncated, _ = many.step(many.action_space.sample())
+    assert terminated.all() and not truncated.any()
+
+
 def test_a_limit_of_another_name_is_refused():
     with pytest.raises(ValueError, match="'truncated' or 'terminated'"):
         MovingEnv(limit="cut")

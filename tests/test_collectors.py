@@ -240,6 +240,28 @@ def test_the_state_of_another_number_of_environments_is_refused(workers, tmp_pat
         workers[1].set_state(small.state())
 
 
+@pytest.mark.parametrize("collector", ["single", pytest.param("multi", marks=pytest.mark.slow)])
+def test_a_resumed_run_of_a_gymnasium_environment_begins_new_episodes_with_the_saved_statistics(collector):
+    words = [*SMALL, "env=gymnasium", "env.id=CartPole-v1", "env.observation_scaling=running", "high=none"]
+    words += [f"collector={collector}", *(["collector.num_workers=2"] if collector == "multi" else [])]
+    config, saved, firsts = make_config(words), None, []
+    for frames in (0, 0, 320, 640):
+        parts = assemble(config)
+        with closing(config.collector.build(config=config, parts=parts, frames=frames)) as collection:
+            if frames:
+                collection.set_state(saved)
+            batch = collection.next()
+            if saved is None:
+                for _ in range(10):
+                    collection.next()
+                saved = collection.state()
+            scaling = parts.env.base_env.scaling
+            firsts.append(batch[keys.OBSERVATION][:, 0])
+            assert scaling.statistics.count > (300 if frames else 8 * 4)
+    assert torch.equal(firsts[0], firsts[1])
+    assert not torch.equal(firsts[2], firsts[3]) and not torch.equal(firsts[1], firsts[2])
+
+
 def test_a_frozen_presser_goes_with_the_share(tmp_path):
     parts = assemble(make_config([*SMALL, "high=ucb", "low.freeze=true"]))
     torch.manual_seed(5)

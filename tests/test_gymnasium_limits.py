@@ -59,10 +59,14 @@ def test_each_problem_with_an_id_has_a_time_limit_as_a_gymnasium_environment(env
 
 @pytest.mark.parametrize(
     ("env_id", "settings"),
-    [("hpamdp/PinballHard-v0", {"training_start": "anywhere"}), ("hpamdp/CircuitGHZ-v0", {"begin": "known"})],
+    [
+        ("hpamdp/PinballHard-v0", {"training_start": "anywhere"}),
+        ("hpamdp/CircuitGHZ-v0", {"begin": "known"}),
+        ("hpamdp/BoatDockUnseen-v0", {"fleet_size": 4}),
+    ],
 )
 def test_problems_whose_training_begins_elsewhere_are_refused_as_gymnasium_environments(env_id, settings):
-    with pytest.raises(SettingError, match="its training begins elsewhere than its evaluation"):
+    with pytest.raises(SettingError, match="its training begins elsewhere than its evaluation, or with other boats"):
         GymnasiumEnv(2, id=env_id, kwargs=settings)
     GymnasiumEnv(2, id=env_id).close()
 

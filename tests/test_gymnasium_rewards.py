@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from gymnasium_players import make, step
 
-from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.env.errors import ProblemError
+from hpamdp.env.gymnasium.environment import GymnasiumEnv, _seeds
+from hpamdp.env.gymnasium.scaling import RewardScaling
 
 
 def steps(env: GymnasiumEnv, num: int) -> np.ndarray:
@@ -43,3 +46,16 @@ def test_the_statistics_of_rewards_are_saved_and_restored():
     other.set_env_state(one.env_state())
     assert len(one.env_state()) == 6
     assert all(torch.equal(column, one.env_state()[name]) for name, column in other.env_state().items())
+
+
+@pytest.mark.parametrize("reward", [float("inf"), float("nan"), 1e300])
+def test_a_reward_that_cannot_be_scaled_is_refused(reward):
+    scaling = RewardScaling(2, 0.9)
+    with pytest.raises(ProblemError, match="step returned the reward .*, which reward_scaling cannot scale"):
+        scaling.scaled(np.array([1.0, reward]), np.ones(2, bool))
+    assert np.isfinite(scaling.statistics.var).all()
+
+
+def test_large_seeds_share_no_episodes_with_small_ones():
+    seeds = [set(_seeds(seed, 8, stream)) for seed in (0, 5, 2**32, 2**32 + 5, 2**64) for stream in (0, 1)]
+    assert len(set().union(*seeds)) == sum(map(len, seeds))

@@ -187,6 +187,9 @@ class NumpyBatchedEnv(NumpyRows):
     def step(self, action: Any, *, restarts: bool = False) -> After:
         """Return what follows an action in every environment."""
         after = super().step(action, restarts=restarts)
+        if self._env.limit_terminates:
+            ended = after.terminations | after.truncations
+            after = after._replace(terminations=ended, truncations=np.zeros_like(ended))
         return after if self._picture is None else after._replace(observations=self._shown(after.observations))
 
     def _shown(self, observations: np.ndarray) -> np.ndarray:

@@ -201,7 +201,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     @property
     def training_begins_elsewhere(self) -> bool:
-        """Whether episodes of training begin in other states than those of evaluation."""
+        """Whether episodes of training begin in other states than those of evaluation, or in another world."""
         return False
 
     def kernel_settings(self) -> Sequence[float]:

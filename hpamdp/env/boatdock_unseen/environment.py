@@ -112,6 +112,11 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         )
         self._trip_presses = torch.zeros(self.num_envs, options.trips, dtype=torch.int32, device=self.device)
 
+    @property
+    def training_begins_elsewhere(self) -> bool:
+        """Whether evaluations have boats of which training has none."""
+        return self.options.fleet_size is not None and self.options.scored_boats == "new"
+
     def kernel_settings(self) -> Sequence[float]:
         """Return the rules in numbers."""
         options = self.options

@@ -153,8 +153,8 @@ class Copies:
             self.example = self.envs[0]
             if getattr(self.example.unwrapped, "training_begins_elsewhere", False):  # of this package's problems
                 raise SettingError(
-                    "its training begins elsewhere than its evaluation, and a Gymnasium environment does not know "
-                    "which of the two it is in; use the problem itself, such as env=pinball"
+                    "its training begins elsewhere than its evaluation, or with other boats, and a Gymnasium "
+                    "environment does not know which of the two it is in; use the problem itself, such as env=pinball"
                 )
             self._limits = [limit_of(env, reading.max_steps) for env in self.envs]
             self.max_steps = max(self._limits)

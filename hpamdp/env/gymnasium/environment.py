@@ -31,6 +31,7 @@ from hpamdp.env.gymnasium.parameter_bounds import agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics, Scaling
 from hpamdp.env.registration import register
+from hpamdp.env.rng_streams import folded
 from hpamdp.observation_entries import observation_dtype
 from hpamdp.pickling import why_unsendable
 from hpamdp.settings import PositiveFraction, SettingError, Settings
@@ -506,5 +507,5 @@ def _fitted(picture: np.ndarray) -> np.ndarray:
 
 def _seeds(seed: int, num: int, stream: int, first: int = 0) -> list[int]:
     """Return 31-bit seeds, which every generator takes, for the `num` copies from number `first` on."""
-    rows = range(first, first + num)
+    rows, seed = range(first, first + num), folded(seed)
     return [int(np.random.SeedSequence((seed, row, stream)).generate_state(1)[0] >> 1) for row in rows]

@@ -10,6 +10,7 @@ import torch
 from gymnasium.wrappers.utils import RunningMeanStd
 from torch import Tensor
 
+from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 from hpamdp.settings import SettingError
 
@@ -18,6 +19,7 @@ Scaling = Literal["bounds", "running", "none"]
 # Bounds further apart than this count as none: some environments write 1e10 or the largest float.
 _WIDEST = 1e6
 _CLIP = 10.0
+_LARGEST_REWARD = 1e30  # its square, and sums of many, are finite
 _SMALLEST = 1e-6  # standard deviation that is not counted as 0
 
 
@@ -130,7 +132,13 @@ class RewardScaling:
         Args:
             rewards: 0 where no step was taken.
             is_stepped: which environments took a step, bool `[N]`.
+
+        Raises:
+            ProblemError: a reward is not finite, or so large that its square is not.
         """
+        if not (np.abs(rewards) < _LARGEST_REWARD).all():
+            worst = rewards[~(np.abs(rewards) < _LARGEST_REWARD)][0]
+            raise ProblemError(f"step returned the reward {worst:g}, which reward_scaling cannot scale")
         if is_stepped.any():
             self._returns = np.where(is_stepped, self._gamma * self._returns + rewards, self._returns)
             self.statistics.update(self._returns[is_stepped, None])

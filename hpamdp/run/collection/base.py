@@ -6,6 +6,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -86,6 +87,20 @@ def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, 
     lengths, chosen = parts.agent.option_lengths, steps.get(keys.OPTION_LENGTH, None)
     if lengths and chosen is not None and not {*chosen.unique().tolist()} <= {*lengths}:
         raise ValueError(f"{where}: option_length holds {chosen.unique().tolist()}, but must be of {list(lengths)}")
+
+
+def random_seeds(seed: int, first_env: int, frames: int, restart: int = 0) -> tuple[int, int]:
+    """Return the seeds of exploration and of new episodes of a process that begins or continues a run.
+
+    Args:
+        seed: of the run.
+        first_env: number of the process's first environment.
+        frames: steps so far.
+        restart: 0 for a first process; the number of the restart for a replacement.
+    """
+    source = (seed, first_env, frames, restart) if restart else (seed, first_env, frames)
+    exploration, episodes = map(int, np.random.SeedSequence(source).generate_state(2))
+    return exploration, episodes
 
 
 class CollectionError(Exception):

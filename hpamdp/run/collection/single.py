@@ -17,15 +17,17 @@ from torchrl.envs.utils import ExplorationType
 from hpamdp.acting import acting
 from hpamdp.config.schema import Config
 from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.collection.base import Collection, checked_state
+from hpamdp.run.collection.base import Collection, checked_state, random_seeds
 
 
 class SingleCollection(Collection):
     """Steps the environments in the learner's own process, between two updates."""
 
-    def __init__(self, config: Config, parts: AssembledRun) -> None:
+    def __init__(self, config: Config, parts: AssembledRun, frames: int = 0) -> None:
         self._parts = parts
         self.env = parts.env
+        if frames > 0 and not self.env.keeps_episodes:  # otherwise the run's first episodes would come again
+            self.env.set_seed(random_seeds(config.run.seed, 0, frames)[1], static_seed=True)
         selector = parts.agent.selector
         pending = None if selector is None else selector.pending.clone()
         with acting(ExplorationType.RANDOM):
@@ -74,6 +76,8 @@ class SingleCollection(Collection):
         saved = checked_state(state, self._parts)
         if saved.env:  # otherwise the collector continues the episodes that it has just begun
             self.env.set_env_state(saved.env)
+            if not self.env.keeps_episodes:  # the saved statistics scale their first observations, too
+                self._collector._carrier.update(self.env.reset())
         if saved.root is not None and self.env.keeps_episodes:
             root = self._collector._carrier
             root.update(TensorDict(saved.root, batch_size=root.batch_size))

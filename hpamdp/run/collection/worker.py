@@ -101,6 +101,11 @@ class ShardCollector(Collector):
         """Return the statistics of the steps since the last call alone."""
         return self.env.base_env.take_new_statistics()
 
+    def begin_episodes(self, statistics: Mapping[str, Tensor]) -> None:
+        """Begin new episodes, whose first observations the `statistics` scale."""
+        self.env.base_env.set_statistics(statistics)
+        self._carrier.update(self.env.reset())
+
     def collect(self, policy: bytes, statistics: Mapping[str, Tensor]) -> Collected:
         """Load the `packed` policy and the environments' common `statistics`, and collect a batch.
 

@@ -10,7 +10,6 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn, TypeVar
 
-import numpy as np
 import torch
 from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
@@ -23,7 +22,7 @@ from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.messages import first_line
 from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state
+from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state, random_seeds
 from hpamdp.run.collection.limits import limit_of
 from hpamdp.run.collection.worker import EnvShard, RemoteError, packed
 from hpamdp.search_path import protect_children, unprotect_children
@@ -134,11 +133,10 @@ class WorkerCollection(Collection):
         """
         seed, first = self._config.run.seed, worker * self._size
         # Each worker has its own random numbers, which change if a run is resumed.
-        source = (seed, first, self._frames, restart) if restart else (seed, first, self._frames)
-        exploration_seed, env_seed = map(int, np.random.SeedSequence(source).generate_state(2))
-        return EnvShard(
-            self._config, self._specs, first, self._size, env_seed if restart else seed, exploration_seed, self._frozen
-        )
+        exploration_seed, fresh_seed = random_seeds(seed, first, self._frames, restart)
+        begins_anew = restart > 0 or (self._frames > 0 and not self._keeps_episodes)
+        env_seed = fresh_seed if begins_anew else seed
+        return EnvShard(self._config, self._specs, first, self._size, env_seed, exploration_seed, self._frozen)
 
     def _start_first(self, number: int) -> None:
         try:
@@ -291,8 +289,10 @@ class WorkerCollection(Collection):
             first = number * self._size
 
             def send_to(worker: Any) -> None:
-                if saved.env and self._keeps_episodes:  # otherwise it continues the episodes that it has just begun
+                if saved.env and self._keeps_episodes:
                     call_worker(worker, "env.set_env_state", _sliced(saved.env, first, self._size))
+                elif saved.env:
+                    call_worker(worker, "begin_episodes", saved.env)
                 if saved.root is not None and self._keeps_episodes:
                     call_worker(worker, "_carrier.update", _sliced(saved.root, first, self._size))
                 if len(saved.generators) == len(self.workers):
