@@ -75,6 +75,9 @@ class Metrics(Protocol):
     def rows(self) -> list[dict[str, float]]:
         """Return all rows so far, each with the columns that have a number."""
 
+    def keep_resumed(self) -> None:
+        """Write the rows of the resumed run into a new folder, where nothing else has them."""
+
 
 def rows_up_to(frames: float, path: Path) -> list[dict[str, float]]:
     """Return the rows of a `metrics.csv` for a run that resumes from this many frames.
@@ -101,6 +104,9 @@ class MetricsInMemory:
     def rows(self) -> list[dict[str, float]]:
         """Return a copy of all rows so far."""
         return [dict(row) for row in self._rows]
+
+    def keep_resumed(self) -> None:
+        """Do nothing: there is no folder."""
 
 
 class MetricsFile:
@@ -133,6 +139,12 @@ class MetricsFile:
         else:
             with self.path.open("a", newline="") as file:
                 self._writer(file).writerow(row)
+
+    def keep_resumed(self) -> None:
+        """Write the rows of the resumed run into a new folder, where nothing else has them."""
+        if self._resumed:
+            self._rewrite(self._resumed)
+            self._resumed = None
 
     def rows(self) -> list[dict[str, float]]:
         """Return all rows so far, each with the columns that have a number."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import re
 import subprocess
 import sys
@@ -167,6 +168,68 @@ def test_an_interrupted_training_in_a_folder_goes_on_with_resume_auto(tmp_path):
     assert hpamdp.train("platform", resume="auto", **arguments).history[-1]["frames"] == 1024
     again = hpamdp.train("platform", resume="auto", **arguments)  # nothing is left to do
     assert again.history[-1]["frames"] == 1024
+
+
+def test_a_resumed_run_in_a_new_folder_keeps_its_rows_even_if_it_ends_before_its_first_own_one(tmp_path):
+    class Fails(hpamdp.Callback):
+        def on_batch(self, trainer):
+            raise RuntimeError("once")
+
+    arguments = {**TINY, "low": "hppo"}
+    first = hpamdp.train("platform", folder=tmp_path / "a", **arguments)
+    longer = {name: value for name, value in arguments.items() if name not in ("low", "env")} | {"total_frames": 2048}
+    with pytest.raises(RuntimeError, match="once"):
+        hpamdp.train(resume=tmp_path / "a", folder=tmp_path / "b", callbacks=Fails(), **longer)
+    last = hpamdp.train(resume=tmp_path / "b", folder=tmp_path / "c", **longer)
+    frames = [row["frames"] for row in last.history]
+    assert frames[: len(first.history)] == [row["frames"] for row in first.history] and frames[-1] == 2048
+
+
+def test_an_evaluation_that_was_cut_off_is_made_by_the_resumed_run(tmp_path):
+    class Stop(hpamdp.Callback):
+        def on_evaluation(self, trainer, row):
+            if row["frames"] >= 1024:
+                raise KeyboardInterrupt
+
+    class Count(hpamdp.Callback):
+        evaluated = 0
+
+        def on_evaluation(self, trainer, row):
+            self.evaluated += 1
+
+    arguments = {**TINY, "low": "hppo", "folder": tmp_path / "run"}
+    hpamdp.train("platform", callbacks=Stop(), **arguments)
+    count = Count()
+    assert hpamdp.train("platform", resume="auto", callbacks=count, **arguments).history[-1]["frames"] == 1024
+    assert count.evaluated == 1
+
+
+def test_training_leaves_the_callers_random_numbers_alone(tmp_path):
+    hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **TINY)
+    np.random.seed(5)
+    random.seed(5)
+    states = np.random.get_state()[1].copy(), random.getstate()
+    hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 2048})
+    assert np.array_equal(np.random.get_state()[1], states[0]) and random.getstate() == states[1]
+
+
+def test_a_resumed_run_tells_that_schedules_have_ended(tmp_path, capsys):
+    hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **{**TINY, "low.anneal_steps": 1024})
+    hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 2048})
+    assert "but low.anneal_steps stay at 1,024" in capsys.readouterr().err
+
+
+def test_another_preset_of_a_problem_keeps_none_of_the_agents_settings():
+    agent = hpamdp.train("catch_point", low="hppo", **TINY)
+    with pytest.raises(hpamdp.ConfigError, match="evaluate: env=catch_point_picture has"):
+        agent.evaluate("catch_point_picture", episodes=2)
+
+
+def test_the_environment_of_a_run_that_was_an_object_is_not_taken_for_the_same_in_silence(tmp_path, capsys):
+    arguments = {**OWN, "folder": tmp_path / "run"}
+    hpamdp.train(lambda: Reach(), **arguments)
+    hpamdp.train(lambda: Reach(), resume="auto", **arguments)
+    assert "whether it was the same one is not known" in capsys.readouterr().err
 
 
 def test_a_callback_sees_the_trainer_and_ends_the_training():

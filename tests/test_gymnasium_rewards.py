@@ -51,7 +51,7 @@ def test_the_statistics_of_rewards_are_saved_and_restored():
 @pytest.mark.parametrize("reward", [float("inf"), float("nan"), 1e300])
 def test_a_reward_that_cannot_be_scaled_is_refused(reward):
     scaling = RewardScaling(2, 0.9)
-    with pytest.raises(ProblemError, match="step returned the reward .*, which reward_scaling cannot scale"):
+    with pytest.raises(ProblemError, match=r"step returned the reward .*, which reward_scaling cannot scale"):
         scaling.scaled(np.array([1.0, reward]), np.ones(2, bool))
     assert np.isfinite(scaling.statistics.var).all()
 

@@ -55,6 +55,16 @@ def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, pat
     assert [row["frames"] for row in rows if "eval/score" in row] == [0, 3, 6]
 
 
+def test_a_run_that_fails_in_its_first_evaluation_keeps_its_data_set(path, tmp_path, monkeypatch):
+    given = overrides(path, "iql")
+    with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
+        patched.setattr(Trainer, "_evaluate", lambda self, bar: 1 / 0)
+        run(compose_config(given), tmp_path / "first", given)
+    resumed = ["mode=offline", f"resume={tmp_path / 'first'}"]
+    assert run(compose_config(resumed), tmp_path / "second", resumed) == 0
+    assert json.loads((tmp_path / "second" / "summary.json").read_text())["without_update"] == []
+
+
 @pytest.mark.parametrize("high", ["ucb", "linucb", "meta_critic"])
 def test_a_selector_learns_from_the_decisions_in_the_data(high, path):
     words = [*overrides(path, "iql", high), *(["high.memory=all"] if high != "meta_critic" else [])]

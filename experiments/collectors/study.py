@@ -33,6 +33,7 @@ TASKS = {
         "env.kwargs={controller:congruent}",
         "env.max_steps=100",
         "num_envs=256",
+        "steps_per_batch=16",
         "total_frames=16384",
         "eval.layouts=100",
     ],

@@ -88,7 +88,7 @@ def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, fl
     for noise, levels in LEVELS.items():
         for level in levels:
             noisy = {**options, **dict.fromkeys(LEVELS, 0.0), noise: level}
-            key = str(noisy)
+            key = str((noisy, config.run.eval, config.run.agent))
             if key not in evaluations:
                 evaluations[key] = make_evaluation(replace(config, env=replace(config.env, settings=noisy)), env)
             evaluation = evaluations[key]

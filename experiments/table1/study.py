@@ -213,7 +213,7 @@ def brief_table(rows: Rows, results: Rows) -> str:
 def table(rows: Rows, results: Rows) -> str:
     """Return the lines of the learners, then those of people, the ceiling and random presses.
 
-    From five seeds on, the interquartile mean and its interval follow the score.
+    From ten seeds on, the interquartile mean and its interval follow the score.
     """
     lines = [
         "| | controller | seeds | score | below the ceiling | above the next best (95 %) | human-normalised score "

@@ -223,8 +223,8 @@ def standing_rows(path: Path) -> Rows:
     """Read the rows of a csv file that stand in tables.
 
     A plan beside the file, `PLAN_NAME`, names the seeds of the protocol. The rows of a cell are those of the
-    protocol's seeds once all planned ones are in the file, and until then those of the earlier seeds. Without a plan,
-    or without the plan's columns, all rows stand.
+    planned seeds once all are in the file, and until then those of the earlier seeds. Without a plan, or without the
+    plan's columns, all rows stand.
     """
     rows, plan = read_csv(path), path.with_name(PLAN_NAME)
     names = _cell_columns(plan) if plan.exists() else []
@@ -233,9 +233,13 @@ def standing_rows(path: Path) -> Rows:
     planned = planned_seeds(plan)
     standing: Rows = []
     for cell, of_cell in groups(rows, *names).items():
-        ran = {row["seed"] for row in of_cell if row["seed"] >= FIRST_PROTOCOL_SEED}
-        is_complete = cell in planned and ran.issuperset(planned[cell])
-        standing += [row for row in of_cell if (row["seed"] >= FIRST_PROTOCOL_SEED) == is_complete]
+        wanted, ran = planned.get(cell, range(0)), {row["seed"] for row in of_cell}
+        if len(wanted) > 0 and ran.issuperset(wanted):
+            standing += [row for row in of_cell if row["seed"] in wanted]
+        else:
+            standing += [row for row in of_cell if row["seed"] < FIRST_PROTOCOL_SEED]
+            if len(wanted) == 0 and max(ran) >= FIRST_PROTOCOL_SEED:
+                warn(f"{path.name}: {', '.join(map(str, cell))} has new seeds, but is not in {plan.name}; left out")
     return standing
 
 

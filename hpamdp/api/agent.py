@@ -251,7 +251,7 @@ class Agent:
         with composed(words) as cfg:
             other = read(cfg).with_objects(arguments.objects)
             own = self._config.env
-            if other.env.cls is own.cls:
+            if other.env.cls is own.cls and other.env.name == own.name:
                 given = {each.partition("=")[0].removeprefix("env.") for each in words}
                 kept = {name: value for name, value in own.settings.items() if name not in (*given, *_SOURCES)}
                 other = other.with_problem(replace(other.env, settings={**other.env.settings, **kept}))

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 import torchrl
+from torchrl.checkpoint import GlobalRNGState
 
 from hpamdp.api.agent import Agent
 from hpamdp.api.arguments import (
@@ -37,7 +38,7 @@ from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import Callback
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.compatibility import check_effects
-from hpamdp.run.continuation import rest_of
+from hpamdp.run.continuation import Rest, rest_of
 from hpamdp.run.folder import locked
 from hpamdp.run.players import load_agent
 from hpamdp.run.resume import resolve, saved_words
@@ -111,7 +112,7 @@ def train(
             if output_dir is not None:
                 stack.enter_context(_own_folder(output_dir))
             if goes_on and output_dir is not None:
-                score, source = rest_of(config, output_dir)
+                score, source = _rest_of(config, output_dir)
                 if score is not None:
                     return load(output_dir, env=env, config_dirs=config_dirs, trust=True)
             trainer = begin(config, source, output_dir, words, may_overwrite=goes_on, callbacks=callbacks)
@@ -213,20 +214,31 @@ def _own_folder(folder: Path) -> Iterator[None]:
                 each.rmdir()
 
 
+def _rest_of(config: Config, folder: Path) -> Rest:
+    """Return the rest of a run in a folder. Warn if its environment is an object, which no config tells apart."""
+    rest = rest_of(config, folder)
+    if config.env.objects and rest != Rest():
+        warn(
+            f"resume='auto': {folder} holds a run of an environment given as an object, too; whether it was the same "
+            "one is not known"
+        )
+    return rest
+
+
 @contextmanager
 def _torch_restored() -> Iterator[None]:
-    """Compute gradients, and give torch back its threads and random numbers afterwards. A run sets its own.
+    """Compute gradients, and give back torch's threads and all random numbers afterwards. A run sets its own.
 
     TorchRL would log every replay buffer that it fills.
     """
-    threads, generator, level = torch.get_num_threads(), torch.get_rng_state(), torchrl.logger.level
+    threads, generators, level = torch.get_num_threads(), GlobalRNGState().state_dict(), torchrl.logger.level
     torchrl.logger.setLevel(max(level, logging.WARNING))
     try:
         with torch.inference_mode(False), torch.enable_grad():
             yield
     finally:
         torch.set_num_threads(threads)
-        torch.set_rng_state(generator)
+        GlobalRNGState().load_state_dict(generators)
         torchrl.logger.setLevel(level)
 
 

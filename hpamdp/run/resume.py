@@ -24,6 +24,7 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import warn
 from hpamdp.run import checkpoint, compatibility
 from hpamdp.run.assemble import choose_selector, make_env
+from hpamdp.run_files import flat_settings
 from hpamdp.shell import setting
 
 # Settings that a run does not take over from the saved run.
@@ -75,7 +76,23 @@ def resolve(
         resolved = read_saved(saved, values, names, trust=run.trust, file=file, place_of=place_of)
     except MissingChoiceError as error:
         raise _not_there(error, file) from error
+    if run.resume is not None:
+        _warn_of_ended_schedules(saved, resolved, source)
     return replace(resolved, config_dirs=folders).with_objects(objects), file
+
+
+def _warn_of_ended_schedules(saved: Mapping[str, Any], resolved: Config, source: str) -> None:
+    """Warn if the run gets longer, but schedules of its agent end where it used to end."""
+    before, now = saved.get("total_frames"), resolved.run.total_frames
+    if not isinstance(before, int) or now <= before:
+        return
+    levels = {group: saved.get(group) for group in ("high", "low", "exploration")}
+    ended = [name for name, value in flat_settings(levels).items() if value == before and ".budget." not in name]
+    if ended:
+        warn(
+            f"resume={source}: total_frames is raised to {now:,}, but {', '.join(ended)} stay at {before:,}: what "
+            "falls until then keeps its last value"
+        )
 
 
 def _plain_value(cfg: DictConfig, name: str) -> Any:

@@ -52,6 +52,7 @@ class Progress(SavedPart):
     wall_s: Amount
     cpu_s: Amount
     last_score: FiniteFloat | None
+    evaluation_due: bool = False
 
 
 class _OptimizerState(SavedPart):

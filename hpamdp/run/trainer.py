@@ -80,6 +80,7 @@ class Trainer:
         self.wall_s = 0.0
         self.cpu_s = 0.0
         self.last_score: float | None = None
+        self.is_evaluation_due = False  # whether one was begun and not ended
         self._saved: checkpoint.Saved | None = None  # what a resumed run continues from
         self.unit = " steps"
         if config.run.mode == "offline":
@@ -98,6 +99,7 @@ class Trainer:
         self.wall_s = progress["wall_s"]
         self.cpu_s = progress["cpu_s"]
         self.last_score = progress["last_score"]
+        self.is_evaluation_due = progress.get("evaluation_due", False)
         if not is_training:
             saved.set_statistics(env)
             return
@@ -146,6 +148,7 @@ class Trainer:
         with moved_aside(self.output_dir):
             self._write_config(self.output_dir)
             self.recorder.start()
+            self.recorder.metrics.keep_resumed()
 
     def _write_config(self, folder: Path) -> None:
         with replacing(folder / CONFIG_NAME) as partial:
@@ -201,7 +204,7 @@ class Trainer:
                 self._call(lambda callback: callback.on_end(self))
             finally:
                 self._save_and_close(collection)
-            return not self._is_over()
+            return self.is_evaluation_due or not self._is_over()
 
     def _call(self, act: Callable[[Callback], None]) -> None:
         for name, callback in self.callbacks.items():
@@ -251,11 +254,12 @@ class Trainer:
             assert isinstance(learner, Learner)
             learner.while_compiling = partial(_said_by, bar, "compiling the updates")
         with bar:
+            is_new = self.last_score is None and self.frames == 0
+            if is_new and self.parts.data is not None:  # before anything can end the run, which has the data only now
+                self.parts.agent.add_demonstrations(self.parts.data.batch, self.parts.data.decisions)
             self._call(lambda callback: callback.on_start(self))
-            if self.last_score is None and self.frames == 0:
+            if is_new or self.is_evaluation_due:
                 self._evaluate(bar)
-                if self.parts.data is not None:
-                    self.parts.agent.add_demonstrations(self.parts.data.batch, self.parts.data.decisions)
             while not self._is_over() and request.signal is None:
                 try:
                     num = self._learn(collection)
@@ -304,12 +308,14 @@ class Trainer:
         return self._is_stopped or is_reached or self.frames >= self.config.run.num_frames
 
     def _evaluate(self, bar: tqdm) -> None:
+        self.is_evaluation_due = True  # if it is cut off, the resumed run makes it
         own = metrics_of(self.callbacks, self)
         row = self.recorder.log(self.frames, self.wall_s, is_evaluated=True, own=own)
         success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
         self.last_score = row["eval/score"]
         bar.set_postfix_str(f"score {self.last_score:.2f}{success}")
         self._call(lambda callback: callback.on_evaluation(self, row))
+        self.is_evaluation_due = False
 
     def save(self, collection: Collection) -> None:
         """Write the checkpoint and the file with only the networks, if the run has a folder.
@@ -380,6 +386,7 @@ class Trainer:
             "wall_s": self.wall_s,
             "cpu_s": self.cpu_s,
             "last_score": self.last_score,
+            "evaluation_due": self.is_evaluation_due,
         }
 
 

@@ -57,9 +57,12 @@ class PolicyCopy(TensorDictModuleBase):
         """Write what the policy writes."""
         return self.policy(td)
 
-    def receive(self, state: bytes) -> float:
-        """Load the `packed` state of the learner's policy, and return this process's CPU seconds so far."""
+    def receive(self, state: bytes) -> None:
+        """Load the `packed` state of the learner's policy."""
         unpack(self.policy, state)
+
+    def cpu_s(self) -> float:
+        """Return this process's CPU seconds so far."""
         return time.process_time() - self._cpu_before
 
     def generator_state(self) -> Tensor:
@@ -80,7 +83,7 @@ class Collected:
     """What a worker returns with a batch.
 
     Attributes:
-        cpu_s: CPU seconds of the process before the batch.
+        cpu_s: CPU seconds of the process, those of the batch included.
         batch: `[num_envs, steps_per_batch]`; None if it lies in the memory of the last batch.
         statistics: what the environments have taken by `take_new_statistics`.
     """
@@ -116,11 +119,11 @@ class ShardCollector(Collector):
             RemoteError: the environment raised any other error.
         """
         try:
-            cpu_s = self.policy.receive(policy)
+            self.policy.receive(policy)
             if statistics:
                 self.env.base_env.set_statistics(statistics)
             batch = self.next()
-            return Collected(cpu_s, batch, self.take_new_statistics())
+            return Collected(self.policy.cpu_s(), batch, self.take_new_statistics())
         except (ProblemError, MemoryError) as error:
             raise type(error)(str(error)) from None
         except EnvironmentFaultError as error:
