@@ -402,6 +402,11 @@ def test_the_learning_rates_fall_to_their_final_fraction():
     assert rates == [pytest.approx([f * 1e-3, f * 3e-3]) for f in (1.0, 0.55, 0.1, 0.1)]
 
 
+def test_updates_with_one_hidden_layer_do_not_count_as_worth_compiling():
+    assert make(hidden_dims=[32]).num_updates(10**6) == 0
+    assert make(hidden_dims=[32, 32]).num_updates(10**6) > 0
+
+
 def test_rewards_are_stored_scaled():
     torch.manual_seed(0)
     learner = make(reward_scale=0.1, warmup_steps=10_000)

@@ -433,6 +433,10 @@ class PDQN(ReplayLearner):
         fraction = linear_schedule(steps, options.lr_steps, options.lr_final_fraction)
         set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
+    def num_updates(self, steps: int) -> int:
+        """Return the updates for this many steps; none with one hidden layer, whose compiled updates take longer."""
+        return super().num_updates(steps) if len(self.options.hidden_dims) > 1 else 0
+
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return every row with its n-step return, the state that follows and the discount of that state's value."""
         rows = super().transitions(batch)
