@@ -66,7 +66,7 @@ def test_each_problem_with_an_id_has_a_time_limit_as_a_gymnasium_environment(env
     ],
 )
 def test_problems_whose_training_begins_elsewhere_are_refused_as_gymnasium_environments(env_id, settings):
-    with pytest.raises(SettingError, match="its training begins elsewhere than its evaluation, or with other boats"):
+    with pytest.raises(SettingError, match="its training begins elsewhere than its evaluation, or in another world"):
         GymnasiumEnv(2, id=env_id, kwargs=settings)
     GymnasiumEnv(2, id=env_id).close()
 

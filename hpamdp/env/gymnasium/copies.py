@@ -153,7 +153,7 @@ class Copies:
             self.example = self.envs[0]
             if getattr(self.example.unwrapped, "training_begins_elsewhere", False):  # of this package's problems
                 raise SettingError(
-                    "its training begins elsewhere than its evaluation, or with other boats, and a Gymnasium "
+                    "its training begins elsewhere than its evaluation, or in another world, and a Gymnasium "
                     "environment does not know which of the two it is in; use the problem itself, such as env=pinball"
                 )
             self._limits = [limit_of(env, reading.max_steps) for env in self.envs]
