@@ -811,7 +811,7 @@ def learners_on_domains() -> list[Claim]:
         ),
         Claim(
             "docs/learners/pdqn.md",
-            "On Platform the difference is small: {mpdqn:.3f} for MP-DQN as published (one seed), {pdqn:.3f} for the "
+            "On Platform the difference is small: {mpdqn:.3f} for MP-DQN as published (three seeds), {pdqn:.3f} for the "
             "default (ten).",
             numbers,
         ),
