@@ -811,8 +811,8 @@ def learners_on_domains() -> list[Claim]:
         ),
         Claim(
             "docs/learners/pdqn.md",
-            "On Platform the difference is small: {mpdqn:.3f} for MP-DQN as published (three seeds), {pdqn:.3f} for the "
-            "default (ten).",
+            "On Platform the difference is small: {mpdqn:.3f} for MP-DQN as published (three seeds), {pdqn:.3f} for "
+            "the default (ten).",
             numbers,
         ),
         Claim(

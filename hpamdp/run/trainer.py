@@ -104,7 +104,8 @@ class Trainer:
             saved.set_statistics(env)
             return
         self.resumed_from = source.parent
-        self.recorder.resume_from(source.parent, self.frames)
+        # The evaluation that is due writes the row of these frames again.
+        self.recorder.resume_from(source.parent, self.frames - 1 if self.is_evaluation_due else self.frames)
         try:
             self.recorder.set_state(saved.states["recorder"])
             self._restore_callbacks(saved.states.get("callbacks", {}))

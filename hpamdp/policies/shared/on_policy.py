@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 import torch
@@ -125,7 +125,12 @@ class OnPolicy(nn.Module):
 
     def gradient_step(self, loss_of: LossFunction, *inputs: Inputs) -> dict[str, Tensor]:
         """Take one step of the optimizer down the gradient of a loss, see `Descent.step`; return its scalars."""
-        return self.descent.step(self.optimizer, loss_of, *inputs, max_grad_norm=self.options.max_grad_norm)
+        limit, apart = self.options.max_grad_norm, self.clipped_apart()
+        return self.descent.step(self.optimizer, loss_of, *inputs, max_grad_norm=limit, clipped_apart=apart)
+
+    def clipped_apart(self) -> Sequence[Iterable[Tensor]]:
+        """Return the groups of parameters whose gradients are clipped separately, see `Descent.step`."""
+        return ()
 
 
 def generalised_advantages(
