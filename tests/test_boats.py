@@ -177,6 +177,23 @@ def test_the_oracle_reaches_the_score_of_its_plans(settings):
         torch.testing.assert_close(score[solved], planned[solved], atol=2e-3, rtol=0.0)
 
 
+@pytest.mark.parametrize("presses", [0, 1])
+def test_boats_that_are_put_elsewhere_have_the_plans_of_that_place(presses):
+    env, other = (BoatDockEnv(16, controller="congruent", oracle=True, seed=seed) for seed in (2, 3))
+    env.reset()
+    td = other.reset()
+    for _ in range(presses):
+        td[keys.DISCRETE], td[keys.PARAMETERS] = torch.zeros(16, dtype=torch.long), torch.full((16, 3), 0.1)
+        td = other.step(td)["next"]
+    env.state = other.state
+    planned = env.read()["oracle"]
+    first = planner.plans_of_options(env.rules, env.state)
+    assert torch.equal(planned["discrete"], first.keys[..., 0])
+    assert torch.equal(planned["parameters"], first.durations[..., 0])
+    if presses == 0:
+        assert (planned == td["oracle"]).all()
+
+
 def follow_held(env, option):
     td = env.reset()
     for _ in range(planner.MAX_PRESSES + 1):

@@ -485,6 +485,20 @@ def test_the_better_set_depends_on_the_target_and_neither_is_always_better():
     assert optimum.amax(-1).mean() - optimum.mean(0).max() > 0.02
 
 
+@pytest.mark.parametrize("begin", ["empty", "known"])
+def test_circuits_that_are_put_elsewhere_have_the_plans_of_that_place(begin):
+    env, other = (CircuitEnv(16, task="toffoli", begin=begin, oracle=True, seed=seed) for seed in (2, 3))
+    env.reset()
+    td = other.reset()
+    for _ in range(2):
+        gate, angle = td["oracle", "discrete"][:, 0], td["oracle", "parameters"]
+        td[keys.DISCRETE], td[keys.PARAMETERS] = gate, angle.repeat(1, other.action_spec[keys.PARAMETERS].shape[-1])
+        td = other.step(td)["next"]
+        env.state = other.state
+        is_unfinished = ~td[keys.DONE].squeeze(-1)
+        assert (env.read()["oracle"] == td["oracle"])[is_unfinished].all()
+
+
 def test_the_oracle_with_the_planner_reaches_the_ceiling_and_always_chooses_right():
     settings = {"env.task": "random_state", "env.gate_set": "choose", "eval.layouts": 50, "film": False}
     sizes = {"num_envs": 4, "steps_per_batch": 4, "total_frames": 16}

@@ -195,6 +195,9 @@ def test_a_seed_fixes_the_episodes_whatever_the_number_of_copies():
     one.set_seed(6)
     assert not torch.equal(seen, first_three(one))
     fixed = first_three(one, tensordict=one.fixed_episodes(5))
+    assert torch.equal(
+        fixed[:, 1:], first_three(make(1, first_env=1), tensordict=make(1, first_env=1).fixed_episodes(5))
+    )
     assert not torch.equal(seen[0], fixed[0])
     assert torch.equal(fixed, first_three(make(2, seed=9), tensordict=one.fixed_episodes(5)))
 

@@ -326,6 +326,10 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     @state.setter
     def state(self, state: EpisodeState) -> None:
+        self._put(state)
+        self._on_start(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
+
+    def _put(self, state: EpisodeState) -> None:
         self._state = type(state)(*(column.to(self.device) for column in state))
         self._has_episodes = True
 
@@ -389,7 +393,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             return
         checksums = self.file_checksums()
         own = {name: column for name, column in columns.items() if name not in checksums}
-        self.state = restored(own, self._state, type(self).__name__)
+        self._put(restored(own, self._state, type(self).__name__))
 
     def seed_evaluation(self, seed: int) -> None:
         """Begin with the episodes of an evaluation, which no training meets, whatever its seed."""
@@ -539,7 +543,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         return self.read() if results is None else self._reading(results)
 
     def _on_start(self, mask: Tensor) -> None:
-        """Prepare what the episodes that have just begun, in the rows of `mask` `[N]`, need beside their state."""
+        """Prepare what episodes that have just begun or were put elsewhere, in the rows of `mask` `[N]`, need."""
 
     def _given_columns(self, tensordict: TensorDictBase | None) -> dict[str, Tensor]:
         """Return the columns of the state that `reset` was given."""

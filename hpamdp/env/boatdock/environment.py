@@ -266,7 +266,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
 
     def fixed_episodes(self, seed: int) -> TensorDict:
         """Return layouts to `reset` with, one for each environment. No training episode has them, whatever its seed."""
-        layout = harbour.fixed_layouts(self.num_envs, seed)
+        layout = harbour.fixed_layouts(self.num_envs, seed, first=int(self._environment[0]))
         centre = torch.tensor(harbour.CENTRE, dtype=torch.float32)
         points = {"start": torch.stack(layout[:2], -1) + centre, "goal": torch.stack(layout[2:], -1) + centre}
         return TensorDict(points, batch_size=self.batch_size, device=self.device)

@@ -130,9 +130,12 @@ def separation(layout: Layout) -> Tensor:
     return ((layout.goal_x - layout.start_x).square() + (layout.goal_y - layout.start_y).square()).sqrt()
 
 
-def fixed_layouts(num: int, seed: int) -> Layout:
-    """Return `num` layouts for evaluation. They have their own random stream, so training never uses them."""
-    rows = torch.arange(num, dtype=torch.int32)
+def fixed_layouts(num: int, seed: int, first: int = 0) -> Layout:
+    """Return `num` layouts for evaluation, from number `first` on.
+
+    They have their own random stream, so training never uses them.
+    """
+    rows = torch.arange(first, first + num, dtype=torch.int32)
     episode = torch.zeros(num, dtype=torch.int32)
     return sample_layout(counter_rng.rng_key(counter_rng.seed_tensor(seed), counter_rng.EVALUATION, rows, episode))
 

@@ -30,7 +30,7 @@ def _num_plans(rules: Rules) -> int:
 
 
 class BoatDockOracle:
-    """Keep the best plan of every option, made at the start of an episode.
+    """Keep the best plan of every option, made at the start of an episode, or where a boat was put.
 
     With noise or a `switch_cost`, the plans are made again before every press.
 
@@ -50,6 +50,7 @@ class BoatDockOracle:
         shape = (num_envs, _num_plans(rules), planner.MAX_PRESSES)
         self.keys = torch.zeros(shape, dtype=torch.long, device=device)
         self.durations = torch.zeros(shape, device=device, dtype=torch.float32)
+        self._planned_at = torch.zeros(num_envs, dtype=torch.long, device=device)  # presses before the plan
 
     def plans(self) -> dict[str, Tensor]:
         """Return the plans for a checkpoint. They are made only at the start of an episode."""
@@ -59,6 +60,7 @@ class BoatDockOracle:
         """Restore the result of `plans`."""
         for name, plan in plans.items():
             getattr(self, name).copy_(plan)
+        self._planned_at.zero_()
 
     def plan(self, state: BoatState, rows: Tensor) -> None:
         """Plan for the environments of `rows`, bool `[N]`, from their current positions."""
@@ -67,15 +69,15 @@ class BoatDockOracle:
         self.option[rows] = planner.better_option(plans)
         self.keys[rows] = plans.keys
         self.durations[rows] = plans.durations
+        self._planned_at[rows] = boats.presses.long()
 
     def read(self, state: BoatState) -> TensorDict:
         """Return `option` `[N]` and the next press of each plan, `discrete` and `parameters` `[N, num_plans]`."""
-        num_presses = state.presses.long()  # since the plan was made
         # Plan again if noise may have moved the boat, or if a change of controllers takes fuel, which alters the other
         # controllers' plans.
         if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0 or self.rules.switch_cost is not None:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))
-            num_presses = torch.zeros_like(num_presses)
+        num_presses = state.presses.long() - self._planned_at
         index = num_presses.clamp(max=planner.MAX_PRESSES - 1).view(-1, 1, 1).expand(-1, self.keys.shape[1], 1)
         keys = self.keys.gather(-1, index).squeeze(-1)
         durations = self.durations.gather(-1, index).squeeze(-1)

@@ -129,12 +129,14 @@ class CircuitOracle:
             self.angles[rows, number, :used] = torch.from_numpy(each.angles).float().to(device)
 
     def _leave_out_begun(self, state: CircuitState, rows: Tensor, beginnings: Tensor) -> None:
-        """Keep of the known circuit what follows the gates with which episodes begin, complex64 `[L, R, C]`."""
+        """Keep of the known circuit what follows the gates that are there, of the `beginnings` complex64 `[L, R, C]`."""
         begun, _ = rules.circuit_and_target(state, self.design)
         distance = (begun[rows].unsqueeze(1) - beginnings.to(begun.device)).abs().sum((-2, -1))
         num = self._known_gates.shape[-1]
-        place = torch.arange(num, device=begun.device) + distance.argmin(-1, keepdim=True)
-        place = place.clamp(max=num - 1)  # the stop
+        least, there = distance.min(-1, keepdim=True)
+        there = torch.where(least < 0.1, there, num - 1)  # of the whole circuit, or of another one, the stop is left
+        place = torch.arange(num, device=begun.device) + there - state.steps[rows].unsqueeze(-1)
+        place = place.clamp(0, num - 1)  # `read` adds the steps
         self.gates[rows] = self._known_gates[place].unsqueeze(1)
         self.angles[rows] = self._known_angles[place].unsqueeze(1)
 

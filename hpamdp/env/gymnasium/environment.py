@@ -247,7 +247,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     def fixed_episodes(self, seed: int) -> TensorDict:
         """Return seeds to `reset` with, one for each copy, from another stream than those of training."""
-        seeds = torch.tensor(_seeds(seed, self.num_envs, _FIXED), device=self.device)
+        seeds = torch.tensor(_seeds(seed, self.num_envs, _FIXED, self.first_env), device=self.device)
         return TensorDict({_SEED: seeds}, batch_size=self.batch_size, device=self.device)
 
     def gymnasium_form(self) -> OwnForm:
