@@ -23,6 +23,7 @@ from hpamdp.analysis.study import (
     gathered,
     groups,
     interquartile_mean,
+    interval_text,
     mean_interval,
     middle_half,
     planned_seeds,
@@ -165,13 +166,14 @@ def test_the_interval_covers_the_truth_about_as_often_as_it_says():
 
 
 @pytest.mark.parametrize("values", [[2.0], [2.0, 2.0, 2.0]])
-def test_seeds_that_do_not_vary_have_an_interval_of_no_width(values):
-    assert interquartile_mean(values) == (2.0, 2.0, 2.0)
+def test_seeds_that_do_not_vary_have_an_interquartile_mean_without_an_interval(values):
+    middle, low, high = interquartile_mean(values)
+    assert middle == 2.0 and np.isnan([low, high]).all()
 
 
 def test_an_interquartile_mean_is_shown_from_ten_seeds_on():
     assert middle_half([1.0, 2.0, 3.0, 4.0] * 2) == ""
-    assert middle_half([1.0] * 10) == "1.000 (1.000 to 1.000)"
+    assert middle_half([1.0] * 10) == "1.000"
 
 
 def test_a_difference_is_clear_where_its_interval_excludes_0():
@@ -207,7 +209,25 @@ def test_the_interval_of_a_difference_covers_the_truth_about_as_often_as_it_says
 def test_the_interval_of_a_mean_covers_the_truth_as_often_as_it_says():
     draws = np.random.default_rng(0).normal(size=(1000, 3))
     assert np.mean([low <= 0.0 <= high for low, high in map(mean_interval, draws)]) == pytest.approx(0.95, abs=0.02)
-    assert np.isnan(mean_interval([1.0])).all() and mean_interval([2.0, 2.0]) == (2.0, 2.0)
+
+
+def test_seeds_that_do_not_vary_have_no_interval_and_no_clear_difference():
+    assert np.isnan(mean_interval([1.0])).all() and np.isnan(mean_interval([2.0, 2.0])).all()
+    assert interval_text([2.0, 2.0]) == "" and interval_text([1.0, 2.0, 3.0], ".1f") == "-0.5 to 4.5"
+    assert str(difference([1.0, 1.0], [0.98, 0.98])) == "+0.020"
+    assert not difference([1.0, 1.0], [0.98, 0.98]).is_clear
+
+
+def test_a_plan_may_name_one_seed(tmp_path):
+    (tmp_path / "cells.csv").write_text("learner,seeds\nhppo,100\npdqn,100-101\n")
+    assert planned_seeds(tmp_path / "cells.csv") == {("hppo",): range(100, 101), ("pdqn",): range(100, 102)}
+
+
+def test_a_curve_joins_runs_that_were_evaluated_at_different_times():
+    points = {0: [(100, 1.0), (0, 0.0)], 1: [(0, 0.0), (50, 0.5), (100, 1.0), (150, 9.0)]}
+    rows = [{"seed": seed, "frames": at, "score": score} for seed, of in points.items() for at, score in of]
+    at, means, deviations = curve(rows, "frames", "score")
+    assert at.tolist() == [0, 50, 100] and means.tolist() == [0.0, 0.5, 1.0] and not deviations.any()
 
 
 def test_a_curve_of_one_seed_has_no_deviation():
@@ -474,6 +494,8 @@ def test_options_refuses_cells_of_runs_with_different_settings():
     assert options.standing(rows, options.PAIR, ["sharing"]) == {("pdqn", "ucb"): rows}
     with pytest.raises(SystemExit, match="pdqn, ucb: has runs with different sharing"):
         options.standing([*rows, rows[0] | {"sharing": "per_option"}], options.PAIR, ["sharing"])
+    with pytest.raises(SystemExit, match="pdqn, ucb: has two runs with the same seed"):
+        options.standing([*rows, rows[0]], options.PAIR)
 
 
 @pytest.mark.parametrize(
@@ -619,7 +641,7 @@ def test_domains_ranks_learners_by_the_plain_mean():
     # One bad seed of five lowers the mean, but not the interquartile mean.
     bad_seed, steady = runs("hyar", 1000, 500.0, 0.9, 0.9, 0.9, 0.9, 0.0), runs("pdqn", 1000, 700.0, *[0.8] * 5)
     line = domains.best_table(bad_seed + steady, [{"domain": "goal", "method": "chdp", "score": 0.81}]).splitlines()[-1]
-    assert line.startswith("| goal | pdqn | 2 | 0.800 ± 0.000 (5), IQM 0.800 success | 0.800 to 0.800 | hyar (5) |")
+    assert line.startswith("| goal | pdqn | 2 | 0.800 ± 0.000 (5), IQM 0.800 success |  | hyar (5) |")
     assert line.endswith("| 0.20 | hyar | 0.81 (chdp) | 700 s |")
     table = domains.table(steady, [], [{"domain": "goal", "player": "random", "score": 0.0004}])
     assert table.splitlines()[-1].startswith("| random |  | 0.0004 |")

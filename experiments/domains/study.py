@@ -28,7 +28,7 @@ from hpamdp.analysis.study import (
     gathered,
     groups,
     interquartile_mean,
-    mean_interval,
+    interval_text,
     read_csv,
     refuse_repeats,
     spread,
@@ -210,14 +210,13 @@ def best_table(results: Rows, published: Rows) -> str:
         best, *others = sorted(values, key=lambda low: -float(np.mean(values[low])))
         second = f"{others[0]} ({_num_seeds(cells[(others[0],)])})" if others else ""
         improvement = f"{difference(values[best], values[others[0]]).improvement:.2f}" if others else ""
-        low, high = mean_interval(values[best])
         top = best_published(published, name)
         columns = [
             name,
             best,
             len(values),
             f"{_cell(cells[(best,)])} {'return' if what == 'score' else 'success'}",
-            f"{low:.3f} to {high:.3f}",
+            interval_text(values[best]),
             second,
             improvement,
             _not_clearly_lower(values, best, others),

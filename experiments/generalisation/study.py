@@ -22,7 +22,7 @@ from hpamdp.analysis.study import (
     add_to_tables,
     gathered,
     groups,
-    mean_interval,
+    interval_text,
     read_csv,
     spread,
     with_enough_seeds,
@@ -117,7 +117,6 @@ def table(results: Rows) -> str:
     for settings, rows in groups(results, *SETTINGS).items():
         family, boats, frame, fleet, scored, ends, high, high_memory, low, memory, sharing = settings
         first, second, rest = ([value(row) for row in rows] for value in (_first, _second, later))
-        low_end, high_end = mean_interval(rest)
         columns = [
             family,
             boats,
@@ -131,7 +130,7 @@ def table(results: Rows) -> str:
             spread(first),
             spread(second),
             spread(rest),
-            f"{low_end:.3f} to {high_end:.3f}",
+            interval_text(rest),
             spread([later(row, first=4) for row in rows]),
             f"{_mean(rows, 'ceiling'):.3f}",
             f"{_mean(rows, 'presses_1'):.1f}",
@@ -193,8 +192,7 @@ def fleet_table(results: Rows) -> str:
     for (size, orders), agents in by_fleet(results).items():
         scores = [[value(rows[boats]) for rows in agents] for value in (_first, later) for boats in ("training", "new")]
         lost = [own - new for own, new in zip(*scores[2:], strict=True)]
-        interval = "{:.3f} to {:.3f}".format(*mean_interval(lost)) if len(lost) > 1 else ""
-        columns = [size, orders, len(agents), *map(spread, scores), spread(lost), interval]
+        columns = [size, orders, len(agents), *map(spread, scores), spread(lost), interval_text(lost)]
         lines.append(f"| {' | '.join(map(str, columns))} |")
     return "\n".join(lines)
 

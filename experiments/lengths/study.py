@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hpamdp.analysis.study import Rows, Run, add_to_tables, gathered, mean_interval, read_csv, spread
+from hpamdp.analysis.study import Rows, Run, add_to_tables, gathered, interval_text, read_csv, spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -81,8 +81,7 @@ def tabulate(rows: Rows) -> None:
         if not of_ends:
             continue
         shares = [100.0 * row["share"] for row in of_ends]
-        low, high = mean_interval(shares)
-        interval = f"{low:.1f} to {high:.1f} %" if len(shares) > 2 else ""
+        interval = f"{interval_text(shares, '.1f')} %" if len(shares) > 2 else ""
         length = "" if ends[0] != "chosen" else spread([row["length"] for row in of_ends], 1)
         cells = [
             title,

@@ -24,7 +24,7 @@ from hpamdp.analysis.study import (
     add_to_tables,
     gathered,
     groups,
-    mean_interval,
+    interval_text,
     read_csv,
     spread,
     standing_rows,
@@ -69,7 +69,7 @@ def standing(rows: Rows, names: Sequence[str], settings: Sequence[str] = ()) -> 
         settings: columns in which the runs of a cell must agree.
 
     Raises:
-        SystemExit: the runs of a cell have different settings.
+        SystemExit: the runs of a cell have different settings, or a seed twice.
     """
     cells = {}
     for cell, of_cell in groups(rows, *names).items():
@@ -79,6 +79,8 @@ def standing(rows: Rows, names: Sequence[str], settings: Sequence[str] = ()) -> 
             cells[cell] = chosen
             if len(groups(chosen, *settings)) > 1:
                 raise SystemExit(f"{', '.join(filter(None, cell))}: has runs with different {', '.join(settings)}")
+            if len(groups(chosen, "seed")) < len(chosen):
+                raise SystemExit(f"{', '.join(filter(None, cell))}: has two runs with the same seed")
     return cells
 
 
@@ -151,7 +153,7 @@ def goal_table() -> str:
             high,
             len(rows),
             spread(scores),
-            "{:.3f} to {:.3f}".format(*mean_interval(scores)),
+            interval_text(scores),
             f"{_mean(rows, 'frames'):,.0f}",
             f"{_mean(rows, 'cpu_s'):.0f} s",
         ]

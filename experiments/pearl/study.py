@@ -20,7 +20,7 @@ from hpamdp.analysis.study import (
     Rows,
     first_at,
     groups,
-    mean_interval,
+    interval_text,
     read_csv,
     refuse_repeats,
     spread,
@@ -86,10 +86,9 @@ def table(curves: Rows) -> str:
         ends = [run[-1] for run in runs]
         firsts = [first for run in runs if (first := first_at(run, "success", REACHED))]
         scores = [end["score"] for end in ends]
-        interval = "{:,.0f} to {:,.0f}".format(*mean_interval(scores)) if len(scores) > 1 else ""
         cells = [PROBLEMS[problem], f"{library} {version}", learner, str(len(runs))]
         cells += [f"{_mean(ends, 'episodes'):,.0f}", f"{_mean(ends, 'steps'):,.0f}", f"{_mean(ends, 'cpu_s'):,.0f} s"]
-        cells += [spread(scores, 0), interval]
+        cells += [spread(scores, 0), interval_text(scores, ",.0f")]
         cells += [f"{100.0 * _mean(ends, 'success'):.1f} %", f"{len(firsts)} of {len(runs)}"]
         cells += [_range(firsts, "episodes"), _range(firsts, "steps"), _range(firsts, "cpu_s", " s")]
         lines.append(f"| {' | '.join(cells)} |")

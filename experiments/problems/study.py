@@ -25,7 +25,7 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
-    mean_interval,
+    interval_text,
     read_csv,
     spread,
     with_enough_seeds,
@@ -199,7 +199,6 @@ def table(results: Rows, curves: Rows) -> str:
         bar, whose = BARS[problem]
         digits = 0 if bar > 100.0 else 3
         scores = [row["score"] for row in rows]
-        low, high = mean_interval(scores)
         firsts = [first_at(evaluations[problem, learner, exploration, row["seed"]], "score", bar) for row in rows]
         reached = [first["frames"] for first in firsts if first]
         columns = [
@@ -209,7 +208,7 @@ def table(results: Rows, curves: Rows) -> str:
             f"{frames:,}",
             len(rows),
             spread(scores, digits),
-            f"{low:.{digits}f} to {high:.{digits}f}",
+            interval_text(scores, f".{digits}f"),
             percent([row["success"] for row in rows]),
             percent([row["better_option"] for row in rows if row["better_option"] != ""]),
             f"{min(scores):.{digits}f}",

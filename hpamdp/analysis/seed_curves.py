@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from hpamdp.analysis.seed_runs import Configuration
+from hpamdp.analysis.study import mean_curve
 from hpamdp.figure_style import LEARNER_COLOURS, REFERENCES, STYLE, label_ends
 from hpamdp.messages import one_line
 from hpamdp.metrics_file import EVALUATION
@@ -54,24 +55,6 @@ def draw(configurations: Sequence[Configuration], metric: str) -> Callable[[Path
             _draw_panel(panel, lines, metric)
         figure.supxlabel(_caption(panels, left_out), fontsize=9)
     return partial(_save, figure)
-
-
-def mean_curve(curves: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return frames, and the mean, the standard deviation and the number of the curves there.
-
-    A curve counts from its first to its last point, and is a straight line between two points. The standard deviation
-    is that of a sample; it is 0 where only one curve counts.
-
-    Args:
-        curves: rows of frames and value, sorted by frames.
-    """
-    frames = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
-    heights = np.array([np.interp(frames, curve[:, 0], curve[:, 1], left=np.nan, right=np.nan) for curve in curves])
-    counts = (~np.isnan(heights)).sum(0)
-    frames, heights, counts = frames[counts > 0], heights[:, counts > 0], counts[counts > 0]
-    means = np.nanmean(heights, 0)
-    squares = np.nansum((heights - means) ** 2, 0)
-    return frames, means, np.sqrt(squares / np.maximum(counts - 1, 1)), counts
 
 
 @contextmanager

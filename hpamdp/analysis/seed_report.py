@@ -186,7 +186,8 @@ def _is_of_a_report(path: Path) -> bool:
 
 def _row(configuration: Configuration) -> dict[str, Any]:
     values, scored = configuration.values, configuration.scored
-    interval = mean_interval(values) if len(values) >= _LEAST_FOR_INTERVAL else None
+    low, high = mean_interval(values)
+    interval = (low, high) if len(values) >= _LEAST_FOR_INTERVAL and not np.isnan(low) else None
     return {
         "configuration": configuration.name,
         "settings": dict(configuration.settings),

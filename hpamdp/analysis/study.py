@@ -205,11 +205,11 @@ def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
 
 
 def planned_seeds(path: Path) -> dict[tuple[Any, ...], range]:
-    """Return the seeds of a plan, whose rows say `100-109`, by cell. The columns before `seeds` name a cell."""
+    """Return the seeds of a plan, whose rows say `100-109` or `100`, by cell. The columns before `seeds` name a cell."""
     names, planned = _cell_columns(path), {}
     for cell in read_csv(path):
-        first, last = map(int, cell["seeds"].split("-"))
-        planned[tuple(cell[name] for name in names)] = range(first, last + 1)
+        first, _, last = str(cell["seeds"]).partition("-")
+        planned[tuple(cell[name] for name in names)] = range(int(first), int(last or first) + 1)
     return planned
 
 
@@ -376,7 +376,7 @@ def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
 
     The plain percentile interval of a few seeds is too narrow. The expanded interval is as wide as Student's t
     interval, within the sample's range. With fewer than `MIN_SEEDS` values it is too narrow, too, so `middle_half`
-    omits both.
+    omits both. The bounds are NaN if the values do not vary, as in `mean_interval`.
 
     Sources: Agarwal et al. 2021, arXiv 2108.13264, for one task; Hesterberg 2015, *What teachers should know about the
     bootstrap*, arXiv 1411.5279.
@@ -384,7 +384,7 @@ def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
     sample = np.asarray(values, dtype=float)
     middle = float(stats.trim_mean(sample, 0.25))
     if len(sample) < 2 or np.ptp(sample) == 0.0:
-        return middle, middle, middle
+        return middle, np.nan, np.nan
     tail = stats.norm.cdf(stats.t.ppf(0.025, len(sample) - 1) * np.sqrt(len(sample) / (len(sample) - 1)))
     interval = stats.bootstrap(
         (sample,),
@@ -402,19 +402,26 @@ def middle_half(values: Sequence[float]) -> str:
     if len(values) < MIN_SEEDS:
         return ""
     middle, low, high = interquartile_mean(values)
-    return f"{middle:.3f} ({low:.3f} to {high:.3f})"
+    return f"{middle:.3f}" if np.isnan(low) else f"{middle:.3f} ({low:.3f} to {high:.3f})"
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:
     """Return the bounds of Student's 95 % t interval of the mean over seeds; NaN with a single seed.
 
-    It assumes that scores are normal over seeds. If one seed in five fails, the mean is less certain than it says.
+    They are also NaN if all values are the same, such as a success of 1: such seeds do not tell how far others may lie.
+    The interval assumes that scores are normal over seeds. If one seed in five fails, the mean is less certain.
     """
     sample = np.asarray(values, dtype=float)
-    if len(sample) < 2:
+    if len(sample) < 2 or np.ptp(sample) == 0.0:
         return np.nan, np.nan
     half = float(stats.t.ppf(0.975, len(sample) - 1) * stats.sem(sample))
     return float(sample.mean()) - half, float(sample.mean()) + half
+
+
+def interval_text(values: Sequence[float], style: str = ".3f") -> str:
+    """Return a text with the bounds of `mean_interval`, in a format such as `.3f`. It is empty if they are NaN."""
+    low, high = mean_interval(values)
+    return "" if np.isnan(low) else f"{low:{style}} to {high:{style}}"
 
 
 @dataclass(frozen=True)
@@ -423,7 +430,8 @@ class Difference:
 
     Attributes:
         mean: difference of the means.
-        low, high: Welch's 95 % t interval of the difference; NaN if either method has a single seed.
+        low, high: Welch's 95 % t interval of the difference; NaN if either method has a single seed, or if the scores
+            of neither vary.
         improvement: probability that a seed of the first method exceeds a seed of the second. Ties count half.
     """
 
@@ -456,10 +464,8 @@ def difference(values: Sequence[float], others: Sequence[float]) -> Difference:
     pairs = np.sign(sample[:, None] - other[None, :])
     improvement = float((0.5 * (pairs + 1.0)).mean())
     mean = float(sample.mean() - other.mean())
-    if min(len(sample), len(other)) < 2:
+    if min(len(sample), len(other)) < 2 or np.ptp(sample) == np.ptp(other) == 0.0:
         return Difference(mean, np.nan, np.nan, improvement)
-    if np.ptp(sample) == np.ptp(other) == 0.0:
-        return Difference(mean, mean, mean, improvement)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # scores of one of them that do not vary
         bounds = stats.ttest_ind(sample, other, equal_var=False).confidence_interval()
@@ -467,12 +473,30 @@ def difference(values: Sequence[float], others: Sequence[float]) -> Difference:
 
 
 def curve(runs: Rows, x: str, y: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `x`, and the mean and the standard deviation of `y` over seeds, up to the end of the shortest run.
+    """Return `x`, and the mean and the standard deviation of `y` over seeds, where every run has values.
 
-    The standard deviation is that of a sample, as in `spread`. With one seed it is 0.
+    Between two values of a run the line is straight. The standard deviation is that of a sample, as in `spread`. With
+    one seed it is 0.
     """
-    seeds = [np.array([(row[x], row[y]) for row in rows], dtype=float) for rows in groups(runs, "seed").values()]
-    num = min(map(len, seeds))
-    heights = np.array([seed[:num, 1] for seed in seeds])
-    deviation = heights.std(0, ddof=1) if len(seeds) > 1 else np.zeros(num)
-    return np.mean([seed[:num, 0] for seed in seeds], 0), heights.mean(0), deviation
+    seeds = [np.array(sorted((row[x], row[y]) for row in rows), dtype=float) for rows in groups(runs, "seed").values()]
+    at, means, deviations, counts = mean_curve(seeds)
+    is_whole = counts == len(seeds)
+    return at[is_whole], means[is_whole], deviations[is_whole]
+
+
+def mean_curve(curves: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return frames, and the mean, the standard deviation and the number of the curves there.
+
+    A curve counts from its first to its last point, and is a straight line between two points. The standard deviation
+    is that of a sample; it is 0 where only one curve counts.
+
+    Args:
+        curves: rows of frames and value, sorted by frames.
+    """
+    frames = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
+    heights = np.array([np.interp(frames, curve[:, 0], curve[:, 1], left=np.nan, right=np.nan) for curve in curves])
+    counts = (~np.isnan(heights)).sum(0)
+    frames, heights, counts = frames[counts > 0], heights[:, counts > 0], counts[counts > 0]
+    means = np.nanmean(heights, 0)
+    squares = np.nansum((heights - means) ** 2, 0)
+    return frames, means, np.sqrt(squares / np.maximum(counts - 1, 1)), counts

@@ -129,7 +129,7 @@ class CircuitOracle:
             self.angles[rows, number, :used] = torch.from_numpy(each.angles).float().to(device)
 
     def _leave_out_begun(self, state: CircuitState, rows: Tensor, beginnings: Tensor) -> None:
-        """Keep of the known circuit what follows the gates that are there, of the `beginnings` complex64 `[L, R, C]`."""
+        """Keep of the known circuit what follows the gates that are there: one of its beginnings `[L, R, C]`."""
         begun, _ = rules.circuit_and_target(state, self.design)
         distance = (begun[rows].unsqueeze(1) - beginnings.to(begun.device)).abs().sum((-2, -1))
         num = self._known_gates.shape[-1]
