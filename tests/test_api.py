@@ -353,6 +353,24 @@ def test_a_wrong_observation_is_refused_with_its_shape(platform_agent, observati
         platform_agent.act(observation)
 
 
+def test_an_agent_scores_alike_in_vectors_that_restart_in_the_same_and_in_the_next_step(boat_agent):
+    def first_scores(**mode):
+        vector = hpamdp.make_gymnasium("boatdock", num_envs=8, **mode)
+        scores: list[list[float]] = [[] for _ in range(8)]
+        observations, _ = vector.reset(seed=0)
+        boat_agent.reset()
+        while min(map(len, scores)) < 4:
+            observations, _, terminated, truncated, infos = vector.step(boat_agent.act(observations))
+            done = terminated | truncated
+            of_done = infos if mode else infos.get("final_info")
+            for row in np.flatnonzero(done):
+                scores[row].append(of_done["score"][row])
+            boat_agent.reset(done, next_step=bool(mode))
+        return np.array([of_row[:4] for of_row in scores])
+
+    np.testing.assert_allclose(first_scores(autoreset_mode="NextStep"), first_scores(), atol=1e-4)
+
+
 def test_a_missing_reset_is_refused_once_an_episode_is_longer_than_the_problem_allows(boat_agent):
     boat_agent.reset()
     observation, _ = hpamdp.make_gymnasium("boatdock").reset(seed=0)

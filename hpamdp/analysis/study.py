@@ -205,7 +205,7 @@ def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
 
 
 def planned_seeds(path: Path) -> dict[tuple[Any, ...], range]:
-    """Return the seeds of a plan, whose rows say `100-109` or `100`, by cell. The columns before `seeds` name a cell."""
+    """Return the seeds of a plan by cell. A row says `100-109` or `100`; the columns before `seeds` name its cell."""
     names, planned = _cell_columns(path), {}
     for cell in read_csv(path):
         first, _, last = str(cell["seeds"]).partition("-")

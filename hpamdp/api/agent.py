@@ -79,7 +79,7 @@ class Agent:
         # What must stay from step to step: the selector's choices, and the state of the learners' policies.
         self._kept = [*agent.choice_keys, *agent.router.state_keys]
         self._last: TensorDictBase | None = None
-        self._starts = np.zeros(0, bool)
+        self._starts = self._starts_later = np.zeros(0, bool)
 
     def __repr__(self) -> str:
         frames = self._progress.get("frames")
@@ -134,18 +134,23 @@ class Agent:
         exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
         with acting(exploration), torch.no_grad():
             self._last = self.policy(seen)
-        self._starts[:] = False
+        self._starts, self._starts_later = self._starts_later, np.zeros_like(self._starts)
         return self._form.write(self._last, is_batch=is_batch)
 
-    def reset(self, starts: Any = None) -> None:
+    def reset(self, starts: Any = None, *, next_step: bool = False) -> None:
         """Begin new episodes with the next `act`.
 
         Args:
             starts: which of a batch begin, bool `[N]`, such as `terminated | truncated`. If None, all of them.
+            next_step: whether the vector restarts them in its next step, as in the mode `NextStep`, the default of
+                `gymnasium.make_vec`. There the next `act` still sees the last observation of the old episode, and its
+                action is ignored, so the new episode begins with the `act` after it.
+                `make_gymnasium` makes vectors that restart in the same step.
 
         Raises:
             ValueError: the mask does not fit the batch.
         """
+        flag("reset: next_step", next_step)
         if starts is None:
             self._last = None
             return
@@ -155,6 +160,8 @@ class Agent:
             raise ValueError(f"reset: starts must be bool [{num}], but is {as_code(starts)}")
         if self._last is not None and self._kept:
             self._starts |= mask
+            if next_step:
+                self._starts_later |= mask
 
     def _seen(self, fresh: TensorDict) -> TensorDictBase:
         """Return what the policy reads: new rows `[N]`, and what stays from the last step."""
@@ -164,7 +171,7 @@ class Agent:
         never = torch.zeros(num, 1, dtype=torch.bool, device=fresh.device)
         fresh.set(keys.DONE, never)
         if self._last is None:
-            self._starts = np.ones(num, bool)
+            self._starts, self._starts_later = np.ones(num, bool), np.zeros(num, bool)
             return self._tracker._reset(fresh.empty(), fresh)
         if len(self._last) != num:
             running = len(self._last)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import inspect
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
+from gymnasium import VectorizeMode
 from gymnasium.envs.registration import load_env_creator
+from gymnasium.vector import AutoresetMode
 from pydantic import NonNegativeInt, PositiveInt
 
 from hpamdp.api.arguments import plain_name, problem_arguments, without_env_prefix
@@ -82,7 +85,9 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
             own, such as `max_steps=50`.
 
     Returns:
-        A `gymnasium.Env`, or a `gymnasium.vector.VectorEnv` if `num_envs` is given.
+        A `gymnasium.Env`, or a `gymnasium.vector.VectorEnv` if `num_envs` is given. A vector of a problem of this
+        package restarts finished episodes in the same step, as `Agent.reset` expects; `autoreset_mode="NextStep"` is
+        Gymnasium's default.
 
     Raises:
         ConfigError: there is no such id or device, a package is missing, or a setting is wrong or given twice.
@@ -108,12 +113,24 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
     try:
         if num_envs is None:
             return gymnasium.make(env_id, **own)
+        if env_id.startswith("hpamdp/"):
+            own = _restarting_in_same_step(env_id, own)
         return gymnasium.make_vec(env_id, num_envs=checked.num_envs, **own)
     except (gymnasium.error.Error, ValueError, ModuleNotFoundError, TypeError) as error:
         complaint = _complaint(error, env_id)
         if complaint is None:
             raise
         raise ConfigError(f"{env_id}: {complaint}") from error
+
+
+def _restarting_in_same_step(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a vector that restarts in the same step, unless they say otherwise."""
+    modes = (None, VectorizeMode.VECTOR_ENTRY_POINT, VectorizeMode.VECTOR_ENTRY_POINT.value)
+    is_own = settings.get("vectorization_mode") in modes and gymnasium.spec(env_id).vector_entry_point is not None
+    if is_own:
+        return {"autoreset_mode": AutoresetMode.SAME_STEP, **settings}
+    of_vector = {"autoreset_mode": AutoresetMode.SAME_STEP, **(settings.get("vector_kwargs") or {})}
+    return {**settings, "vector_kwargs": of_vector}
 
 
 def _complaint(error: Exception, env_id: str) -> str | None:
