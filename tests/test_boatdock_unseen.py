@@ -391,3 +391,9 @@ def test_scores_say_whether_they_are_of_a_trip_or_of_a_boat():
     means = Evaluation.measure(SimpleNamespace(env=env), played)
     scores = {name for name in means if name.startswith("score_")}
     assert scores == {"score_trip_1", "score_trip_2", "score_later", "score_boat_1", "score_boat_2"}
+
+
+def test_a_model_sees_the_velocity_where_the_displacement_has_noise():
+    velocity = {rules.OBSERVATION_NAMES.index(name) for name in ("velocity_x", "velocity_y")}
+    assert velocity <= {*UnseenBoatsEnv(1).geometry.redundant}
+    assert not velocity & {*UnseenBoatsEnv(1, sensor_noise=5.0).geometry.redundant}

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import pickle
 
+import gymnasium
+import numpy as np
 import pytest
 from gymnasium_players import step
 from toy_environments import Toy
 
+import hpamdp
 from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
@@ -67,3 +70,26 @@ def test_the_command_line_prints_the_line_and_the_environments_own_frames(where,
     lines = [line for line in err.splitlines() if "steps" not in line]
     assert code == 1 and f"its {where} raised ValueError" in err
     assert "Traceback" not in err and "hydra" not in err and "hpamdp/" not in err and len(lines) <= 12
+
+
+class Unseeded(gymnasium.Env):
+    """Its generator ignores the seed of `reset`."""
+
+    observation_space, action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,)), gymnasium.spaces.Discrete(2)
+
+    def __init__(self):
+        self.generator = np.random.default_rng(0)
+
+    def reset(self, *, seed=None, options=None):
+        return self.generator.uniform(-1.0, 1.0, 2).astype(np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 1.0, True, False, {}
+
+
+def test_an_environment_that_ignores_its_seed_is_named_once(capsys):
+    sizes = {"total_frames": 256, "num_envs": 2, "steps_per_batch": 32, "eval.layouts": 2, "env.max_steps": 3}
+    hpamdp.train(Unseeded, low="hppo", high="none", progress=False, **sizes)
+    assert capsys.readouterr().err.count("two resets with the same seed began differently") == 1
+    hpamdp.train(Toy, low="hppo", high="none", progress=False, **sizes)
+    assert "two resets" not in capsys.readouterr().err

@@ -274,6 +274,9 @@ class PAMDPEnv(EnvBase):
         """
         self.set_seed(_checked_seed(seed) ^ _EVALUATION)
 
+    def warn_if_seed_is_ignored(self, seed: int) -> None:
+        """Warn if episodes with the same seed begin differently, which only somebody else's environment can do."""
+
     def describe(self) -> dict[str, Tensor]:
         """Return facts about the episodes that have just begun, first dimension `N`. A run asks once."""
         return {}

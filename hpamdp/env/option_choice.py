@@ -70,6 +70,10 @@ class OptionChoiceEnv(PAMDPEnv):
         """Seed the evaluation episodes of the wrapped environment."""
         self.inner_env.seed_evaluation(seed)
 
+    def warn_if_seed_is_ignored(self, seed: int) -> None:
+        """Warn if the wrapped environment ignores seeds."""
+        self.inner_env.warn_if_seed_is_ignored(seed)
+
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return the results of the wrapped environment."""
         return self.inner_env.results(last)

@@ -39,6 +39,7 @@ class Evaluation:
         self.num_filmed = num_filmed
         self.filmed_steps = filmed_steps
         self.states: list[dict[str, Tensor]] = []
+        self.problem.warn_if_seed_is_ignored(seed)
         self.episodes = env.fixed_episodes(seed)
         self._reset()
         self.known = env.describe()

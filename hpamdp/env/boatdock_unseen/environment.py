@@ -191,12 +191,13 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         """The places and displacements, and what reveals where the keys of each boat push.
 
         A mirrored boat is as likely as the boat itself, so the mirror holds for all families. Every press begins at
-        rest, so the velocity does not matter. The start affects only the distance.
+        rest, so the velocity moves nothing. The start affects only the distance.
         """
-        names = ["start_x", "start_y", "velocity_x", "velocity_y", "trip", "boat", "last_boat", "last_key_1"]
-        names += ["last_key_2", "last_key_3", "last_duration", "moved_x", "moved_y", "last_score"]
+        names = ["start_x", "start_y", "trip", "boat", "last_boat", "last_key_1", "last_key_2", "last_key_3"]
+        names += ["last_duration", "moved_x", "moved_y", "last_score"]
         if self.rules.sensor_noise == 0.0:
-            names += ["goal_x", "goal_y"]  # the boat's place and the goal's offset tell it
+            # The boat's place and the goal's offset tell the goal, and the displacement the velocity's direction.
+            names += ["goal_x", "goal_y", "velocity_x", "velocity_y"]
         entry = {name: number for number, name in enumerate(rules.OBSERVATION_NAMES)}
         vectors = ("start", "goal", "boat", "to_goal", "velocity", "moved")
         return PlaneGeometry(

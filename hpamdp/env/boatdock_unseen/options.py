@@ -56,7 +56,10 @@ class UnseenBoatsOptions(Settings):
     motor_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
     """Standard deviation of the log of the executed duration."""
     sensor_noise: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
-    """Standard deviation of the positions and of the displacement that are seen, in pixels."""
+    """Standard deviation of the positions and of the displacement that are seen, in pixels.
+
+    The velocity and the seconds of the last press are seen without noise, so they still show where its key pushes.
+    """
     compile_rules: bool = False
     """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 

@@ -32,6 +32,7 @@ from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics, Scaling
 from hpamdp.env.registration import register
 from hpamdp.env.rng_streams import folded
+from hpamdp.messages import warn
 from hpamdp.observation_entries import observation_dtype
 from hpamdp.pickling import why_unsendable
 from hpamdp.settings import PositiveFraction, SettingError, Settings
@@ -249,6 +250,22 @@ class GymnasiumEnv(PAMDPEnv):
         """Return seeds to `reset` with, one for each copy, from another stream than those of training."""
         seeds = torch.tensor(_seeds(seed, self.num_envs, _FIXED, self.first_env), device=self.device)
         return TensorDict({_SEED: seeds}, batch_size=self.batch_size, device=self.device)
+
+    def warn_if_seed_is_ignored(self, seed: int) -> None:
+        """Warn if two resets of the first copy with the same seed return different observations.
+
+        It ends the running episode of this copy.
+        """
+        (first,) = _seeds(seed, 1, _FIXED)
+        begun = []
+        for _ in range(2):
+            self._copies.reset({0: first})
+            begun.append(self._copies.results.observation[0].copy())
+        if not np.array_equal(*begun, equal_nan=True):
+            warn(
+                f"{self._name}: two resets with the same seed began differently, so evaluations cannot be repeated, "
+                "and copies may play the same episodes; call super().reset(seed=seed) and draw from self.np_random"
+            )
 
     def gymnasium_form(self) -> OwnForm:
         """Return the form of the environment itself."""

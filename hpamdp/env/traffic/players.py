@@ -103,7 +103,7 @@ def _cycle(ratios: Sequence[float] | np.ndarray) -> float:
 
 
 def _greens(ratios: np.ndarray, cycle: float) -> list[int]:
-    """Return whole greens within the bounds, of which the last one fills the cycle."""
+    """Return whole greens within the bounds, except for the longest one, which fills the cycle."""
     whole = round(cycle) - YELLOW * len(PHASES)
     greens = [min(max(round(whole * ratio / ratios.sum()), MIN_GREEN), MAX_GREEN) for ratio in ratios.tolist()]
     longest = int(np.argmax(greens))
