@@ -148,10 +148,13 @@ class Saved:
         A line warns if a file that describes the problem differs from that of the saved run.
 
         Raises:
-            ConfigError: the saved statistics are of another environment.
+            ConfigError: the file lacks statistics that the environment scales by, or they are of another environment.
         """
         with _explained(f"{self.file}: does not fit env"):
             columns = _strings(self.states.get("collection", {}).get("env", {}))
+            missing = sorted(env.statistics().keys() - columns.keys())
+            if missing:
+                raise ValueError(f"it lacks the running statistics {', '.join(missing)}, by which env scales")
             for name, checksum in env.file_checksums().items():
                 if name not in columns:
                     continue
