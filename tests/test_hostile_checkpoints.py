@@ -395,6 +395,48 @@ def test_a_policy_with_other_progress_is_refused(entry, value, opener, tmp_path)
     assert "\n" not in str(error.value)
 
 
+HUGE = {
+    "low": {"low": {"hidden_dims": [8_000, 8_000]}},
+    "high": {"high": {"hidden_dims": [8_000, 8_000]}},
+    "members": {"high": {"num_members": 200_000}},
+    "exploration": {
+        "exploration": {
+            "_target_": "hpamdp.policies.exploration.novelty.Novelty",
+            "hidden_dims": [8_000, 8_000],
+        },
+        "choices": {"exploration": "novelty"},
+    },
+}
+
+
+def policy_of(opener, file, changes, *, has_weights=True):
+    """Write the policy of a run with other settings in its config."""
+    saved = torch.load(opener.folder / "policy.pt", weights_only=True)
+    progress = json.loads(saved["progress"])
+    for group, values in changes.items():
+        progress["config"][group].update(values)
+    torch.save({**saved, "progress": json.dumps(progress), **({} if has_weights else {"agent": {}})}, file)
+
+
+def load_without_memory(file) -> None:
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    words = ["mode=eval", f"checkpoint={file}"]
+    for load in (lambda: load_player(str(file), []), lambda: run(compose_config(words), file.parent / "run", words)):
+        with pytest.raises(ConfigError, match="does not fit this agent") as error:
+            load()
+        assert "\n" not in str(error.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+@pytest.mark.parametrize("has_weights", [True, False])
+@pytest.mark.parametrize("changes", HUGE.values(), ids=HUGE)
+def test_a_small_file_that_describes_a_huge_agent_is_refused_before_it_takes_memory(
+    changes, has_weights, opener, tmp_path
+):
+    policy_of(opener, tmp_path / "policy.pt", changes, has_weights=has_weights)
+    assert forked(load_without_memory, tmp_path / "policy.pt") == 0
+
+
 def test_weights_that_overflowed_are_not_saved(opener):
     weight = next(opener.parts.agent.parameters())
     with torch.no_grad():
