@@ -7,6 +7,7 @@ import json
 import math
 import pickle
 import resource
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -303,6 +304,7 @@ ODD = {
     "protocol 4": lambda: with_script(pickle.dumps({"a": [1]}, protocol=4)),
     "nothing": lambda: with_script(b""),
     "memo": lambda: with_script(b"\x80\x02}r\xff\xff\xff\xff."),
+    "dicts": lambda: with_script(b"\x80\x02](" + b"}" * 2_000_000 + b"e."),
     "length": lambda: with_script(b"\x80\x02X\xff\xff\xff\x7fab."),
 }
 
@@ -329,6 +331,31 @@ def open_bombs(opener) -> None:
 
 def test_no_bomb_takes_memory(opener):
     assert forked(open_bombs, opener) == 0
+
+
+def test_a_description_that_takes_more_memory_than_its_bytes_is_refused():
+    data = ODD["dicts"]()
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"its description has more than 450,0\d\d instructions"):
+        TensorArchive(io.BytesIO(data), len(data))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50_000_000
+
+
+def test_a_description_of_many_small_tensors_is_read():
+    data = packed([{"a": torch.zeros(1), "b": torch.zeros(2)} for _ in range(8_000)])
+    assert len(TensorArchive(io.BytesIO(data), len(data)).state) == 8_000
+
+
+def test_a_tensor_takes_its_bytes_twice_while_it_is_read():
+    data = packed({"a": torch.arange(5_000_000)})
+    archive = TensorArchive(io.BytesIO(data), len(data))
+    tracemalloc.start()
+    read = archive.tensor(archive.state["a"])
+    peak = tracemalloc.get_traced_memory()[1]  # without torch's own copy
+    tracemalloc.stop()
+    assert read.equal(torch.arange(5_000_000)) and peak < 1.1 * read.nbytes
 
 
 def test_a_compressed_or_ambiguous_archive_is_refused(opener, tmp_path):
