@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hpamdp.complaints import as_code
 from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import FULL_TANK, HumanData
 from hpamdp.env.boatdock import harbour, physics
@@ -30,6 +31,21 @@ def keep(data: HumanData, mask: Tensor) -> HumanData:
     return HumanData(data.episodes[mask].clone(), presses)
 
 
+def check_conditions(complete: object, successes: object, best_people: object, controller: object) -> None:
+    """Refuse conditions that `select` does not take.
+
+    Raises:
+        DataError: a condition is of another type, or there is no such controller.
+    """
+    for name, value in (("complete", complete), ("successes", successes)):
+        if not isinstance(value, bool):
+            raise DataError(f"{name}={as_code(value)}, but must be True or False")
+    if best_people is not None and type(best_people) is not int:
+        raise DataError(f"best_people={as_code(best_people)}, but must be a whole number or None")
+    if controller is not None and controller not in harbour.CONTROLLERS:
+        raise DataError(f"controller={as_code(controller)}, but must be one of {', '.join(harbour.CONTROLLERS)}")
+
+
 def select(
     data: HumanData,
     *,
@@ -48,8 +64,9 @@ def select(
         controller: only episodes with the `congruent` or the `incongruent` controller. If None, with either.
 
     Raises:
-        DataError: a condition is out of range, or no episode meets them all.
+        DataError: a condition is of another type or out of range, or no episode meets them all.
     """
+    check_conditions(complete, successes, best_people, controller)
     episodes = data.episodes
     mask = torch.ones(len(episodes), dtype=torch.bool)
     if complete:
@@ -63,8 +80,6 @@ def select(
             raise DataError(f"best_people={best_people}, but must be 1 to {num_people}")
         mask &= torch.isin(episodes["person"], scores.topk(best_people).indices)
     if controller is not None:
-        if controller not in harbour.CONTROLLERS:
-            raise DataError(f"controller={controller!r}, but must be one of {', '.join(harbour.CONTROLLERS)}")
         mask &= episodes["controller"] == harbour.CONTROLLERS.index(controller)
     if not mask.any():
         raise DataError("no episode meets all the conditions")
