@@ -549,7 +549,7 @@ SPOILS = {
     "say total_episodes=1, but its file has 2": lambda folder: with_metadata(folder, total_episodes=1),
     "say total_episodes=200000000, but its file has 2": lambda folder: with_metadata(folder, total_episodes=2 * 10**8),
     "say total_episodes=2.0, but its file has 2": lambda folder: with_metadata(folder, total_episodes=2.0),
-    "say total_episodes=null, but its file has 2": lambda folder: with_metadata(folder, total_episodes=None),
+    "say total_episodes=None, but its file has 2": lambda folder: with_metadata(folder, total_episodes=None),
     "its observation_space has pictures, but transitions hold vectors alone": in_pictures,
     "cannot be read as transitions (": lambda folder: with_values(
         folder, "rewards", lambda group, name, old: group.create_dataset(name, data=old[:1])

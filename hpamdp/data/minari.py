@@ -21,7 +21,6 @@ from gymnasium import spaces
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.complaints import as_json
 from hpamdp.data.errors import DataError
 from hpamdp.data.export import check_room
 from hpamdp.data.row_checks import TRAJECTORY, check_transitions
@@ -198,7 +197,7 @@ def _check_files(dataset_id: str) -> None:
         raise DataError(f"its file of episodes has {unknown[0][:80]}, but must have episode_0 to episode_{last} alone")
     said = metadata.get("total_episodes")
     if type(said) is not int or said != len(names):
-        raise DataError(f"its metadata say total_episodes={as_json(said):.40}, but its file has {len(names)}")
+        raise DataError(f"its metadata say total_episodes={said!r:.40}, but its file has {len(names)}")
 
 
 def _checked_episodes(file: Path) -> set[str]:
