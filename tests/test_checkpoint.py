@@ -12,11 +12,14 @@ import torch
 from conftest import compose_config, make_config
 from test_grid import SHORT
 
+import hpamdp
 from hpamdp.config.errors import ConfigError
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.state_checks import example_steps
 from hpamdp.run.train import run
+from hpamdp.run.trainer import Trainer
+from hpamdp.run_files import DIVERGED_NAME
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=256", "eval.layouts=4", "eval.every=0", "high=ucb"]
 PROGRESS = {"config": {}, "frames": 0, "wall_s": 0.0, "cpu_s": 0.0, "last_score": None}
@@ -214,6 +217,55 @@ def test_a_policy_file_is_scored_like_the_run_that_it_is_of(trained, tmp_path):
     assert run(compose_config(words), tmp_path / "scored", words) == 0
     scores = [json.loads((folder / "summary.json").read_text())["score"] for folder in (trained, tmp_path / "scored")]
     assert scores[0] == scores[1]
+
+
+@pytest.fixture(scope="module")
+def scaled(tmp_path_factory):
+    """A policy that reads observations scaled by running statistics."""
+    agent = hpamdp.train(
+        "CartPole-v1",
+        high="none",
+        low="hppo",
+        total_frames=64,
+        num_envs=2,
+        steps_per_batch=32,
+        observation_scaling="running",
+        **{"low.minibatch_size": 32, "low.hidden_dims": [8], "eval.layouts": 1},
+    )
+    file = tmp_path_factory.mktemp("scaled") / "policy.pt"
+    agent.save(file)
+    return file
+
+
+@pytest.mark.parametrize("collection", [None, {}, {"env": {}}])
+def test_a_policy_file_without_the_statistics_that_scale_its_observations_is_refused(scaled, tmp_path, collection):
+    saved = torch.load(scaled, weights_only=True)
+    assert hpamdp.load(scaled, trust=True)._env.statistics()["observation_count"] > 0
+    del saved["collection"]
+    torch.save(saved if collection is None else {**saved, "collection": collection}, tmp_path / "policy.pt")
+    with pytest.raises(ConfigError, match="it lacks the running statistics observation_count, observ") as error:
+        hpamdp.load(tmp_path / "policy.pt", trust=True)
+    assert "\n" not in str(error.value)
+
+
+def test_an_agent_that_diverged_is_kept_with_the_statistics_that_scale_its_observations(tmp_path):
+    words = ["env=gymnasium", "env.id=CartPole-v1", "env.observation_scaling=running", "high=none", "low=hppo"]
+    config = make_config([*words, *SMALL[:-1]])
+    parts = assemble(config)
+    parts.env.rollout(3)
+    before = parts.env.base_env.statistics()
+    Trainer(config, parts, tmp_path).keep_for_inspection()
+    saved = checkpoint.load(tmp_path / DIVERGED_NAME, parts.agent, parts.device, with_training=False)
+    other = assemble(config).env.base_env
+    saved.set_statistics(other)
+    assert all(torch.equal(column, before[name]) for name, column in other.statistics().items())
+
+
+def test_a_policy_file_of_an_earlier_version_without_statistics_is_read(trained, tmp_path):
+    saved = torch.load(trained / "policy.pt", weights_only=True)
+    del saved["collection"]
+    torch.save(saved, tmp_path / "policy.pt")
+    assert hpamdp.load(tmp_path / "policy.pt")._env.statistics() == {}
 
 
 def test_a_kill_while_writing_leaves_the_old_checkpoint_and_its_leftover_is_removed_later(trained, parts, tmp_path):

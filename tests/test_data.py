@@ -1,6 +1,7 @@
 """What serves any recording: demonstrations, tables and memory-mapped files, and Minari."""
 
 import csv
+import importlib
 import json
 import os
 import re
@@ -482,6 +483,19 @@ def with_values(folder, name, make):
         make(episode, name, old)
 
 
+def in_file(folder, change):
+    """Change the file of episodes."""
+    with h5py.File(folder / "main_data.hdf5", "a") as file:
+        change(file)
+
+
+def in_pictures(folder):
+    """Say that observations are pictures."""
+    library = importlib.import_module("minari.serialization")
+    space = spaces.Dict(a=spaces.Tuple([spaces.Box(0, 255, (64, 64, 3), np.uint8)]))
+    with_metadata(folder, observation_space=library.serialize_space(space))
+
+
 def spec_that_runs(folder):
     spec = gymnasium.envs.registration.EnvSpec("Bomb-v0", entry_point=f"{__name__}:light")
     with_metadata(folder, env_spec=spec.to_json(), action_space=None)
@@ -517,6 +531,26 @@ SPOILS = {
     "the transitions, row 3: next.reward is nan, but must be finite": lambda folder: with_values(
         folder, "rewards", lambda group, name, old: group.create_dataset(name, data=old * np.nan)
     ),
+    "episode_1/rewards in its file of episodes does not hold numbers": lambda folder: with_values(
+        folder, "rewards", lambda group, name, old: group.create_dataset(name, data=["a" * 99] * 2)
+    ),
+    "episode_2 in its file of episodes is there twice": lambda folder: in_file(
+        folder, lambda file: file.__setitem__("episode_2", file["episode_0"])
+    ),
+    "episode_1/more in its file of episodes is there twice": lambda folder: in_file(
+        folder, lambda file: file["episode_1"].__setitem__("more", file["/"])
+    ),
+    "has episode_7, but must have episode_0 to episode_1 alone": lambda folder: in_file(
+        folder, lambda file: file.move("episode_1", "episode_7")
+    ),
+    "has notes, but must have episode_0 to episode_2 alone": lambda folder: in_file(
+        folder, lambda file: file.create_group("notes")
+    ),
+    "say total_episodes=1, but its file has 2": lambda folder: with_metadata(folder, total_episodes=1),
+    "say total_episodes=200000000, but its file has 2": lambda folder: with_metadata(folder, total_episodes=2 * 10**8),
+    "say total_episodes=2.0, but its file has 2": lambda folder: with_metadata(folder, total_episodes=2.0),
+    "say total_episodes=None, but its file has 2": lambda folder: with_metadata(folder, total_episodes=None),
+    "its observation_space has pictures, but transitions hold vectors alone": in_pictures,
     "cannot be read as transitions (": lambda folder: with_values(
         folder, "rewards", lambda group, name, old: group.create_dataset(name, data=old[:1])
     ),

@@ -172,7 +172,7 @@ def differences(agent: Agent, run, num_steps: int = 6, num_rows: int = 64) -> fl
 
 def traced_step(agent: Agent):
     """Return the function that is traced for an export."""
-    step = GreedyStep(agent._agent, agent._form.scaling(), option_length(agent._config))
+    step = GreedyStep(agent._agent, agent._form, option_length(agent._config))
 
     def run(inputs):
         with torch.no_grad():
@@ -247,7 +247,7 @@ def test_the_file_acts_as_the_agent_on_raw_observations_alone_and_in_a_batch(own
     space = own_agent.observation_space
     rows = [spaces.flatten(space, {"far": far[i], "kind": kind[i]}) for i in range(64)]
     inputs = {
-        "observation": np.stack(rows).astype(np.float32),
+        "observation": np.stack(rows),
         "action_mask": masks,
         "option_mask": np.ones((64, 3), bool),
         "held_option": np.zeros(64, np.int64),
@@ -271,7 +271,7 @@ def test_the_file_holds_an_option_until_a_decision_is_due(own_session):
     session, _ = own_session
     held = np.arange(8) % 3
     inputs = {
-        "observation": np.zeros((8, 5), np.float32),
+        "observation": np.zeros((8, 5)),
         "action_mask": np.ones((8, 2), bool),
         "option_mask": np.ones((8, 3), bool),
         "held_option": held,
@@ -283,14 +283,164 @@ def test_the_file_holds_an_option_until_a_decision_is_due(own_session):
     np.testing.assert_array_equal(chosen[4:], held[4:])
 
 
+@pytest.mark.parametrize("number", [-1, 3, 99])
+def test_the_held_option_may_be_any_number_at_a_decision(own_session, number):
+    session, _ = own_session
+    inputs = {
+        "observation": np.zeros((2, 5)),
+        "action_mask": np.ones((2, 2), bool),
+        "option_mask": np.ones((2, 3), bool),
+        "is_decision": np.ones(2, bool),
+    }
+    expected = session.run(None, {**inputs, "held_option": np.zeros(2, np.int64)})
+    found = session.run(None, {**inputs, "held_option": np.full(2, number)})
+    assert all(map(np.array_equal, found, expected))
+
+
+@pytest.mark.parametrize("name", ["termination", "grouped", "chosen"])
+def test_selectors_that_read_the_held_option_ignore_it_at_a_decision(name):
+    agent = fresh_agent(*CASES[name])
+    ((vectors, info),) = steps(agent, 1, 3)
+    inputs = {keys.OBSERVATION: vectors, **info, keys.IS_DECISION: np.ones(3, bool), HELD_LENGTH: np.full(3, 99)}
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        expected, found = (traced_step(agent)({**inputs, HELD_OPTION: np.full(3, number)}) for number in (0, 99))
+    assert all(map(np.array_equal, found, expected))
+
+
+class Plain(gymnasium.Env):
+    """Observations and actions of any space, drawn at random."""
+
+    observation_space: spaces.Space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+class Far(Plain):
+    """Times in seconds since 1970, and a large count, which float32 cannot tell apart."""
+
+    observation_space = spaces.Dict(
+        count=spaces.Box(2_000_000_000, 2_000_000_009, (1,), np.int64),
+        time=spaces.Box(1.7e9, 1.7e9 + 100.0, (2,), np.float64),
+    )
+    action_space = spaces.Tuple([spaces.Discrete(3), spaces.Tuple([spaces.Box(0.0, 1.0, (1,))] * 3)])
+
+
+class Mapped(Plain):
+    """Parameters that float32 cannot hold, and numbers that do not begin at 0."""
+
+    action_space = spaces.Dict(
+        action=spaces.Tuple(
+            [
+                spaces.Discrete(2, start=5),
+                spaces.Tuple(
+                    [
+                        spaces.Box(1.7e9, 1.7e9 + 3600.0, (1,), np.float64),
+                        spaces.Tuple(
+                            [
+                                spaces.Box(20_000_000, 20_000_009, (2,), np.int64),
+                                spaces.Box(-50_000_000, 50_000_000, (2,), np.int64),
+                                spaces.Box(0.0, 9.0, (1,)),
+                                spaces.Box(-3, 4, (1,), np.int64),
+                            ]
+                        ),
+                    ]
+                ),
+            ]
+        ),
+        option=spaces.Discrete(3, start=7),
+    )
+
+
+class Parts(Plain):
+    """Several components, each with numbers of its own."""
+
+    action_space = spaces.Dict(
+        a=spaces.MultiDiscrete([3, 2], start=[4, -1]),
+        b=spaces.Box(-3, 4, (2,), np.int64),
+        c=spaces.Box(1.7e9, 1.7e9 + 9.0, (1,), np.float64),
+        d=spaces.Discrete(2, start=3),
+    )
+
+
+def own(name: str) -> list[str]:
+    return ["env=gymnasium", f"env.entry_point=test_export:{name}", "env.max_steps=9"]
+
+
+def about(session) -> dict:
+    return {name: json.loads(value) for name, value in session.get_modelmeta().custom_metadata_map.items()}
+
+
+@pytest.mark.parametrize("scaling", ["bounds", "running", "none"])
+def test_observations_that_float32_cannot_hold_are_read_in_float64(scaling, tmp_path):
+    agent = fresh_agent(*own("Far"), f"env.observation_scaling={scaling}", "high=none", "low=hppo")
+    rng = np.random.default_rng(0)
+    time, count = rng.uniform(1.7e9, 1.7e9 + 100.0, (200, 2)), rng.integers(2_000_000_000, 2_000_000_010, (200, 1))
+    vectors = np.concatenate([count, time], -1)
+    if scaling == "running":
+        agent._env.scaling.statistics.update(vectors[:50])
+    agent.export(tmp_path / "far.onnx")
+    session = session_of(tmp_path / "far.onnx")
+    assert session.get_inputs()[0].type == "tensor(double)"
+    discrete, parameters = session.run(None, {"observation": vectors})
+    agent.act({"time": time, "count": count})
+    np.testing.assert_array_equal(discrete, agent._last[keys.DISCRETE].numpy())
+    np.testing.assert_allclose(parameters, agent._last[keys.PARAMETERS].numpy(), atol=1e-5)
+
+
+def test_numbers_that_float32_cannot_hold_are_those_of_the_environment(tmp_path):
+    agent = fresh_agent(*own("Mapped"), "high=linucb", "low=hppo")
+    agent.export(tmp_path / "a.onnx")
+    session = session_of(tmp_path / "a.onnx")
+    said = about(session)
+    assert (said["discrete_starts"], said["option_start"]) == ([5], 7)
+    assert said["parameter_low"] == [1.7e9, 2e7, 2e7, -5e7, -5e7, 0.0, -3.0]
+    assert said["parameter_high"] == [1.7e9 + 3600.0, 20_000_009, 20_000_009, 5e7, 5e7, 9.0, 4.0]
+    assert said["integer_parameters"] == [False, True, True, True, True, False, True]
+    vectors = np.random.default_rng(0).uniform(-1.0, 1.0, (64, 2)).astype(np.float32)
+    inputs = {"observation": vectors, "held_option": np.zeros(64, np.int64), "is_decision": np.ones(64, bool)}
+    discrete, parameters, option = session.run(None, inputs)
+    acted = agent.act(vectors)
+    chosen, (seconds, (counts, many, real, few)) = acted["action"]
+    np.testing.assert_array_equal(discrete + said["discrete_starts"][0], chosen)
+    np.testing.assert_array_equal(option + said["option_start"], acted["option"])
+    np.testing.assert_allclose(parameters[:, :1], seconds, rtol=0.0, atol=1e-2)
+    np.testing.assert_array_equal(parameters[:, 1:3], counts)
+    np.testing.assert_allclose(parameters[:, 3:5], many, rtol=0.0, atol=1e3)  # float32 has 1e-5 of the width
+    np.testing.assert_allclose(parameters[:, 5:6], real, atol=1e-4)
+    np.testing.assert_array_equal(parameters[:, 6:], few)
+    assert (parameters[:, said["integer_parameters"]] % 1.0 == 0.0).all()
+
+
+@pytest.mark.parametrize("low", ["hppo", "pdqn", "hsac"])
+def test_each_component_says_the_number_of_its_first_action(low, tmp_path):
+    agent = fresh_agent(*own("Parts"), "high=none", f"low={low}")
+    agent.export(tmp_path / "a.onnx")
+    session = session_of(tmp_path / "a.onnx")
+    said = about(session)
+    assert said["discrete_starts"] == [4, -1, 0, 0, 3]
+    vectors = np.random.default_rng(0).uniform(-1.0, 1.0, (64, 2)).astype(np.float32)
+    discrete, parameters = session.run(None, {"observation": vectors})
+    acted = agent.act(vectors)
+    numbers = discrete + said["discrete_starts"]
+    np.testing.assert_array_equal(numbers[:, :2], acted["a"])
+    np.testing.assert_array_equal(numbers[:, 4], acted["d"])
+    np.testing.assert_array_equal(parameters[:, :2], acted["b"])
+    np.testing.assert_allclose(parameters[:, 2:], acted["c"], rtol=0.0, atol=1e-4)
+
+
 def test_the_file_says_what_its_numbers_mean_and_holds_no_code(own_session):
     session, data = own_session
-    about = {name: json.loads(value) for name, value in session.get_modelmeta().custom_metadata_map.items()}
-    assert about["option_names"] == ["slow", "medium", "fast"]
-    assert about["parameter_dims"] == [1, 2]
-    assert (about["parameter_low"], about["parameter_high"]) == ([-1.0, 0.0, 0.0], [3.0, 9.0, 9.0])
-    assert (about["high"], about["low"], about["env"]) == ("linucb", "hppo", "gymnasium")
-    assert about["hpamdp_version"] == hpamdp.__version__
+    said = about(session)
+    assert said["option_names"] == ["slow", "medium", "fast"]
+    assert said["parameter_dims"] == [1, 2]
+    assert (said["parameter_low"], said["parameter_high"]) == ([-1.0, 0.0, 0.0], [3.0, 9.0, 9.0])
+    assert (said["high"], said["low"], said["env"]) == ("linucb", "hppo", "gymnasium")
+    assert said["hpamdp_version"] == hpamdp.__version__
     shapes = {each.name: each.shape for each in (*session.get_inputs(), *session.get_outputs())}
     assert shapes["observation"] == ["N", 5] and shapes["parameters"] == ["N", 3]
     assert not [word for word in (b".py", b"import ", b"def ", b"site-packages") if word in data]

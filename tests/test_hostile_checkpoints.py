@@ -7,6 +7,7 @@ import json
 import math
 import pickle
 import resource
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -303,6 +304,7 @@ ODD = {
     "protocol 4": lambda: with_script(pickle.dumps({"a": [1]}, protocol=4)),
     "nothing": lambda: with_script(b""),
     "memo": lambda: with_script(b"\x80\x02}r\xff\xff\xff\xff."),
+    "dicts": lambda: with_script(b"\x80\x02](" + b"}" * 2_000_000 + b"e."),
     "length": lambda: with_script(b"\x80\x02X\xff\xff\xff\x7fab."),
 }
 
@@ -329,6 +331,31 @@ def open_bombs(opener) -> None:
 
 def test_no_bomb_takes_memory(opener):
     assert forked(open_bombs, opener) == 0
+
+
+def test_a_description_that_takes_more_memory_than_its_bytes_is_refused():
+    data = ODD["dicts"]()
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"its description has more than 450,0\d\d instructions"):
+        TensorArchive(io.BytesIO(data), len(data))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50_000_000
+
+
+def test_a_description_of_many_small_tensors_is_read():
+    data = packed([{"a": torch.zeros(1), "b": torch.zeros(2)} for _ in range(8_000)])
+    assert len(TensorArchive(io.BytesIO(data), len(data)).state) == 8_000
+
+
+def test_a_tensor_takes_its_bytes_twice_while_it_is_read():
+    data = packed({"a": torch.arange(5_000_000)})
+    archive = TensorArchive(io.BytesIO(data), len(data))
+    tracemalloc.start()
+    read = archive.tensor(archive.state["a"])
+    peak = tracemalloc.get_traced_memory()[1]  # without torch's own copy
+    tracemalloc.stop()
+    assert read.equal(torch.arange(5_000_000)) and peak < 1.1 * read.nbytes
 
 
 def test_a_compressed_or_ambiguous_archive_is_refused(opener, tmp_path):
@@ -393,6 +420,48 @@ def test_a_policy_with_other_progress_is_refused(entry, value, opener, tmp_path)
     with pytest.raises(ConfigError, match="damaged, or not a checkpoint") as error:
         load_player(str(tmp_path / "policy.pt"), [])
     assert "\n" not in str(error.value)
+
+
+HUGE = {
+    "low": {"low": {"hidden_dims": [8_000, 8_000]}},
+    "high": {"high": {"hidden_dims": [8_000, 8_000]}},
+    "members": {"high": {"num_members": 200_000}},
+    "exploration": {
+        "exploration": {
+            "_target_": "hpamdp.policies.exploration.novelty.Novelty",
+            "hidden_dims": [8_000, 8_000],
+        },
+        "choices": {"exploration": "novelty"},
+    },
+}
+
+
+def policy_of(opener, file, changes, *, has_weights=True):
+    """Write the policy of a run with other settings in its config."""
+    saved = torch.load(opener.folder / "policy.pt", weights_only=True)
+    progress = json.loads(saved["progress"])
+    for group, values in changes.items():
+        progress["config"][group].update(values)
+    torch.save({**saved, "progress": json.dumps(progress), **({} if has_weights else {"agent": {}})}, file)
+
+
+def load_without_memory(file) -> None:
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    words = ["mode=eval", f"checkpoint={file}"]
+    for load in (lambda: load_player(str(file), []), lambda: run(compose_config(words), file.parent / "run", words)):
+        with pytest.raises(ConfigError, match="does not fit this agent") as error:
+            load()
+        assert "\n" not in str(error.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+@pytest.mark.parametrize("has_weights", [True, False])
+@pytest.mark.parametrize("changes", HUGE.values(), ids=HUGE)
+def test_a_small_file_that_describes_a_huge_agent_is_refused_before_it_takes_memory(
+    changes, has_weights, opener, tmp_path
+):
+    policy_of(opener, tmp_path / "policy.pt", changes, has_weights=has_weights)
+    assert forked(load_without_memory, tmp_path / "policy.pt") == 0
 
 
 def test_weights_that_overflowed_are_not_saved(opener):

@@ -19,9 +19,13 @@ from tensordict import TensorDict
 
 from hpamdp.data.errors import DataError
 from hpamdp.data.human import cli
+from hpamdp.data.human.dataset import HumanExperienceReplay
+from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.download import download
 from hpamdp.data.human.released_file import read
+from hpamdp.data.human.rest_to_rest import to_rest_to_rest
 from hpamdp.data.human.transitions import transitions
+from hpamdp.env.boatdock.environment import BoatDockEnv
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +83,64 @@ def test_check_and_summary_of_the_released_file_print_its_known_figures(capsys, 
     ):
         assert re.search(rf"^{name} +\d+ +{score} +{success}", output, re.MULTILINE), name
     assert "0-10: 0.788, 10-20: 0.741, 20-30: 0.654, 30-40: 0.502, 40-50: 0.427, 50-60: 0.370" in output
+
+
+def without_presses(folder: Path) -> Path:
+    people = synthetic_human.recording()
+    episodes = [episode for person in people for episode in person if np.size(episode["gas"]) == 0]
+    return synthetic_human.write(folder / "still.mat", [episodes[:3]])
+
+
+def test_a_recording_without_a_press_is_checked_and_summarised_and_gives_no_transitions(capsys, tmp_path):
+    path = without_presses(tmp_path)
+    assert printed(capsys, "check", path, "--any-file").endswith("the episodes have no logged press\n")
+    assert json.loads(printed(capsys, "summary", path, "--any-file", "--json"))["all"]["presses"] == 0.0
+    printed(capsys, "export", path, "--any-file", "--format", "csv", "--to", tmp_path / "tables")
+    error = error_of(capsys, "export", path, "--any-file", "--format", "memmap", "--to", tmp_path / "rows")
+    assert error == "the episodes have no logged press\n"
+    with pytest.raises(DataError, match=r"^the episodes have no logged press$"):
+        HumanExperienceReplay(4, path=path, root=tmp_path / "root", checksum=None)
+    for rest_to_rest in (True, False):
+        with pytest.raises(DataError, match=r"^the episodes have no logged press$"):
+            HumanDemonstrations(BoatDockEnv(1), path=str(path), checksum=None, rest_to_rest=rest_to_rest)
+
+
+def test_presses_of_which_none_is_from_rest_to_rest_are_refused_in_one_line(tmp_path):
+    people = synthetic_human.recording()
+    data = read(synthetic_human.write(tmp_path / "all.mat", people), checksum=None, one_frame=True)
+    left = to_rest_to_rest(data).presses["episode"].bincount(minlength=len(data.episodes))
+    number = int(((left == 0) & (data.episodes["presses"] > 0)).nonzero()[0])
+    episode = [each for person in people for each in person][number]
+    path = str(synthetic_human.write(tmp_path / "taps.mat", [[episode]]))
+    with pytest.raises(DataError, match="no press is left as a rest-to-rest press; use rest_to_rest=false"):
+        HumanDemonstrations(BoatDockEnv(1), path=path, checksum=None)
+    assert len(HumanDemonstrations(BoatDockEnv(1), path=path, checksum=None, rest_to_rest=False).batch)
+
+
+def test_the_json_of_a_single_episode_has_null_where_there_is_no_number(capsys, tmp_path, recwarn):
+    path = synthetic_human.write(tmp_path / "one.mat", [synthetic_human.recording()[0][:1]])
+
+    def refuse(name: str) -> None:
+        raise AssertionError(name)
+
+    figures = json.loads(printed(capsys, "summary", path, "--any-file", "--json"), parse_constant=refuse)
+    assert figures["all"]["score_error"] is None and None in figures["congruent_by_offset"]
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    ("form", "given", "said"),
+    [
+        ("csv", ["--reward", "sparse", "--observation", "pixels"], "--reward sparse, --observation pixels: no effect"),
+        ("npz", ["--reward", "paper"], "--reward paper: no effect on tables"),
+        ("memmap", ["--one-frame"], "--one-frame: no effect on transitions, which always have one frame"),
+        ("minari", ["--one-frame"], "leave it out with --format minari"),
+    ],
+)
+def test_options_that_an_export_would_ignore_are_refused(capsys, path, tmp_path, form, given, said):
+    to = tmp_path / "out"
+    assert said in error_of(capsys, "export", path, "--any-file", "--format", form, "--to", to, *given)
+    assert not to.exists()
 
 
 @pytest.mark.parametrize(

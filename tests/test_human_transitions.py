@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import pickle
+import re
 import struct
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from hpamdp.data.errors import DataError
 from hpamdp.data.human import minari
 from hpamdp.data.human.dataset import HumanExperienceReplay, slices, whole_episodes
 from hpamdp.data.human.episodes import keep, scores_by_person, select
-from hpamdp.data.human.released_file import HumanData, read
+from hpamdp.data.human.released_file import PATH_VARIABLE, HumanData, read
 from hpamdp.data.human.transitions import decisions, transitions
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
@@ -204,13 +205,46 @@ def test_replay_buffer_is_memory_mapped_and_complete(path, tmp_path, data):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_replay_buffer_made_once_is_found_again(path, tmp_path):
+def test_replay_buffer_made_once_is_found_again(path, tmp_path, monkeypatch):
     checksum = hashlib.sha256(path.read_bytes()).hexdigest()
     made = HumanExperienceReplay(4, path=path, root=tmp_path, checksum=checksum, complete=True)
-    found = HumanExperienceReplay(4, path="nowhere", root=tmp_path, checksum=checksum, complete=True)
+    monkeypatch.setenv(PATH_VARIABLE, "nowhere")
+    found = HumanExperienceReplay(4, root=tmp_path, checksum=checksum, complete=True)
     assert found.data_path == made.data_path and len(found) == len(made)
     with pytest.raises(DataError, match="no such file"):
-        HumanExperienceReplay(4, path="nowhere", root=tmp_path, checksum=checksum, complete=False)
+        HumanExperienceReplay(4, root=tmp_path, checksum=checksum, complete=False)
+
+
+def test_a_path_that_is_given_must_be_the_file_even_if_its_rows_are_there(path, tmp_path):
+    arguments = dict(root=tmp_path / "root", checksum=hashlib.sha256(path.read_bytes()).hexdigest())
+    HumanExperienceReplay(4, path=path, **arguments)
+    with pytest.raises(DataError, match="nowhere: there is no such file"):
+        HumanExperienceReplay(4, path="nowhere", **arguments)
+    (tmp_path / "other.mat").write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(DataError, match="truncated, altered or another file"):
+        HumanExperienceReplay(4, path=tmp_path / "other.mat", **arguments)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (dict(complete="false"), "complete='false', but must be True or False"),
+        (dict(successes=1), "successes=1, but must be True or False"),
+        (dict(best_people="5"), "best_people='5', but must be a whole number or None"),
+        (dict(best_people=2.5), "best_people=2.5, but must be a whole number or None"),
+        (dict(best_people=True), "best_people=True, but must be a whole number or None"),
+        (dict(best_people=0), "best_people=0, but must be 1 to 3"),
+        (dict(controller="congruen"), "controller='congruen', but must be one of incongruent, congruent"),
+        (dict(has_choice="no"), "has_choice='no', but must be True or False"),
+        (dict(reward="dense"), "reward='dense', but must be one of paper, sparse"),
+        (dict(root=5), "root=5, but must be a path or None"),
+        (dict(path=5), "path=5, but must be a path or None"),
+    ],
+)
+def test_a_wrong_argument_of_the_replay_buffer_is_refused_in_one_line(path, tmp_path, given, said):
+    with pytest.raises(DataError, match=f"^{re.escape(said)}$"):
+        HumanExperienceReplay(4, **{"path": path, "root": tmp_path, "checksum": None, **given})
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize(

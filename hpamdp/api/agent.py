@@ -296,9 +296,13 @@ class Agent:
 
         The inputs are `observation`, float32 `[N, observation_dim]`, the masks `action_mask` and `option_mask` if the
         problem has them, and, if the agent chooses options, `held_option`, int64 `[N]`, and `is_decision`, bool `[N]`.
+        If the agent also chooses their lengths, `held_length`, int64 `[N]`, follows.
         The outputs are `discrete`, int64 `[N]`, or `[N, num_components]` if there are several components, `parameters`,
-        float32 `[N, num_parameters]`, and `option`, int64 `[N]`.
+        float32 `[N, num_parameters]`, `option`, int64 `[N]`, and `option_length`, int64 `[N]`.
+        Observations or parameters that float32 cannot hold are float64.
         The file scales observations as the agent does. Its properties name the actions and hold the parameters' bounds.
+        They also give the numbers of the environment's first discrete actions and of its first option. The file counts
+        both from 0.
 
         Raises:
             ConfigError: the path is none, the agent has no greedy policy that can be exported, or `hpamdp[onnx]` is not

@@ -26,7 +26,7 @@ from hpamdp.acting import acting
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import OptionLength
-from hpamdp.env.gymnasium_form import VectorScaling
+from hpamdp.env.gymnasium_form import GymnasiumForm
 from hpamdp.files import replacing
 from hpamdp.policies.agent import HierarchicalAgent, OptionRouter, with_option
 from hpamdp.policies.base import Learner, Level, Selector
@@ -47,14 +47,14 @@ class GreedyStep(nn.Module):
 
     Args:
         agent: the agent.
-        scaling: how observations are scaled; None if they are not.
+        form: of the problem, which tells how observations are scaled and parameters become actions.
         option_length: steps of an option, as in `DecisionTracker`.
 
     Attributes:
         names: of the inputs, in order.
     """
 
-    def __init__(self, agent: HierarchicalAgent, scaling: VectorScaling | None, option_length: OptionLength) -> None:
+    def __init__(self, agent: HierarchicalAgent, form: GymnasiumForm, option_length: OptionLength) -> None:
         super().__init__()
         self.specs: PAMDPSpecs = agent.specs
         self.selector: Selector | None = agent.selector
@@ -62,8 +62,9 @@ class GreedyStep(nn.Module):
         self.device = agent.frames.device
         self.option_length = option_length
         self.pairs = agent.pairs
-        parts = {} if scaling is None else vars(scaling)
-        self.scaling = {name: torch.as_tensor(part, device=self.device) for name, part in parts.items()}
+        self.observed_dtype = form.observed_dtype()
+        self.scaling = self._tensors(form.scaling())
+        self.parameter_map = self._tensors(form.parameter_map())
         self.option_actions: Tensor | None = None
         if self.specs.has_action_mask and self.specs.option_actions is not None:
             self.option_actions = torch.tensor(self.specs.option_actions, device=self.device)
@@ -72,10 +73,15 @@ class GreedyStep(nn.Module):
             self.choice = self.selector.greedy_choice()
         self.names = list(self.example())
 
+    def _tensors(self, parts: object | None) -> dict[str, Tensor]:
+        """Return the arrays of a dataclass as tensors; none if there is no dataclass."""
+        arrays = {} if parts is None else vars(parts)
+        return {name: torch.as_tensor(array, device=self.device) for name, array in arrays.items()}
+
     def example(self) -> dict[str, Tensor]:
         """Return inputs of the right shapes, by name."""
         specs, num = self.specs, _EXAMPLE_ROWS
-        inputs = {keys.OBSERVATION: torch.zeros(num, specs.observation_dim, dtype=torch.float32)}
+        inputs = {keys.OBSERVATION: torch.zeros(num, specs.observation_dim, dtype=self.observed_dtype)}
         if specs.has_action_mask:
             inputs[keys.ACTION_MASK] = torch.ones(num, specs.num_discrete, dtype=torch.bool)
         if specs.has_option_mask and self.option_actions is None:
@@ -128,7 +134,8 @@ class GreedyStep(nn.Module):
         They are new where a decision is due or the held option ends.
         """
         assert self.selector is not None and self.choice is not None
-        option = held[0]
+        # At a decision the held option may be any number, even none of an option.
+        option = torch.where(is_decision, 0, held[0])
         td.set(keys.IS_DECISION, is_decision.unsqueeze(-1)).set(keys.OPTION, option)
         if self.option_actions is not None and self.option_length is not None:
             is_decision = is_decision | ~td.get(keys.OPTION_MASK).gather(-1, option.unsqueeze(-1)).squeeze(-1)
@@ -138,7 +145,7 @@ class GreedyStep(nn.Module):
         return tuple(torch.where(is_decision, new, old) for new, old in zip(fresh, held, strict=True))
 
     def _action(self, td: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return the discrete actions and the parameters of each row's own learner."""
+        """Return the discrete actions, and the parameters of each row's own learner as numbers of the action space."""
         seen = td.select(*self.router.in_keys, strict=False)
         if self.router.is_shared:
             seen = with_option(seen, self.specs.num_options)
@@ -149,7 +156,19 @@ class GreedyStep(nn.Module):
             chosen = own.get(keys.DISCRETE)
             discrete = torch.where(rows.reshape(-1, *[1] * (chosen.ndim - 1)), chosen, discrete)
             parameters = torch.where(rows.unsqueeze(-1), own.get(keys.PARAMETERS), parameters)
-        return discrete, parameters
+        return discrete, self._mapped(parameters)
+
+    def _mapped(self, parameters: Tensor) -> Tensor:
+        """Return the numbers of the action space, float64 if they are not the agent's parameters."""
+        if not self.parameter_map:
+            return parameters
+        of = self.parameter_map
+        parameters = parameters.double()
+        fraction = 0.5 * (parameters.clamp(-1.0, 1.0) + 1.0)
+        width = of["high"] - of["low"]
+        offset = torch.where(of["is_many"], (fraction * (width + 1.0)).floor(), fraction * width)
+        numbers = torch.where(of["is_unit"], of["low"] + offset, parameters + of["shift"])
+        return torch.where(of["is_whole"], numbers.round(), numbers).clamp(of["low"], of["high"])
 
 
 def export_onnx(
@@ -173,7 +192,7 @@ def export_onnx(
         raise ConfigError(f"export: {' and '.join(missing)} not installed; pip install 'hpamdp[onnx]'")
     _check_levels(agent)
     with acting(ExplorationType.DETERMINISTIC), torch.no_grad(), _quiet():
-        step = GreedyStep(agent, env.gymnasium_form().scaling(), option_length)
+        step = GreedyStep(agent, env.gymnasium_form(), option_length)
         if agent.option_lengths:
             about = {"option_lengths": agent.option_lengths, **about}
         try:
@@ -187,14 +206,21 @@ def export_onnx(
 
 def properties(specs: PAMDPSpecs, env: PAMDPEnv, option_length: OptionLength) -> dict[str, Any]:
     """Return what a reader of the file needs to know of a problem, as values for JSON."""
+    form = env.gymnasium_form()
+    found = form.parameter_map()
+    low, high = (specs.parameter_low, specs.parameter_high) if found is None else (found.low, found.high)
+    whole = specs.integer_parameters if found is None or not found.is_whole.any() else found.is_whole.tolist()
+    discrete_starts, option_start = form.starts()
     return {
         "discrete_names": [str(name) for name in env.discrete_names or range(specs.num_discrete)],
         "option_names": specs.option_names,
         "parameter_dims": specs.parameter_dims,
-        "parameter_low": specs.parameter_low,
-        "parameter_high": specs.parameter_high,
+        "discrete_starts": discrete_starts or (0,) * len(specs.components.sizes),
+        "option_start": option_start,
+        "parameter_low": [*low],
+        "parameter_high": [*high],
         "component_sizes": specs.components.sizes,
-        "integer_parameters": specs.integer_parameters,
+        "integer_parameters": whole,
         "option_length": None if option_length in (None, math.inf, "chosen") else option_length,
         "hpamdp_version": __version__,
     }

@@ -40,6 +40,31 @@ class VectorScaling:
     limit: np.ndarray
 
 
+@dataclass(frozen=True)
+class ParameterMap:
+    """How an agent's parameters become the numbers of the action space. All parts have shape `[num_parameters]`.
+
+    Attributes:
+        low, high: bounds of the space's numbers, float64.
+        shift: what is added to a parameter that is counted from elsewhere, float64.
+        is_unit: whether the agent's parameter lies in [-1, 1] and stands for a place between the bounds, bool.
+        is_many: whether such a parameter has a cell for each integer between the bounds, bool.
+        is_whole: whether the space's number is an integer, bool.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    shift: np.ndarray
+    is_unit: np.ndarray
+    is_many: np.ndarray
+    is_whole: np.ndarray
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether the agent's parameters are the numbers of the space."""
+        return not (self.is_unit.any() or self.shift.any())
+
+
 class GymnasiumForm(ABC):
     """The spaces of one environment.
 
@@ -69,6 +94,18 @@ class GymnasiumForm(ABC):
     def scaling(self) -> VectorScaling | None:
         """Return how flattened observations are scaled; None if policies see them as they are."""
         return None
+
+    def observed_dtype(self) -> torch.dtype:
+        """Return the dtype that holds flattened observations without loss, float32 or float64."""
+        return torch.float32
+
+    def parameter_map(self) -> ParameterMap | None:
+        """Return how parameters become the numbers of the action space; None if they are these numbers."""
+        return None
+
+    def starts(self) -> tuple[tuple[int, ...], int]:
+        """Return the number of each component's first discrete action, and that of the first option."""
+        return (), 0
 
 
 class VectorForm(GymnasiumForm):

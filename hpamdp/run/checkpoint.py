@@ -14,6 +14,7 @@ import copy
 import hashlib
 import io
 import json
+import math
 import os
 import random
 import zipfile
@@ -56,7 +57,7 @@ from hpamdp.run.state_checks import (
     scheduled,
     state_after_a_step,
 )
-from hpamdp.run.tensor_archive import MemberFile, TensorArchive, stored_members
+from hpamdp.run.tensor_archive import MemberFile, SavedTensor, TensorArchive, stored_members
 from hpamdp.run_files import CHECKPOINT_NAME as FILE_NAME
 from hpamdp.run_files import POLICY_NAME
 
@@ -148,10 +149,13 @@ class Saved:
         A line warns if a file that describes the problem differs from that of the saved run.
 
         Raises:
-            ConfigError: the saved statistics are of another environment.
+            ConfigError: the file lacks statistics that the environment scales by, or they are of another environment.
         """
         with _explained(f"{self.file}: does not fit env"):
             columns = _strings(self.states.get("collection", {}).get("env", {}))
+            missing = sorted(env.statistics().keys() - columns.keys())
+            if missing:
+                raise ValueError(f"it lacks the running statistics {', '.join(missing)}, by which env scales")
             for name, checksum in env.file_checksums().items():
                 if name not in columns:
                     continue
@@ -227,6 +231,19 @@ def progress_of(file: Path) -> dict[str, Any]:
     """
     with _Opened(file) as opened:
         return opened.progress
+
+
+def num_numbers(file: Path) -> int:
+    """Return how many floating-point numbers the agent in a file has, as the file describes it.
+
+    Raises:
+        ConfigError: the file is damaged or not a checkpoint of this program.
+    """
+    with _Opened(file) as opened:
+        state = opened.part("agent")
+        parts = state.values() if isinstance(state, Mapping) else ()
+        tensors = [part for part in parts if isinstance(part, SavedTensor)]
+        return sum(math.prod(tensor.shape) for tensor in tensors if tensor.dtype.is_floating_point)
 
 
 def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) -> None:

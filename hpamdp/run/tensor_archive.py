@@ -1,9 +1,10 @@
-"""Read files of `torch.save` without running code, and with no more memory than the file has bytes.
+"""Read files of `torch.save` without running code, and with little more memory than the file has bytes.
 
 `torch.load(weights_only=True)` runs no code either. But it allocates the sizes that a file claims and decompresses
 members without a limit. Before torch 2.10 it also trusts the length of a storage. A `TensorArchive` first reads a
 description: nested values with a `SavedTensor` in place of each tensor. The caller checks the description, and then
-reads the tensors.
+reads the tensors. The description has a largest number of instructions, since an instruction of one byte can make a
+dict of 64 bytes. A tensor takes its bytes twice while it is read.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ _DTYPES = {
 }
 _ORDERED_DICT, _REBUILD = object(), object()
 _MAX_DIMS = 16
+# Instructions that any archive may have, and one more for so many bytes. A tensor takes some 25, and 350 bytes or more.
+_FEW_INSTRUCTIONS, _BYTES_AN_INSTRUCTION = 200_000, 8
+_BLOCK = 2**20
 
 
 @dataclass(frozen=True)
@@ -143,7 +147,8 @@ class TensorArchive:
         order = f"{folder}byteorder"
         if order in sizes and self._archive.read(order) != sys.byteorder.encode():
             raise ValueError("its numbers have another byte order")
-        self.state: Any = _Reader(self._archive.read(script), folder, sizes).read()
+        most = _FEW_INSTRUCTIONS + num_bytes // _BYTES_AN_INSTRUCTION
+        self.state: Any = _Reader(self._archive.read(script), folder, sizes, most).read()
 
     def tensor(self, saved: SavedTensor, device: torch.device | None = None) -> Tensor:
         """Read a tensor.
@@ -151,7 +156,7 @@ class TensorArchive:
         Raises:
             ValueError: a bool tensor has bytes other than 0 and 1.
         """
-        data = bytearray(self._archive.read(saved.record))
+        data = self._bytes(saved.record)
         dtype = torch.uint8 if saved.dtype == torch.bool else saved.dtype
         flat = torch.frombuffer(data, dtype=dtype) if data else torch.empty(0, dtype=dtype)
         if saved.dtype == torch.bool:
@@ -159,6 +164,16 @@ class TensorArchive:
                 raise ValueError(f"{saved.record} holds other bytes than 0 and 1")
             flat = flat.bool()
         return flat.as_strided(saved.shape, saved.stride, saved.offset).clone().to(device)
+
+    def _bytes(self, record: str) -> bytearray:
+        """Read a member piece by piece, which takes no copy of it as `ZipFile.read` would."""
+        data = bytearray(self._archive.getinfo(record).file_size)
+        view = memoryview(data)
+        with self._archive.open(record) as member:
+            for start in range(0, len(data), _BLOCK):
+                piece = member.read(len(view[start : start + _BLOCK]))
+                view[start : start + len(piece)] = piece
+        return data
 
     def filled(self, value: Any, device: torch.device | None = None) -> Any:
         """Return a nested value of `state` with its tensors read."""
@@ -178,10 +193,12 @@ class _Reader:
         script: the instructions.
         folder: the folder of the archive's members.
         sizes: number of bytes of each member.
+        most: number of instructions that there may be.
     """
 
-    def __init__(self, script: bytes, folder: str, sizes: Mapping[str, int]) -> None:
+    def __init__(self, script: bytes, folder: str, sizes: Mapping[str, int], most: int) -> None:
         self._script = script
+        self._most = most
         self._folder = folder
         self._sizes = sizes
         self._used: Counter[str] = Counter()
@@ -195,7 +212,9 @@ class _Reader:
         Raises:
             ValueError: an instruction is unknown, or a value does not fit the archive.
         """
-        for instruction, argument, _ in pickletools.genops(self._script):
+        for number, (instruction, argument, _) in enumerate(pickletools.genops(self._script)):
+            if number == self._most:
+                raise ValueError(f"its description has more than {self._most:,} instructions")
             self._follow(instruction.name, argument)
         (value,) = self._stack
         return value

@@ -372,7 +372,8 @@ class Trainer:
         if self.output_dir is None:
             return "the run has no folder, so nothing is kept"
         file = self.output_dir / DIVERGED_NAME
-        checkpoint.save(file, self.parts.agent, {}, self.progress(), with_replay=False)
+        states = {"collection": {"env": self.parts.env.base_env.statistics()}}
+        checkpoint.save(file, self.parts.agent, states, self.progress(), with_replay=False)
         good = self.output_dir / checkpoint.FILE_NAME
         kept = f"the last good checkpoint is {good}" if good.is_file() else "there is no checkpoint from before"
         return f"{kept}; the agent as it is now is in {file}"

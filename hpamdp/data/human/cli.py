@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from hpamdp.data.human import minari, played_file, statistics, validation
 from hpamdp.data.human.download import download
 from hpamdp.data.human.episodes import scores_by_person, select
 from hpamdp.data.human.released_file import FILE_NAME, PATH_VARIABLE, QUIRKS, SHA256, HumanData, default_path, read
-from hpamdp.data.human.transitions import transitions
+from hpamdp.data.human.transitions import NO_PRESS, transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
 from hpamdp.messages import exit_code, one_line, say, warn
@@ -110,10 +110,10 @@ def _parser() -> argparse.ArgumentParser:
         "--one-frame", action="store_true", help="csv, npz: move every harbour to the environment's centre"
     )
     export_parser.add_argument(
-        "--reward", default="paper", choices=("paper", "sparse"), help="memmap, minari: the reward"
+        "--reward", choices=("paper", "sparse"), help="memmap, minari: the reward (default paper)"
     )
     export_parser.add_argument(
-        "--observation", default="scaled", choices=("scaled", "pixels"), help="memmap, minari: the observation"
+        "--observation", choices=("scaled", "pixels"), help="memmap, minari: the observation (default scaled)"
     )
     export_parser.set_defaults(run=_export)
     return parser
@@ -154,6 +154,9 @@ def _check(options: argparse.Namespace) -> None:
     first_episodes = torch.stack([(episodes["person"] == person).nonzero()[0, 0] for person in people])
     _print_counts("harbour at", episodes["centre"][first_episodes])
     _print_counts("key map", episodes["keymap"][first_episodes])
+    if not len(presses):
+        say(NO_PRESS)
+        return
     say(f"longest press {presses['duration'].max():.2f} s")
     singles = validation.single_presses(data)
     if len(singles.outcome):
@@ -190,9 +193,9 @@ def _summary(options: argparse.Namespace) -> None:
             "controller": by_controller,
             "block": by_block,
             "person": by_person,
-            "congruent_by_offset": [None if math.isnan(probability) else probability for probability in curve],
+            "congruent_by_offset": curve,
         }
-        say(json.dumps(summary, indent=1))
+        say(json.dumps(_without_nan(summary), indent=1, allow_nan=False))
         return
     say(f"{'':24}{'episodes':>8}  {'score':>7}  {'success':>7}  {'too fast':>8}  {'out':>6}  {'no fuel':>7}  presses")
     _print_row("all", overall)
@@ -207,6 +210,15 @@ def _summary(options: argparse.Namespace) -> None:
     say(", ".join(f"{low}-{high}: {probability:.3f}" for low, high, probability in bins))
 
 
+def _without_nan(value: Any) -> Any:
+    """Return nested values with None in place of NaN, which JSON lacks."""
+    if isinstance(value, dict):
+        return {name: _without_nan(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(part) for part in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
 def _print_row(name: str, figures: Figures) -> None:
     say(
         f"{name:24}{figures['episodes']:8}  {figures['score']:7.3f}  {figures['success']:7.1%}  "
@@ -217,6 +229,7 @@ def _print_row(name: str, figures: Figures) -> None:
 
 def _export(options: argparse.Namespace) -> None:
     is_table = options.format in _TABLE_FORMATS
+    _refuse_options_without_effect(options, is_table=is_table)
     data = select(
         _read(options, one_frame=options.one_frame or not is_table),
         complete=options.complete,
@@ -231,6 +244,18 @@ def _export(options: argparse.Namespace) -> None:
     say(f"{options.to}: {len(data.episodes)} episodes, {len(data.presses)} presses")
 
 
+def _refuse_options_without_effect(options: argparse.Namespace, *, is_table: bool) -> None:
+    given = {
+        f"--reward {options.reward}": is_table and options.reward is not None,
+        f"--observation {options.observation}": is_table and options.observation is not None,
+        "--one-frame": not is_table and options.one_frame,
+    }
+    ignored = [option for option, is_ignored in given.items() if is_ignored]
+    if ignored:
+        of = "tables, which hold what was recorded" if is_table else "transitions, which always have one frame"
+        raise DataError(f"{', '.join(ignored)}: no effect on {of}; leave it out with --format {options.format}")
+
+
 def _export_tables(data: HumanData, options: argparse.Namespace) -> None:
     if options.format == "csv":
         export.write_csv(data._asdict(), Path(options.to), axes=("x", "y"))
@@ -239,7 +264,7 @@ def _export_tables(data: HumanData, options: argparse.Namespace) -> None:
 
 
 def _export_transitions(data: HumanData, options: argparse.Namespace) -> None:
-    rows = transitions(data, reward=options.reward, observation=options.observation)
+    rows = transitions(data, reward=options.reward or "paper", observation=options.observation or "scaled")
     if options.format == "memmap":
         export.write_memmap(rows, Path(options.to))
     else:

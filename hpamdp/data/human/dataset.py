@@ -17,8 +17,8 @@ from torchrl.data.replay_buffers import Sampler
 from hpamdp.data import memmap
 from hpamdp.data.errors import DataError
 from hpamdp.data.export import write_memmap
-from hpamdp.data.human.episodes import select
-from hpamdp.data.human.released_file import SHA256, default_path, load_bytes, read
+from hpamdp.data.human.episodes import check_conditions, select, shown
+from hpamdp.data.human.released_file import SHA256, check_sum, default_path, load_bytes, read
 from hpamdp.data.human.transitions import transitions
 from hpamdp.data.row_checks import TRAJECTORY, check_actions, check_transitions
 from hpamdp.env.boatdock.environment import BoatDockEnv
@@ -50,7 +50,8 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
 
     Args:
         batch_size: rows in a sample.
-        path: the released file. If None, `released_file.default_path`.
+        path: the released file, which must exist if it is given. If None, `released_file.default_path`, which is read
+            if there are no memory-mapped files yet.
         root: folder of the memory-mapped files. If None, the user's cache.
         complete, successes, best_people, controller: conditions on episodes, as in
             `hpamdp.data.human.episodes.select`.
@@ -62,8 +63,8 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         buffer_arguments: further arguments of TorchRL's TensorDictReplayBuffer.
 
     Raises:
-        DataError: the file is missing or has another checksum, an argument is out of range, no episode is left, or
-            `root` has files with other rows.
+        DataError: the file is missing or has another checksum, an argument is of another type or out of range, no
+            episode or no press is left, or `root` has files with other rows.
     """
 
     def __init__(
@@ -84,9 +85,17 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         checksum: str | None = SHA256,
         **buffer_arguments: Any,
     ) -> None:
+        check_conditions(complete, successes, best_people, controller)
+        if not isinstance(has_choice, bool):
+            raise DataError(f"has_choice={shown(has_choice)}, but must be True or False")
+        for name, given in (("path", path), ("root", root)):
+            if not isinstance(given, str | Path | None):
+                raise DataError(f"{name}={shown(given)}, but must be a path or None")
         self.root = user_cache_path("hpamdp") / "datasets" if root is None else Path(root)
         if checksum is None:
             checksum = hashlib.sha256(load_bytes(default_path() if path is None else Path(path))).hexdigest()
+        elif path is not None:
+            check_sum(load_bytes(Path(path)), checksum, Path(path))
         self._name = _name(
             checksum=checksum,
             complete=complete,

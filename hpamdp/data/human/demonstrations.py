@@ -10,6 +10,7 @@ from pydantic import PositiveInt
 from tensordict import TensorDict
 
 from hpamdp.data.demonstrations import Demonstrations
+from hpamdp.data.errors import DataError
 from hpamdp.data.human import played_file
 from hpamdp.data.human.episodes import select
 from hpamdp.data.human.released_file import SHA256, HumanData, read
@@ -65,7 +66,7 @@ class HumanDemonstrations(Demonstrations):
 
     Raises:
         ValueError: `env` is not a boat-docking environment.
-        DataError: the file is missing or has another checksum, or no episode is left.
+        DataError: the file is missing or has another checksum, or no episode or no press is left.
     """
 
     Options = HumanOptions
@@ -87,7 +88,7 @@ class PlayedDemonstrations(Demonstrations):
 
     Raises:
         ValueError: `env` is not a boat-docking environment.
-        DataError: the file is missing or damaged, or no episode is left.
+        DataError: the file is missing or damaged, or no episode or no press is left.
     """
 
     Options = PlayedOptions
@@ -127,8 +128,10 @@ def _as_returned(
         controller=_controller_of(env),
     )
     recorded = decisions(data, reward=rules.reward, observation=rules.observation) if env.has_choice else None
-    if options.rest_to_rest:
+    if options.rest_to_rest and len(data.presses):
         data = to_rest_to_rest(data)
+        if not len(data.presses):
+            raise DataError("no press is left as a rest-to-rest press; use rest_to_rest=false")
     if isinstance(rules.keymap, int):
         data = with_keymap(data, rules.keymap)
     rows = transitions(data, reward=rules.reward, observation=rules.observation, has_choice=env.has_choice)

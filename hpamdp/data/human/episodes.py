@@ -8,6 +8,7 @@ from torch import Tensor
 from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import FULL_TANK, HumanData
 from hpamdp.env.boatdock import harbour, physics
+from hpamdp.messages import one_line
 
 
 def score(data: HumanData) -> Tensor:
@@ -30,6 +31,26 @@ def keep(data: HumanData, mask: Tensor) -> HumanData:
     return HumanData(data.episodes[mask].clone(), presses)
 
 
+def check_conditions(complete: object, successes: object, best_people: object, controller: object) -> None:
+    """Refuse conditions that `select` does not take.
+
+    Raises:
+        DataError: a condition is of another type, or there is no such controller.
+    """
+    for name, value in (("complete", complete), ("successes", successes)):
+        if not isinstance(value, bool):
+            raise DataError(f"{name}={shown(value)}, but must be True or False")
+    if best_people is not None and type(best_people) is not int:
+        raise DataError(f"best_people={shown(best_people)}, but must be a whole number or None")
+    if controller is not None and controller not in harbour.CONTROLLERS:
+        raise DataError(f"controller={shown(controller)}, but must be one of {', '.join(harbour.CONTROLLERS)}")
+
+
+def shown(value: object) -> str:
+    """Return a value as Python code shows it, in one line of at most 80 letters, for a message."""
+    return one_line(f"{value!r:.80}")
+
+
 def select(
     data: HumanData,
     *,
@@ -48,8 +69,9 @@ def select(
         controller: only episodes with the `congruent` or the `incongruent` controller. If None, with either.
 
     Raises:
-        DataError: a condition is out of range, or no episode meets them all.
+        DataError: a condition is of another type or out of range, or no episode meets them all.
     """
+    check_conditions(complete, successes, best_people, controller)
     episodes = data.episodes
     mask = torch.ones(len(episodes), dtype=torch.bool)
     if complete:
@@ -63,8 +85,6 @@ def select(
             raise DataError(f"best_people={best_people}, but must be 1 to {num_people}")
         mask &= torch.isin(episodes["person"], scores.topk(best_people).indices)
     if controller is not None:
-        if controller not in harbour.CONTROLLERS:
-            raise DataError(f"controller={controller!r}, but must be one of {', '.join(harbour.CONTROLLERS)}")
         mask &= episodes["controller"] == harbour.CONTROLLERS.index(controller)
     if not mask.any():
         raise DataError("no episode meets all the conditions")

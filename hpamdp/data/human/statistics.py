@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -27,7 +29,7 @@ def figures(data: HumanData, mask: Tensor | None = None) -> Figures:
     """Return the mean figures of the episodes of `mask` `[E]`, by the names of `hpamdp.env.boatdock.reference`.
 
     There are three more figures: `presses`, the mean number of presses (called `steps` there); `score_error`, the
-    standard error of the mean score; and `episodes`, the number of episodes.
+    standard error of the mean score, NaN for a single episode; and `episodes`, the number of episodes.
     """
     if mask is None:
         mask = torch.ones(len(data.episodes), dtype=torch.bool)
@@ -38,10 +40,11 @@ def figures(data: HumanData, mask: Tensor | None = None) -> Figures:
     cases = {name: episodes["outcome"] == code for code, name in enumerate(physics.OUTCOMES) if code != physics.SAILING}
     cases["option_congruent"] = is_congruent
     cases["oracle_agreement"] = is_congruent == congruent_is_better
+    deviation = scores.double().std().item() if len(scores) > 1 else math.nan
     return {
         "episodes": len(scores),
         "score": scores.double().mean().item(),
-        "score_error": (scores.double().std() / len(scores) ** 0.5).item(),
+        "score_error": deviation / max(1, len(scores)) ** 0.5,
         **{name: is_case.double().mean().item() for name, is_case in cases.items()},
         "presses": episodes["presses"].double().mean().item(),
     }

@@ -6,8 +6,8 @@ Values that the recording does not contain are filled in:
 - The observed velocity is the one at which the previous logged press was released.
 - A final press that docked or was too fast ends where its course meets the dock's circle. If they do not meet, it ends
   at the point of the circle that is nearest to the start of the press. Our physics gives the ends of other final
-  presses. All these states are terminal, so no value bootstraps from them, and only the progress reward depends on
-  them.
+  presses. These states are terminal, so no value bootstraps from them, and only the progress reward depends on them.
+  Only played episodes that ended by the time limit are truncated; our physics gives where their boats are.
 - If the first press was not logged, the first observation shows the boat away from its start.
 
 Episodes without a logged press have no transitions.
@@ -26,6 +26,7 @@ from hpamdp.data.row_checks import TRAJECTORY
 from hpamdp.env.boatdock import episode, harbour, physics
 from hpamdp.env.boatdock.task import FUEL, BoatState, ObservationForm, RewardForm, Rules
 
+NO_PRESS = "the episodes have no logged press"
 _REWARDS = ("paper", "sparse")
 _OBSERVATIONS = ("scaled", "pixels")
 
@@ -51,9 +52,11 @@ def transitions(
             show it, and there is no `option`.
 
     Raises:
-        DataError: the reward or the observation is unknown, or the harbours have different centres.
+        DataError: the reward or the observation is unknown, the harbours have different centres, or there is no press.
     """
     _check(data, reward, observation)
+    if not len(data.presses):
+        raise DataError(NO_PRESS)
     rules = Rules(controller="choose" if has_choice else "random", reward=reward, observation=observation)
     presses = data.presses
     episodes = data.episodes[presses["episode"]]  # the episode of each press
@@ -80,7 +83,8 @@ def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: Obs
     """Return each recorded episode as one decision of a selector, `[E]`: first observation, boat and return.
 
     The return is the environment's return for the recorded outcome and `tank`, even if the log of presses is not
-    complete. Every episode is terminated. Episodes without a logged press are included.
+    complete. Recorded episodes are terminated. A played episode that ended by the time limit is truncated. Episodes
+    without a logged press are included.
 
     At the root: `option` `[E]`. Under `next`: `decision_observation` and `observation` `[E, 16]` (14 with `pixels`),
     `option_return`, `option_steps` (the logged presses, at least 1), `is_decision`, `done`, `terminated` and

@@ -25,11 +25,13 @@ class Part(ABC):
 
     Attributes:
         sizes: number of discrete actions of each component.
+        starts: number of the first discrete action of each component in the space.
         parameter_dims: number of parameters of each discrete action of all components.
         trees: the spaces of the parameters, in the order of the parameters.
     """
 
     sizes: tuple[int, ...]
+    starts: tuple[int, ...]
     parameter_dims: tuple[int, ...]
     trees: tuple[ParameterTree, ...]
 
@@ -88,6 +90,7 @@ class Choice(Part):
         self.sizes = (num,)
         self.parameter_dims = tuple(parameter_dims or [ParameterTree(part).size for part in parts])
         self._first = int(form.discrete.start)
+        self.starts = (self._first,)
         self._copies = 1 if self._is_split else num
 
     def natives(self, discrete: np.ndarray, parameters: np.ndarray, bounds: Bounds | None) -> list[Any]:
@@ -179,6 +182,7 @@ class PlainChoices(Part):
             sizes = np.full(int(np.prod(space.shape)), 2)
             start = np.zeros_like(sizes)
         self._start = start.astype(np.int64)
+        self.starts = tuple(self._start.tolist())
         self.sizes = tuple(sizes.tolist())
         self.parameter_dims = (0,) * sum(self.sizes)
 
@@ -214,6 +218,7 @@ class BoxComponent(Part):
     """A `Box`: a component with one discrete action, whose parameters are the numbers of the box."""
 
     sizes = (1,)
+    starts = (0,)
 
     def __init__(self, space: spaces.Box) -> None:
         self._tree = ParameterTree(space)
@@ -241,6 +246,7 @@ class Group(Part):
         self._names = list(space.spaces) if isinstance(space, spaces.Dict) else None
         self._parts = list(parts)
         self.sizes = tuple(size for part in parts for size in part.sizes)
+        self.starts = tuple(start for part in parts for start in part.starts)
         self.parameter_dims = tuple(dim for part in parts for dim in part.parameter_dims)
         self.trees = tuple(tree for part in parts for tree in part.trees)
         self._components = _slices([len(part.sizes) for part in parts])

@@ -53,6 +53,7 @@ from gymnasium import spaces
 from hpamdp.env.gymnasium.action_parts import Bounds, Choice, Part, choice_form, read_part
 from hpamdp.env.gymnasium.parameter_trees import NotAcceptedError
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers
+from hpamdp.env.gymnasium_form import ParameterMap
 from hpamdp.settings import SettingError
 
 ActionForm = Literal["auto", "components"]
@@ -77,6 +78,7 @@ class ActionSpace:
         num_components: number of components.
         parameter_dims: number of parameters of each discrete action.
         integer_parameters: which of the agent's parameters are integers; empty if all are real numbers.
+        starts: number of the first discrete action of each component in the space.
         low, high: bounds of the agent's parameters, float32 `[sum(parameter_dims)]`.
         own_low, own_high: bounds of the space's own parameters, float64 `[sum(parameter_dims)]`.
         is_whole: which of the space's own parameters are integers, bool `[sum(parameter_dims)]`.
@@ -100,6 +102,7 @@ class ActionSpace:
             raise self._refusal("has nothing to choose")
         self.num_components = len(sizes)
         self.component_sizes = sizes if len(sizes) > 1 else ()
+        self.starts = self._part.starts
         self.parameter_dims = self._part.parameter_dims
         trees = self._part.trees
         self._trees = trees
@@ -147,6 +150,12 @@ class ActionSpace:
         parts = np.split(own, ends, axis=-1) if self._trees else []
         of_trees = [tree.to_agent(part) for tree, part in zip(self._trees, parts, strict=True)]
         return np.concatenate([np.zeros((*own.shape[:-1], 0)), *of_trees], axis=-1)
+
+    def parameter_map(self) -> ParameterMap:
+        """Return how all parameters become the space's own."""
+        maps = [vars(tree.parameter_map()) for tree in self._trees]
+        joined = {name: np.concatenate([each[name] for each in maps]) for name in (maps[0] if maps else ())}
+        return ParameterMap(**joined) if joined else ParameterMap(*[np.zeros(0)] * 3, *[np.zeros(0, bool)] * 3)
 
     def read_mask(self, given: Any) -> np.ndarray:
         """Return a mask as bool, with an entry for each discrete action of all components.
@@ -203,6 +212,7 @@ class OptionSpace:
     Attributes:
         rest: the space without the option.
         num_options: number of options; 0 if the space has no option.
+        start: number of the first option in the space.
 
     Raises:
         ValueError: the space has no such entry, or the entry is not a `Discrete`.
@@ -216,6 +226,7 @@ class OptionSpace:
             entries.update(enumerate(space.spaces))
         self.rest = space
         self.num_options = 0
+        self.start = 0
         self._is_dict = isinstance(space, spaces.Dict)
         if option_key is None:
             others = [entry for name, entry in entries.items() if name != "option"]
@@ -235,6 +246,7 @@ class OptionSpace:
         self._option = option
         self._names = list(entries)
         self.num_options = int(option.n)
+        self.start = int(option.start)
         if len(entries) == 1:
             (self.rest,) = entries.values()
         else:
@@ -246,7 +258,7 @@ class OptionSpace:
 
     def with_option(self, action: Any, option: int) -> Any:
         """Return an action of the space: one of `rest` with an option, 0 to `num_options` - 1."""
-        native = self._option.dtype.type(self._option.start + option)
+        native = self._option.dtype.type(self.start + option)
         if self._is_dict:
             parts = {self._names[0]: action} if len(self._names) == 1 else dict(action)
             return {**parts, self._key: native}

@@ -18,7 +18,7 @@ from hpamdp.env.gymnasium.masks import Masks, as_leaf
 from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds, agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling
-from hpamdp.env.gymnasium_form import GymnasiumForm, VectorScaling, checked_mask
+from hpamdp.env.gymnasium_form import GymnasiumForm, ParameterMap, VectorScaling, checked_mask
 
 
 class OwnForm(GymnasiumForm):
@@ -72,6 +72,19 @@ class OwnForm(GymnasiumForm):
     def scaling(self) -> VectorScaling:
         """Return how flattened observations are scaled."""
         return VectorScaling(*self._observations.clip_bounds(), *self._scaling.linear_map())
+
+    def observed_dtype(self) -> torch.dtype:
+        """Return float64 if an observed `Box` has numbers that float32 cannot hold, otherwise float32."""
+        return torch.float64 if self._observations.is_precise else torch.float32
+
+    def parameter_map(self) -> ParameterMap | None:
+        """Return how parameters become the numbers of the action space; None if they are these numbers."""
+        found = self._actions.parameter_map()
+        return None if found.is_identity else found
+
+    def starts(self) -> tuple[tuple[int, ...], int]:
+        """Return the number of each component's first discrete action, and that of the first option."""
+        return self._actions.starts, self._options.start
 
     def write(self, acted: TensorDictBase, *, is_batch: bool) -> Any:
         """Return the action of `GymnasiumForm.write`."""

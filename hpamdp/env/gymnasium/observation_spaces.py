@@ -24,6 +24,8 @@ from hpamdp.observation_entries import ObservationEntry, channels_axis, is_pictu
 from hpamdp.settings import SettingError
 
 _CHANNELS = (1, 3, 4)  # of grey, RGB and RGBA
+_FLOAT32_BYTES = 4
+_MOST_EXACT = 1 << 24  # float32 holds all integers up to this one
 
 
 class ObservationSpace:
@@ -188,6 +190,18 @@ class ObservationSpace:
             if leaf.rounding is not None:
                 vectors[:, own] = vectors[:, own].astype(leaf.rounding)
         return vectors
+
+    @property
+    def is_precise(self) -> bool:
+        """Whether the vectors have numbers that float32 cannot hold: float64, or integers beyond 16,777,216."""
+        boxes = [leaf.space for leaf in self.leaves if isinstance(leaf.space, spaces.Box)]
+        return any(
+            box.dtype.itemsize > _FLOAT32_BYTES
+            if box.dtype.kind == "f"
+            else max(-int(box.low.min()), int(box.high.max())) > _MOST_EXACT
+            for box in boxes
+            if box.low.size
+        )
 
     def clip_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds to which `rounded` clips, float64 `[dim]` each; infinite if it does not clip."""

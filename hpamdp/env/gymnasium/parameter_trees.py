@@ -24,6 +24,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers
+from hpamdp.env.gymnasium_form import ParameterMap
 
 # The largest distance between neighbouring float32 that counts as fine enough, as a fraction of the width of a Box.
 _RESOLUTION = 1e-6
@@ -150,6 +151,10 @@ class ParameterTree:
     def own_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of the space's own parameters, float64 `[size]` each."""
         return self._lows, self._highs
+
+    def parameter_map(self) -> ParameterMap:
+        """Return what `natives` does with parameters, apart from clipping and rounding to the space's dtype."""
+        return ParameterMap(self._lows, self._highs, self._shift, self._is_unit, self._is_many, self.is_whole)
 
     @property
     def is_whole(self) -> np.ndarray:

@@ -50,10 +50,11 @@ class EnsembleLinear(nn.Module):
     def __init__(self, num_members: int, in_dim: int, out_dim: int) -> None:
         super().__init__()
         bound = 1.0 / math.sqrt(in_dim)  # as in nn.Linear
-        self.weight = nn.Parameter(
-            torch.empty(num_members, in_dim, out_dim, dtype=torch.float32).uniform_(-bound, bound)
-        )
-        self.bias = nn.Parameter(torch.empty(num_members, 1, out_dim, dtype=torch.float32).uniform_(-bound, bound))
+        # Values follow when both are registered: weights of a wrong size are refused before they take memory.
+        self.weight = nn.Parameter(torch.empty(num_members, in_dim, out_dim, dtype=torch.float32))
+        self.bias = nn.Parameter(torch.empty(num_members, 1, out_dim, dtype=torch.float32))
+        nn.init.uniform_(self.weight, -bound, bound)
+        nn.init.uniform_(self.bias, -bound, bound)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply each member to its own slice of `x`; if there are fewer slices, apply the first members alone."""
