@@ -45,16 +45,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     )
     add_config_dir(parser)
     options = parser.parse_intermixed_args(words)
-    if options.to.suffix not in film.SUFFIXES:
-        raise ConfigError(f"--to {options.to}: must end in {' or '.join(film.SUFFIXES)}")
-    if options.to.suffix == ".gif" and options.fps > film.GIF_FPS:
-        raise ConfigError(f"--fps {options.fps}: a GIF shows at most {film.GIF_FPS} pictures a second; write an .mp4")
-    rows, columns = film.grid(options.episodes)
-    if max(rows, columns) * options.size > film.MOST_PIXELS:
-        raise ConfigError(
-            f"--size {options.size} --episodes {options.episodes}: a picture would have {columns * options.size} x "
-            f"{rows * options.size} px, but at most {film.MOST_PIXELS} px on each side are possible"
-        )
+    _check_film(options)
     path, settings = split_words(options.player)
     for each in settings:
         flag = _FLAGS.get(setting_of(each))
@@ -83,3 +74,16 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     scores = ", ".join(f"{score:.2f}" for score in played["score"])
     say(f"{options.to}: {len(played['score'])} episodes, scores {scores}")
     return 0
+
+
+def _check_film(options: argparse.Namespace) -> None:
+    if options.to.suffix not in film.SUFFIXES:
+        raise ConfigError(f"--to {options.to}: must end in {' or '.join(film.SUFFIXES)}")
+    if options.to.suffix == ".gif" and options.fps > film.GIF_FPS:
+        raise ConfigError(f"--fps {options.fps}: a GIF shows at most {film.GIF_FPS} pictures a second; write an .mp4")
+    rows, columns = film.grid(options.episodes)
+    if max(rows, columns) * options.size > film.MOST_PIXELS:
+        raise ConfigError(
+            f"--size {options.size} --episodes {options.episodes}: a picture would have {columns * options.size} x "
+            f"{rows * options.size} px, but at most {film.MOST_PIXELS} px on each side are possible"
+        )
