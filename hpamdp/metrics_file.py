@@ -37,8 +37,8 @@ def read_rows(path: Path) -> list[dict[str, float]]:
 def read_curve(path: Path, column: str, max_bytes: int) -> tuple[list[str], list[tuple[float, float]]]:
     """Return the names of the columns, and the points (frames, value) of one column.
 
-    Rows without a number in either column are left out, and so is an incomplete last line. The time is linear in the
-    size of the file, whoever wrote it.
+    The value is NaN in rows without a number in the column. Rows without a number of frames are left out, and so is an
+    incomplete last line. The time is linear in the size of the file, whoever wrote it.
 
     Raises:
         OSError: the file is missing, not regular, unreadable or larger than `max_bytes`.
@@ -53,8 +53,15 @@ def read_curve(path: Path, column: str, max_bytes: int) -> tuple[list[str], list
     points = []
     for row in rows:
         with suppress(ValueError, IndexError):
-            points.append((float(row[x]), float(row[y])))
+            points.append((float(row[x]), _number(row[y]) if y < len(row) else math.nan))
     return columns, points
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
 
 
 def _numbers(cells: Mapping[str | None, Any]) -> Iterable[tuple[str, float]]:

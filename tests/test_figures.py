@@ -221,6 +221,50 @@ def test_the_best_possible_score_is_of_both_boats_only_where_the_agent_chose():
     assert boats.episode_title({**evaluation, "option": np.array([-1])}, 0) == "2.00 / 3.00  C"
 
 
+def choices_of_three(without=(), **changed):
+    rng = np.random.default_rng(0)
+    option = np.arange(30) % 3
+    best = np.zeros((30, 3))
+    best[np.arange(30), option] = 1.0  # each choice is the best one
+    evaluation = {
+        "start": rng.uniform(-50, 50, (30, 2)),
+        "goal": rng.uniform(-50, 50, (30, 2)),
+        "option": option,
+        "outcome": np.ones(30),
+        "bearing_offset": rng.uniform(0, 60, 30),
+        "optimum": best,
+        **changed,
+    }
+    kept = {name: array for name, array in evaluation.items() if name not in without}
+    return boats.draw(kept, {"boats": ["a", "b", "c"]}).get("choices.png")
+
+
+@pytest.mark.parametrize("name", ["optimum", "goal", "start"])
+def test_the_choice_of_other_boats_is_left_out_if_one_of_its_arrays_is_missing(name):
+    assert choices_of_three(without=(name,)) is None
+
+
+@pytest.mark.parametrize("num_unknown", [0, 20, 30])
+def test_only_episodes_with_a_known_best_boat_count_in_the_agreement(num_unknown):
+    best = np.eye(3)[np.arange(30) % 3]
+    best[:num_unknown] = np.nan
+    axes = choices_of_three(optimum=best).axes[0]
+    known = "" if num_unknown == 30 else " (best one in 100%)"
+    assert axes.get_title() + axes.get_title(loc="left") == f"Boat chosen{known}"
+    assert len(axes.lines) == (3 if num_unknown == 30 else 6)
+    assert np.isfinite(np.concatenate([line.get_ydata() for line in axes.lines])).all()
+
+
+def test_only_episodes_with_a_known_better_boat_count_in_the_choice_of_people_s(tmp_path):
+    optimum = np.tile([0.0, 1.0], (30, 1))
+    optimum[:20] = np.nan
+    write_evaluation(tmp_path, option=np.ones(30, int), optimum=optimum)
+    axes = boats.draw(arrays_of(tmp_path), {})["choices.png"].axes[0]
+    title = axes.get_title() + axes.get_title(loc="left")
+    assert title == "Congruent boat chosen (better boat in 100%)"
+    assert (axes.lines[0].get_ydata() == 1.0).all()
+
+
 def test_a_problem_that_draws_nothing_gets_its_learning_curves(tmp_path):
     write_metrics(tmp_path)
     write_evaluation(tmp_path)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import make_config
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from hpamdp.analysis import film
 from hpamdp.env.boatdock import film as boat_film
@@ -69,7 +69,7 @@ def test_boats_move_smoothly_from_their_start_to_their_end(played, monkeypatch):
 
 def test_the_film_of_an_evaluation_ends_with_the_picture_of_every_end(played):
     player, _, tracks = played
-    pictures = film.film(player.evaluation.problem, tracks[:4], 10.0, 40)
+    pictures = list(film.film(player.evaluation.problem, tracks[:4], 10.0, 40))
     assert pictures[0].shape == (80, 120, 3)  # three side by side, the fourth below
     np.testing.assert_array_equal(pictures[-1], pictures[-10])  # the pause
     assert any((one != other).any() for one, other in itertools.pairwise(pictures))
@@ -92,7 +92,7 @@ def test_a_gif_holds_the_pictures_for_as_long_as_asked(tmp_path):
 
 
 def test_a_film_without_pictures_or_of_another_ending_is_refused(tmp_path):
-    with pytest.raises(film.FilmError, match="no picture"):
+    with pytest.raises(film.NoPictureError, match="no picture"):
         film.write(tmp_path / "a.gif", [], 10.0)
     with pytest.raises(film.FilmError, match=r"must end in \.gif or \.mp4"):
         film.write(tmp_path / "a.avi", [np.zeros((2, 2, 3), np.uint8)], 10.0)
@@ -109,12 +109,50 @@ def test_nothing_is_filmed_where_it_is_turned_off(played):
     assert not config.run.film and make_config(["film=true"]).run.film
 
 
-def test_a_gif_shows_its_pictures_for_as_long_as_they_are_meant_to_in_hundredths_of_a_second(tmp_path):
-    pictures = [np.full((4, 4, 3), shade, np.uint8) for shade in (0, 100, 200)]
-    for fps, milliseconds in ((25.0, 40), (30.0, 30), (40.0, 20), (60.0, 20)):
-        film.write(tmp_path / "a.gif", pictures, fps)
-        with Image.open(tmp_path / "a.gif") as image:
-            assert image.info["duration"] == milliseconds
+@pytest.mark.parametrize("fps", [7, 25, 29, 30, 34, 40, 45, 50])
+def test_a_gif_plays_at_its_mean_rate_in_pictures_of_at_least_two_hundredths_of_a_second(tmp_path, fps):
+    striped = np.tile(np.array([0, 200], np.uint8)[:, None], (4, 2, 3))
+    film.write(tmp_path / "a.gif", (np.roll(striped, i, 1) for i in range(3 * fps)), float(fps))
+    with Image.open(tmp_path / "a.gif") as image:
+        durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
+    assert len(durations) == 3 * fps and sum(durations) == 3000
+    assert min(durations) >= 20 and max(durations) - min(durations) <= 10
+
+
+def test_a_gif_cannot_be_faster_than_viewers_show_it(tmp_path):
+    film.write(tmp_path / "a.gif", [np.full((4, 4, 3), shade, np.uint8) for shade in (0, 200)], 60.0)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.info["duration"] == 20
+
+
+class Endless:
+    """A problem whose episodes never end, and that notes how many pictures were asked for."""
+
+    def __init__(self):
+        self.asked = 0
+
+    def film(self, track, fps, size):
+        while True:
+            self.asked += 1
+            yield np.full((size, size, 3), self.asked % 256, np.uint8)
+
+
+def test_pictures_are_made_when_they_are_asked_for():
+    env = Endless()
+    pictures = film.film(env, [None, None], 10.0, 20)
+    assert next(pictures).shape == (20, 40, 3) and env.asked == 2
+    assert len(list(itertools.islice(pictures, 4))) == 4 and env.asked == 10
+
+
+def test_a_gif_that_takes_too_much_memory_is_refused_before_all_of_its_pictures_are_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(film, "_MOST_KEPT", 1 << 20)
+    same = np.zeros((100, 100, 3), np.uint8)
+    film.write(tmp_path / "a.gif", itertools.repeat(same, 1000), 10.0)  # counts once
+    env = Endless()
+    with pytest.raises(film.FilmError, match=r"b\.gif: .* take more than 1 MiB; lower the size, the pictures a second"):
+        film.write(tmp_path / "b.gif", film.film(env, [None], 10.0, 100), 10.0)
+    assert 90 < env.asked < 110
+    assert not (tmp_path / "b.gif").exists()
 
 
 def test_a_path_is_told_from_settings(tmp_path):
@@ -141,6 +179,12 @@ def test_watch_writes_a_film(tmp_path, command):
         (["low=planner", "--episodes", "0"], "must be a whole number"),
         (["low=planner", "--size", "19"], "19: must be a whole number from 20 to 4096"),
         (["low=planner", "--fps", "60"], "--fps 60: a GIF shows at most 50 pictures a second; write an .mp4"),
+        (["low=planner", "--fps", "241", "--to", "a.mp4"], "--fps: 241: must be a whole number from 1 to 240"),
+        (
+            ["low=planner", "--size", "4096", "--episodes", "4"],
+            "--size 4096 --episodes 4: a picture would have 12288 x 8192 px, but at most 8192 px on each side",
+        ),
+        (["low=planner", "--size", "20", "--episodes", "2000"], "--size 20 --episodes 2000: a picture would have 60 x"),
         (["low=planner", "--colour", "red"], "--help"),
         (["low=nobody"], "nobody"),
         (["low=random", "high=none"], "needs a selector"),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from gymnasium_players import step
 from PIL import Image
+from tensordict import TensorDict
 
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
@@ -32,6 +34,32 @@ def test_a_film_has_the_pictures_of_render_at_their_own_speed(num_workers):
     assert [grey(picture) for picture in pictures] == [0, 0, 100, 100, 200, 200]
     assert pictures[0].shape == (100, 100, 3) and pictures[0][0, 0].tolist() == [255, 255, 255]
     env.close()
+
+
+def test_pictures_of_different_sizes_are_filmed_on_white(tmp_path, command):
+    kwargs = {"render_mode": "rgb_array", "varies": True}
+    env = GymnasiumEnv(2, entry_point=ENTRY_POINT, kwargs=kwargs, max_steps=4)
+    env.reset()
+    step(env)
+    env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+    small, large = env.film_state(2)["picture"].numpy()
+    assert small.shape == large.shape == (40, 80, 3) and (large == 100).all()
+    assert (small[10:30, 20:60] == 0).all() and (small == 255).sum() == 3 * (40 * 80 - 20 * 40)
+    words = [*WORDS, "env.kwargs={render_mode:rgb_array,varies:true}", "low=random", "num_envs=2", "steps_per_batch=4"]
+    code, _, err = command(*words, "total_frames=8", "eval.layouts=2")
+    assert code == 0, err
+
+
+@pytest.mark.parametrize("rate", [10, 30, 50, 60, 120])
+@pytest.mark.parametrize("fps", [20.0, 25.0])
+def test_the_last_picture_is_shown_however_fast_the_environment_is(rate, fps):
+    env = GymnasiumEnv(entry_point=ENTRY_POINT, kwargs={"render_mode": "rgb_array"}, max_steps=4)
+    env._copies.pictures_per_second = float(rate)
+    for num in range(1, 22):
+        track = [{"picture": torch.full((1, 4, 4, 3), shade, dtype=torch.uint8)} for shade in range(num)]
+        shades = [grey(picture) for picture in env.film(track, fps, 20)]
+        assert shades[-1] == num - 1 and shades == sorted(shades)
+        assert -0.5 <= len(shades) - fps * num / rate <= 1.5
 
 
 def test_without_the_render_mode_there_is_nothing_to_film():

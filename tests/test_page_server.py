@@ -5,7 +5,9 @@ import json
 import random
 import resource
 import socket
+import socketserver
 import threading
+import urllib.request
 from contextlib import contextmanager
 
 import pytest
@@ -360,6 +362,10 @@ def test_the_plans_of_the_page_are_made_with_the_threads_that_are_set(tmp_path, 
         (["env.boats=[congruent,incongruent1]"], "boats=['congruent', 'incongruent1'], but the page has none"),
         (["env.keymap=2"], "keymap=2, but the page has 1"),
         (["--agent", "nowhere"], "no checkpoint there"),
+        (
+            ["--agent", "hppo_hard_move_8"],
+            "--agent hppo_hard_move_8: was trained on env=hard_move, but the page is of env=boatdock\n",
+        ),
         (["somewhere"], "--agent somewhere"),
         (["--port", "99999"], "whole number"),
         (["--to", "nowhere/a.jsonl", "--agent", "none"], "there is no folder nowhere"),
@@ -377,3 +383,25 @@ def test_the_page_may_send_episodes_through_a_web_server_that_encrypts(tmp_path)
         host = f"127.0.0.1:{server.server_port}"
         assert send(server, EPISODES[0], Host=host, Origin=f"https://{host}")[0] == 201
         assert send(server, EPISODES[1], Host=host, Origin="https://127.0.0.1")[0] == 403
+
+
+@pytest.mark.parametrize(
+    ("host", "is_told"), [("localhost", False), ("127.0.0.2", False), ("127.0.0.1", False), ("0.0.0.0", True)]
+)
+def test_only_an_address_that_others_reach_is_warned_of(tmp_path, monkeypatch, command, host, is_told):
+    monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
+    asked = []
+
+    def serve_until_interrupted(server, poll_interval):
+        thread = threading.Thread(target=socketserver.BaseServer.serve_forever, args=(server, 0.02), daemon=True)
+        thread.start()
+        with urllib.request.urlopen(server.address) as answer:
+            asked.append(answer.status)
+        server.shutdown()
+        thread.join()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PageServer, "serve_forever", serve_until_interrupted)
+    words = ["--agent", "none", "--no-browser", "--port", "0", "--host", host, "--to", str(tmp_path / "a.jsonl")]
+    code, _, err = command("play", *words)
+    assert code == 0 and asked == [200] and ("others who reach this address" in err) == is_told

@@ -369,14 +369,15 @@ def test_what_waits_for_the_server_is_said_for_as_long_as_it_waits_also_after_a_
         player.board(layout=DOWN_THE_MIDDLE)
         player.hold("k", 1.8)
         player.ends()
-        player.until("refused === 1" if turn == 0 else "unsent.length === 1")
+        player.until("refused.length === 1" if turn == 0 else "unsent.length === 1")
         time.sleep(0.3)
-        assert ("refused" if turn == 0 else "1 episode waits for the server") in notice.inner_text()
+        assert "1 episode was refused (nobody plays so)" in notice.inner_text()
+        assert ("1 episode waits for the server" in notice.inner_text()) == (turn == 1)
         player.page.keyboard.press("Enter")
     player.page.context.set_offline(False)
     player.until("unsent.length === 0")
     time.sleep(0.1)
-    assert "waits" not in notice.inner_text()
+    assert "waits" not in notice.inner_text() and "refused" in notice.inner_text()
 
 
 @pytest.mark.parametrize("has_server", [True, False])

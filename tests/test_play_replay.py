@@ -2,6 +2,7 @@
 
 import json
 import random
+import re
 import shutil
 import subprocess
 
@@ -269,9 +270,17 @@ def test_the_layouts_of_the_page_are_those_of_no_evaluation_and_follow_the_rules
     assert BoatPage(seed=1).data([], has_server=False)["layouts"] != page_data["layouts"]
 
 
-def test_an_agent_of_other_rules_is_refused():
-    entry = {"name": "noisy", "title": "a", "score": None, "env": {"slip": 0.1}, "agent": {}}
-    with pytest.raises(EpisodeError, match=r"noisy: was trained with env\.slip=0\.1"):
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"slip": 0.1}, "env.slip=0.1, but the page has 0.0"),
+        ({"controller": "random"}, "env.controller=random, but the page has choose, congruent or incongruent"),
+        ({"keymap": "random"}, "env.keymap=random, but the page has 1 or 2"),
+    ],
+)
+def test_an_agent_of_other_rules_is_refused(settings, said):
+    entry = {"name": "other", "title": "a", "score": None, "env": settings, "agent": {}}
+    with pytest.raises(EpisodeError, match=f"^other: was trained with {re.escape(said)}$"):
         BoatPage(seed=0).data([entry], has_server=True)
 
 

@@ -141,6 +141,19 @@ def test_another_metric_comes_from_the_summary_or_else_from_the_last_row(tmp_pat
         hpamdp.report(tmp_path, metric="eval/sucess")
 
 
+@pytest.mark.parametrize("last", ["nan", "", "inf", "no number"])
+def test_a_value_in_the_middle_of_a_run_is_not_the_final_one(tmp_path, last):
+    for seed in range(2):
+        leave_run(tmp_path / str(seed), seed=seed)
+    with (tmp_path / "1/metrics.csv").open("a") as file:
+        file.write(f"300,{last},1.0,0.1\n")
+    report = report_on([tmp_path], "loss")
+    assert [run.value for run in report.configurations[0].runs] == [0.5, None]
+    assert f"1 finished without a finite loss, the first in {tmp_path / '1'}" in report.table()
+    assert report_on([tmp_path]).configurations[0].values == [2.0, 2.0]
+    assert len(report.configurations[0].runs[1].curve) == 4  # the curve still has what was measured
+
+
 def test_the_mean_of_curves_counts_each_seed_up_to_its_last_point():
     long = np.array([[0.0, 0.0], [10.0, 2.0], [20.0, 4.0]])
     short = np.array([[0.0, 2.0], [10.0, 4.0]])

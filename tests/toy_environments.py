@@ -135,17 +135,21 @@ class Wrong(Toy):
 
 
 class Drawn(Toy):
-    """Draws a grey picture that grows lighter with every step."""
+    """Draws a grey picture that grows lighter with every step; with `varies`, also larger by 40 px."""
 
     metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 10}
 
-    def __init__(self, render_mode: str | None = None, is_wrong: bool = False):
+    def __init__(self, render_mode: str | None = None, is_wrong: bool = False, varies: bool = False):
         super().__init__()
         self.render_mode = render_mode
         self.is_wrong = is_wrong
+        self.varies = varies
 
     def render(self):
-        return np.zeros((2, 2)) if self.is_wrong else np.full((300, 600, 3), 100 * self.steps % 256, np.uint8)
+        if self.is_wrong:
+            return np.zeros((2, 2))
+        width = 40 * (1 + self.steps) if self.varies else 600
+        return np.full((width // 2, width, 3), 100 * self.steps % 256, np.uint8)
 
 
 class Faulty(Toy):

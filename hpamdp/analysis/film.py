@@ -6,6 +6,7 @@ Matplotlib's writers are ten times slower, because they draw through a figure. T
 from __future__ import annotations
 
 import itertools
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -19,8 +20,11 @@ from hpamdp.files import replacing
 SUFFIXES = (".gif", ".mp4")
 GIF_FPS = 50  # largest number of pictures per second of a GIF
 COLUMNS = 3
+MOST_FPS = 240
+MOST_PIXELS = 8192  # from edge to edge of a film
 _PAUSE = 1.5  # seconds for which the last picture stays
 _GIF_COLOURS = 128
+_MOST_KEPT = 1 << 31  # bytes of the pictures of a GIF
 
 Track = Sequence[Mapping[str, Tensor]]
 
@@ -29,8 +33,18 @@ class FilmError(ValueError):
     """Raised if a film cannot be written. The message is one line."""
 
 
-def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> list[np.ndarray]:
-    """Return the pictures of episodes side by side, uint8 `[height, width, 3]`, or none if the problem draws none.
+class NoPictureError(FilmError):
+    """Raised if there is no picture to write."""
+
+
+def grid(num_episodes: int) -> tuple[int, int]:
+    """Return how many episodes a film shows below each other, and how many side by side."""
+    columns = min(COLUMNS, num_episodes)
+    return -(-num_episodes // columns), columns
+
+
+def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> Iterator[np.ndarray]:
+    """Yield the pictures of episodes side by side, uint8 `[height, width, 3]`, or none if the problem draws none.
 
     Args:
         env: the problem, which draws the pictures.
@@ -38,19 +52,26 @@ def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> list[
         fps: pictures per second.
         size: width of one episode, px.
     """
-    episodes = [list(env.film(track, fps, size)) for track in tracks]
-    if not episodes or not all(episodes):
-        return []
-    length = max(map(len, episodes)) + round(_PAUSE * fps)
-    columns = min(COLUMNS, len(episodes))
-    blank = np.full_like(episodes[0][0], 255)
-    pictures = []
-    for i in range(length):
-        shown = [episode[min(i, len(episode) - 1)] for episode in episodes]
-        shown += [blank] * (-len(shown) % columns)
-        rows = [np.concatenate(shown[row : row + columns], 1) for row in range(0, len(shown), columns)]
-        pictures.append(np.concatenate(rows))
-    return pictures
+    episodes = [iter(env.film(track, fps, size)) for track in tracks]
+    shown = [picture for episode in episodes if (picture := next(episode, None)) is not None]
+    if not episodes or len(shown) < len(episodes):
+        return
+    while True:
+        together = _side_by_side(shown)
+        yield together
+        following = [next(episode, None) for episode in episodes]
+        if all(picture is None for picture in following):
+            break
+        # An episode that is over keeps its last picture.
+        shown = [last if new is None else new for last, new in zip(shown, following, strict=True)]
+    yield from itertools.repeat(together, round(_PAUSE * fps))
+
+
+def _side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    rows, columns = grid(len(pictures))
+    blank = np.full_like(pictures[0], 255)
+    shown = [*pictures, *[blank] * (rows * columns - len(pictures))]
+    return np.concatenate([np.concatenate(shown[row * columns : (row + 1) * columns], 1) for row in range(rows)])
 
 
 def tracks_of(states: Sequence[Mapping[str, Tensor]], num_steps: int | None = None) -> list[Track]:
@@ -71,12 +92,13 @@ def write(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     """Write pictures as a GIF that repeats forever or as an MP4, depending on the path's suffix.
 
     Raises:
-        FilmError: the path has another suffix, there is no picture, or imageio is missing.
+        NoPictureError: there is no picture.
+        FilmError: the path has another suffix, imageio is missing, or the pictures of a GIF take too much memory.
     """
     remaining = iter(pictures)
     first = next(remaining, None)
     if first is None:
-        raise FilmError(f"{path}: there is no picture to write")
+        raise NoPictureError(f"{path}: there is no picture to write")
     remaining = itertools.chain([first], remaining)
     if path.suffix == ".gif":
         _write_gif(path, remaining, fps)
@@ -87,15 +109,37 @@ def write(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 
 
 def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:
-    images = [Image.fromarray(picture) for picture in pictures]
-    # All pictures share one palette, made from three of them, because separate palettes would flicker.
-    samples = [np.asarray(images[i]) for i in (0, len(images) // 2, -1)]
+    # All pictures share one palette, made from three of them, because separate palettes would flicker. Until the last
+    # picture is there, they wait in memory. Compressed, drawn ones take a fiftieth of their size.
+    kept: list[bytes] = []
+    num_bytes = 0
+    shape: tuple[int, ...] = ()
+    for picture in pictures:
+        shape = picture.shape
+        compressed = zlib.compress(picture.tobytes(), 1)
+        if not kept or compressed != kept[-1]:
+            num_bytes += len(compressed) + shape[0] * shape[1]  # Pillow keeps a byte for each pixel
+        kept.append(compressed)
+        if num_bytes > _MOST_KEPT:
+            raise FilmError(
+                f"{path}: the pictures of the GIF take more than {_MOST_KEPT >> 20} MiB; lower the size, the pictures "
+                "a second or the number of episodes, or write an .mp4"
+            )
+
+    def restored(number: int) -> np.ndarray:
+        return np.frombuffer(zlib.decompress(kept[number]), np.uint8).reshape(shape)
+
+    samples = [restored(number) for number in (0, len(kept) // 2, -1)]
     palette = Image.fromarray(np.concatenate(samples)).quantize(_GIF_COLOURS)
-    indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    indexed = (
+        Image.fromarray(restored(number)).quantize(palette=palette, dither=Image.Dither.NONE)
+        for number in range(len(kept))
+    )
     # A GIF counts in hundredths of a second. Viewers show pictures of one hundredth for a tenth of a second.
-    hundredths = round(100.0 / min(fps, GIF_FPS))
+    ends = [round(100.0 * number / min(fps, GIF_FPS)) for number in range(len(kept) + 1)]
+    durations = [10 * (end - begin) for begin, end in itertools.pairwise(ends)]
     with replacing(path) as partial:
-        indexed[0].save(partial, save_all=True, append_images=indexed[1:], duration=10 * hundredths, loop=0)
+        next(indexed).save(partial, save_all=True, append_images=indexed, duration=durations, loop=0)
 
 
 def _write_mp4(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:

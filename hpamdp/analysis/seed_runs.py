@@ -44,7 +44,7 @@ class SeedRun:
         folder: the run's folder.
         state: `FINISHED`, `UNFINISHED` or `FAILED`.
         settings: its settings as JSON, by their dotted names.
-        value: the metric at the end of the run; None if the run is not finished or has no finite value.
+        value: the metric at the end of the run; None if the run is not finished or has no finite value there.
         curve: the metric over training, rows of frames and value.
         summary: its `summary.json`; empty if the run wrote none.
         metrics: names of all its metrics.
@@ -126,7 +126,8 @@ def read_runs(folders: Iterable[Path], metric: str) -> list[SeedRun]:
 
     Args:
         folders: folders of runs, or folders that contain them. A run that is found twice counts once.
-        metric: a column of `metrics.csv`. The final value of `eval/NAME` is `NAME` of the summary.
+        metric: a column of `metrics.csv`. The final value is that of the last row. The final value of `eval/NAME` is
+            `NAME` of the summary.
     """
     seen = set[str]()
     found = [
@@ -153,19 +154,21 @@ def _read(folder: Path, metric: str) -> SeedRun | None:
         return None
     if not summary and not {"mode", _SEED, "env", "low"} <= config.keys():
         return None  # a config of another program
-    columns, curve = _read_curve(folder / METRICS_NAME, metric)
+    columns, points = _read_points(folder / METRICS_NAME, metric)
     if summary.get(FINISHED):
         state = FINISHED
     else:
         is_failed = any(os.path.lexists(folder / name) for name in (ERROR_NAME, DIVERGED_NAME))
         state = FAILED if is_failed else UNFINISHED
-    value = _final(summary, curve, metric) if state == FINISHED else None
+    value = _final(summary, points, metric) if state == FINISHED else None
+    curve = points[(np.abs(points) <= _LARGEST).all(1)]
     measured = {f"{EVALUATION}{name}" for name in summary.keys() - _NO_METRICS if finite(summary[name]) is not None}
     settings = {name: json.dumps(value, default=str, skipkeys=True) for name, value in flat_settings(config).items()}
     return SeedRun(folder, state, settings, value, curve, summary, frozenset({*columns, *measured}))
 
 
-def _read_curve(path: Path, metric: str) -> tuple[list[str], np.ndarray]:
+def _read_points(path: Path, metric: str) -> tuple[list[str], np.ndarray]:
+    """Return the names of the columns and the rows of frames and value, by frames; a missing value is NaN."""
     columns: list[str] = []
     points: list[tuple[float, float]] = []
     try:
@@ -174,16 +177,16 @@ def _read_curve(path: Path, metric: str) -> tuple[list[str], np.ndarray]:
         pass
     except (OSError, csv.Error) as error:
         warn(f"{one_line(path)}: {reason_of(error)}; its curve is left out")
-    curve = np.array(points, dtype=float).reshape(-1, 2)
-    curve = curve[(np.abs(curve) <= _LARGEST).all(1)]
-    return columns, curve[np.argsort(curve[:, 0], kind="stable")]
+    rows = np.array(points, dtype=float).reshape(-1, 2)
+    rows = rows[np.abs(rows[:, 0]) <= _LARGEST]
+    return columns, rows[np.argsort(rows[:, 0], kind="stable")]
 
 
-def _final(summary: Mapping[str, Any], curve: np.ndarray, metric: str) -> float | None:
+def _final(summary: Mapping[str, Any], points: np.ndarray, metric: str) -> float | None:
     name = metric.removeprefix(EVALUATION)
     if name in summary:
         return finite(summary[name])
-    return float(curve[-1, 1]) if len(curve) and not metric.startswith(EVALUATION) else None
+    return finite(float(points[-1, 1])) if len(points) and not metric.startswith(EVALUATION) else None
 
 
 def configurations(runs: Sequence[SeedRun]) -> list[Configuration]:

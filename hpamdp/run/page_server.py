@@ -7,6 +7,7 @@ every installation. The server is meant for the user's own computer and listens 
 from __future__ import annotations
 
 import errno
+import ipaddress
 import json
 import os
 import threading
@@ -198,6 +199,8 @@ class PageServer(ThreadingHTTPServer):
 
     Attributes:
         address: address of the page.
+        is_local: whether only this computer reaches the address.
+        has_fixed_names: whether the page is served only under the names of 127.0.0.1.
 
     Raises:
         OSError: the server cannot listen on the address.
@@ -216,7 +219,8 @@ class PageServer(ThreadingHTTPServer):
         self.contents[f"/{DATA_NAME}"] = as_script(data)
         super().__init__(address, _Handler)
         host, port = str(self.server_address[0]), self.server_port
-        self.is_local = host in _LOOPBACK
+        self.is_local = ipaddress.ip_address(host).is_loopback
+        self.has_fixed_names = host in _LOOPBACK
         self.address = f"http://{host}:{port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -302,7 +306,7 @@ class _Handler(BaseHTTPRequestHandler):
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:
             return False
-        if self.server.is_local and name not in _LOOPBACK:
+        if self.server.has_fixed_names and name not in _LOOPBACK:
             return False
         origin = self.headers.get("Origin")
         # A web server in front of this one may use https.

@@ -133,13 +133,15 @@ def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) 
         settings: the words of the command line that led to `config`.
 
     Raises:
-        ConfigError: an agent does not exist, or the page cannot show it.
+        ConfigError: an agent does not exist, is of another problem, or the page cannot show it.
     """
     agents = []
     for name in names:
         if name == "none":
             continue
         player = load_player(name, [*_ONE_EPISODE, *permissions(name, config, settings)])
+        if player.config.env.cls is not config.env.cls:
+            raise ConfigError(f"--agent {name}: was trained on {player.config.env}, but the page is of {config.env}")
         agent = described(find(name, "--agent").parent, player)
         if agent is None:
             raise ConfigError(
@@ -209,7 +211,7 @@ def serve(page: PlayPage, data: dict[str, Any], options: argparse.Namespace) -> 
         server = PageServer((options.host, options.port), page, data, episodes)
     except (OSError, TypeError) as error:  # the latter for a name that is too long
         raise ConfigError(f"--host {options.host} --port {options.port}: {reason_of(error)}") from error
-    if options.host != _LOOPBACK:
+    if not server.is_local:
         warn(f"--host {options.host}: others who reach this address can play and add episodes to {options.to}")
     say(f"{server.address}: episodes go to {options.to}; Ctrl-C ends it")
     if not options.no_browser:

@@ -219,10 +219,11 @@ class Recorder:
         evaluation = self.parts.evaluation
         tracks = film.tracks_of(evaluation.states)
         pictures = film.film(evaluation.problem, tracks, _FPS, _FILM_SIZE)
-        if not pictures:
-            return None
         path = folder / FILM_NAME
-        film.write(path, pictures, _FPS)
+        try:
+            film.write(path, pictures, _FPS)
+        except film.NoPictureError:
+            return None
         return path
 
     def _play(self) -> dict[str, np.ndarray]:

@@ -127,7 +127,10 @@ def episode_title(evaluation: Mapping[str, np.ndarray], episode: int, names: tup
 
 
 def _choices(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> Figure | None:
-    if not {"option", "bearing_offset", "outcome"} <= evaluation.keys():
+    needed = {"option", "bearing_offset", "outcome"}
+    if summary.get("boats"):
+        needed |= {"optimum", "start", "goal"}
+    if not needed <= evaluation.keys():
         return None
     chose = (evaluation["option"] != NOT_CHOSEN) & np.isfinite(evaluation["bearing_offset"])
     if not chose.any():
@@ -177,12 +180,14 @@ def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: 
     optimum = evaluation.get("optimum", np.full((len(evaluation["option"]), 2), np.nan))
     congruent = evaluation["option"] == CONGRUENT
     title = "Congruent boat chosen"
-    if np.isfinite(optimum).all():
-        better = optimum[:, CONGRUENT] > optimum[:, INCONGRUENT]
-        oracle = bins.sums(better) / bins.num
-        axes.plot(bins.centres, oracle, color=INK, linewidth=1.1, marker="s", markersize=4)
+    is_known = np.isfinite(optimum).all(1)
+    if is_known.any():
+        better = optimum[is_known, CONGRUENT] > optimum[is_known, INCONGRUENT]
+        known = _Bins(evaluation["bearing_offset"][is_known], bins.edges)
+        oracle = known.sums(better) / known.num
+        axes.plot(known.centres, oracle, color=INK, linewidth=1.1, marker="s", markersize=4)
         labels.append((oracle[-1], "oracle", INK))
-        title += f" (better boat in {(better == congruent).mean():.0%})"
+        title += f" (better boat in {(better == congruent[is_known]).mean():.0%})"
     if has_people:
         label, colour, dashes = REFERENCES["human"]
         axes.plot(bins.all_centres, HUMAN_CONGRUENT_BY_OFFSET, color=colour, linestyle=dashes, marker="D", markersize=4)
@@ -206,25 +211,30 @@ def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: 
 def _draw_boats(axes: Axes, evaluation: Mapping[str, np.ndarray], names: Sequence[str]) -> None:
     """Draw the fraction of choices of each controller by the goal's bearing, for the agent and the planner.
 
-    If several controllers are equally good, the planner's choice is split evenly between them.
+    If several controllers are equally good, the planner's choice is split evenly between them. Its choice is known in
+    the episodes whose `optimum` is finite.
     """
     to_goal = evaluation["goal"] - evaluation["start"]
     bearing = np.degrees(np.arctan2(to_goal[:, 1], to_goal[:, 0])) % 360.0
-    bins = _Bins(bearing, np.arange(0.0, 361.0, 30.0))
-    optimum = evaluation["optimum"]
+    is_known = np.isfinite(evaluation["optimum"]).all(1)
+    optimum, option = evaluation["optimum"][is_known], evaluation["option"].astype(int)
     is_best = optimum == optimum.max(1, keepdims=True)
+    edges = np.arange(0.0, 361.0, 30.0)
+    bins, known = _Bins(bearing, edges), _Bins(bearing[is_known], edges)
+    title = "Boat chosen"
     for boat, name in enumerate(names):
-        shown: list[tuple[np.ndarray, dict[str, Any]]] = [
-            (evaluation["option"] == boat, {"label": name, "linewidth": 2.0, "marker": "o", "markersize": 5}),
-            (is_best[:, boat] / is_best.sum(1), {"linewidth": 1.1, "linestyle": "--"}),
-        ]
-        for weights, line in shown:
-            axes.plot(bins.centres, bins.sums(weights) / bins.num, color=f"C{boat}", **line)
-    agreement = is_best[np.arange(len(is_best)), evaluation["option"].astype(int)].mean()
+        chosen = bins.sums(option == boat) / bins.num
+        axes.plot(bins.centres, chosen, color=f"C{boat}", label=name, linewidth=2.0, marker="o", markersize=5)
+        if is_known.any():
+            planned = known.sums(is_best[:, boat] / is_best.sum(1)) / known.num
+            axes.plot(known.centres, planned, color=f"C{boat}", linewidth=1.1, linestyle="--")
+    if is_known.any():
+        title += f" (best one in {is_best[np.arange(len(is_best)), option[is_known]].mean():.0%})"
     axes.set(xlim=(0, 360), ylim=(-0.03, 1.2), xticks=bins.edges[::2], yticks=np.linspace(0.0, 1.0, 6))
-    axes.set_xlabel("the goal's bearing, degrees (0 to the right, 90 down); dashed: oracle")
+    dashed = "; dashed: oracle" if is_known.any() else ""
+    axes.set_xlabel(f"the goal's bearing, degrees (0 to the right, 90 down){dashed}")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    axes.set_title(f"Boat chosen (best one in {agreement:.0%})")
+    axes.set_title(title)
     axes.legend(frameon=False, fontsize=8.5, loc="upper center", ncols=min(len(names), 3))
 
 

@@ -333,19 +333,25 @@ class GymnasiumEnv(PAMDPEnv):
             statistics.add(columns)
 
     def film_state(self, num: int) -> dict[str, Tensor]:
-        """Return what the first `num` copies draw, if their `render_mode` is `rgb_array`: uint8 `[num, H, W, 3]`."""
+        """Return what the first `num` copies draw, if their `render_mode` is `rgb_array`: uint8 `[num, H, W, 3]`.
+
+        Pictures that are smaller than another one get a white margin.
+        """
         if not self._copies.has_pictures:
             return {}
-        pictures = [_fitted(picture) for picture in self._copies.pictures(num)]
-        return {_PICTURE: torch.from_numpy(np.stack(pictures))}
+        return {_PICTURE: torch.from_numpy(_stacked([_fitted(picture) for picture in self._copies.pictures(num)]))}
 
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
-        """Yield the pictures of `render`, each for as long as the environment's `render_fps` says."""
+        """Yield the pictures of `render`, each for as long as the environment's `render_fps` says.
+
+        If that is shorter than a picture of the film, some states are left out, but never the last one.
+        """
         for number, state in enumerate(track):
             image = Image.fromarray(state[_PICTURE][0].numpy())
             picture = np.array(ImageOps.pad(image, (size, size), color="white"))
             shown = [round(fps * count / self._copies.pictures_per_second) for count in (number, number + 1)]
-            yield from itertools.repeat(picture, shown[1] - shown[0])
+            is_last = number == len(track) - 1
+            yield from itertools.repeat(picture, max(shown[1] - shown[0], int(is_last)))
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the copies."""
@@ -520,6 +526,16 @@ def _fitted(picture: np.ndarray) -> np.ndarray:
     image = Image.fromarray(picture)
     image.thumbnail((_LARGEST, _LARGEST))
     return np.array(image)
+
+
+def _stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Return pictures of any sizes as uint8 `[N, H, W, 3]`, each in the middle of a white one of the largest size."""
+    height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
+    stacked = np.full((len(pictures), height, width, 3), 255, np.uint8)
+    for whole, picture in zip(stacked, pictures, strict=True):
+        top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+        whole[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+    return stacked
 
 
 def _seeds(seed: int, num: int, stream: int, first: int = 0) -> list[int]:

@@ -27,6 +27,9 @@ _PRACTICE, _FREE = 10, 120
 _PLAIN = {"boats": None, "switch_cost": None, "motor_noise": 0.0, "sensor_noise": 0.0, "slip": 0.0}
 _OF_PEOPLE = {**_PLAIN, "controller": "choose", "keymap": 1}  # the player chooses both on the page
 _OF_AGENTS = {**_PLAIN, "observation": "scaled"}
+# Settings of agents for which the page has several values. Nothing is drawn at random there.
+_CHOICES_OF_AGENTS = {"controller": ("choose", "congruent", "incongruent"), "keymap": (1, 2)}
+MOST_AGENTS = 8  # the colours of agents in `game.js`
 _FOLDER = Path(__file__).resolve().parent / "page"
 
 
@@ -67,8 +70,11 @@ class BoatPage:
 
     def data(self, agents: Sequence[Mapping[str, Any]], *, has_server: bool) -> dict[str, Any]:
         """Return the rules, the layouts with their best plans, the agents, and people's results."""
-        for agent in agents:
+        for number, agent in enumerate(agents, 1):
             _check_agent(agent)
+            if number > MOST_AGENTS:
+                told_apart = f"the page tells at most {MOST_AGENTS} agents apart"
+                raise EpisodeError(f"{agent['name']}: {told_apart}, and this is number {number}")
         return {
             "format": episodes.FORMAT,
             "software": __version__,
@@ -160,6 +166,11 @@ def _check_agent(agent: Mapping[str, Any]) -> None:
     other = other_setting(agent["env"], _OF_AGENTS)
     if other is not None:
         raise EpisodeError(f"{agent['name']}: was trained with env.{other}")
+    for name, allowed in _CHOICES_OF_AGENTS.items():
+        given = agent["env"].get(name, allowed[0])
+        if given not in allowed:
+            named = f"{', '.join(map(str, allowed[:-1]))} or {allowed[-1]}"
+            raise EpisodeError(f"{agent['name']}: was trained with env.{name}={given}, but the page has {named}")
 
 
 def other_setting(settings: Mapping[str, Any], of_page: Mapping[str, Any]) -> str | None:

@@ -11,7 +11,15 @@ playGame((game, tools) => {
   game.results = { practice: [], round: [], free: [] };
   const played = () => game.results[game.mode];
   const isDone = () => game.mode !== "free" && played().length >= data.layouts[game.mode].length;
-  const titleOf = (agent) => agent.title + (agent.controller === "choose" ? "" : `, ${agent.controller}`);
+  const titles = distinctTitles(data.agents);
+
+  // The titles of agents. If titles are equal, they also have the agents' names; if these are equal, too, a number.
+  function distinctTitles(agents) {
+    const isRepeated = (text, i, all) => all.indexOf(text) !== i || all.lastIndexOf(text) !== i;
+    return agents.map((agent) => agent.title + (agent.controller === "choose" ? "" : `, ${agent.controller}`))
+      .map((title, i, all) => (isRepeated(title, i, all) ? `${title} (${agents[i].name})` : title))
+      .map((title, i, all) => (isRepeated(title, i, all) ? `${title}, ${i + 1}` : title));
+  }
 
   function begin(mode) {
     keymap = Number(document.querySelector("input[name=keymap]:checked").value);
@@ -33,16 +41,21 @@ playGame((game, tools) => {
   }
 
   function add(result) {
-    const { layout } = game;
-    const { congruent, incongruent } = layout.best;
+    const { congruent, incongruent } = game.layout.best;
     const better = congruent.score >= incongruent.score ? "congruent" : "incongruent";
-    Object.assign(result, {
-      controller: result.boat, best: layout.best[better].score, better,
-      agents: crew.agents.map((agent) => agent.sail(layout)), plan: crew.sailPlan(layout, better),
-    });
+    Object.assign(result, { controller: result.boat, best: game.layout.best[better].score, better });
+  }
+
+  function compare(result) {
+    const { layout } = game;
+    const agents = crew.agents.map((agent) => agent.sail(layout));
+    Object.assign(result, { agents, plan: crew.sailPlan(layout, result.better) });
   }
 
   const record = (result) => ({ mode: game.mode, keymap, controller: result.controller, ...tools.sailed(result) });
+
+  // The boat that an agent chose, which the title of an agent without a choice has already.
+  const choiceOf = (i, sailed) => (data.agents[i].controller === "choose" ? `, ${sailed.controller}` : "");
 
   function describe(result) {
     const chosen = game.layout.people;
@@ -51,7 +64,7 @@ playGame((game, tools) => {
         `${percent(result.fuel)} fuel left</p>`,
       `<p>${swatch(COLOURS.plan, "dashed")}Best plan, ${result.better}: ${result.best.toFixed(2)}</p>`,
       ...result.agents.map((sailed, i) =>
-        `<p>${swatch(colourOf(i), "solid")}${escape(data.agents[i].title)}, ${sailed.controller}: ${sailed.score.toFixed(2)}</p>`),
+        `<p>${swatch(colourOf(i), "solid")}${escape(titles[i])}${choiceOf(i, sailed)}: ${sailed.score.toFixed(2)}</p>`),
       `<p>People at this bearing: ${percent(chosen)} chose the congruent boat, ${percent(1 - chosen)} the incongruent one.</p>`,
     ].join("");
   }
@@ -87,7 +100,7 @@ playGame((game, tools) => {
       ["you", `You, ${results.length} ${results.length === 1 ? "episode" : "episodes"}`, ...meansOf(results)],
       ["", "People, mean", data.people.mean.toFixed(2), percent(data.people.success)],
       ["", "Best of 40 people", data.people.best.toFixed(2), percent(data.people.best_success)],
-      ...data.agents.map((agent, i) => ["", escape(titleOf(agent)), ...meansOf(results.map((r) => r.agents[i]))]),
+      ...titles.map((title, i) => ["", escape(title), ...meansOf(results.map((r) => r.agents[i]))]),
       ["", "Ceiling", has ? mean(results.map((r) => r.best)).toFixed(2) : "", has ? "100 %" : ""],
     ]);
   }
@@ -103,14 +116,14 @@ playGame((game, tools) => {
         { value: mean(results.map((r) => r.best)), colour: "#2b2b2b", text: "ceiling", dashes: [] },
         { value: data.people.mean, colour: "#D98200", text: "people", dashes: [6, 4] },
         { value: data.people.best, colour: "#D98200", text: "best person", dashes: [2, 3] },
-        ...data.agents.map((agent, i) =>
-          ({ value: mean(results.map((r) => r.agents[i].score)), colour: colourOf(i), text: titleOf(agent), dashes: [] })),
+        ...titles.map((text, i) =>
+          ({ value: mean(results.map((r) => r.agents[i].score)), colour: colourOf(i), text, dashes: [] })),
       ],
     };
   }
 
   return {
-    noun: "episode", showsDirections: true, begin, status, next, add, record, describe, tracks, isPause, isDone, endText,
+    noun: "episode", showsDirections: true, begin, status, next, add, record, compare, describe, tracks, isPause, isDone, endText,
     table, curve, boat: (name) => ({ directions: crew.directionsOf(name, keymap) }),
     sailText: (name) => `The ${name} boat. Hold a key; release it to glide.`, leave: () => {},
   };

@@ -11,8 +11,9 @@
 //   next()            prepares the next episode: { layout, text, onlyBoat }; with an `onlyBoat` nothing is chosen
 //   boat(name)        what a boat does: `directions`, and if it is unlike people's, `strength` and `glide`
 //   sailText(name)    the text beside an episode that begins with this boat
-//   add(result)       completes the result of an episode
+//   add(result)       completes the result of an episode with what is to be stored
 //   record(result)    what is to be stored after this episode, or null
+//   compare(result)   completes the result with what others score on the same layout
 //   describe(result)  the text after an episode, and tracks(result) what is drawn of it: { points, colour, dashes }
 //   isPause()         whether the screen with the curve comes next, and isDone() whether nothing comes after it
 //   endText(), table(results), curve(results): what that screen shows
@@ -66,7 +67,8 @@ function playGame(makeTask) {
     Digit2: 1, Numpad2: 1, KeyK: 1, ArrowUp: 1, ArrowDown: 1,
     Digit3: 2, Numpad3: 2, KeyL: 2, ArrowRight: 2,
   };
-  const COLOURS = { you: "#1d3f58", glide: "#86aecb", plan: "#3c8a55", agents: ["#D55E00", "#AA4499", "#0072B2", "#8c6d1f"] };
+  const AGENTS = ["#D55E00", "#AA4499", "#0072B2", "#8c6d1f", "#6a3fb5", "#b00020", "#00979c", "#7d7d7d"];
+  const COLOURS = { you: "#1d3f58", glide: "#86aecb", plan: "#3c8a55", agents: AGENTS };
   const OUTCOMES = {
     success: "Docked", too_fast: "Too fast", out_of_bounds: "Out of the harbour", out_of_fuel: "Out of fuel",
     time_limit: `${rules.max_presses} presses and no dock`,
@@ -76,7 +78,7 @@ function playGame(makeTask) {
   const harbour = $("#harbour");
   const game = {
     screen: "loading", mode: null, layout: null, boat: null, origin: 0, events: [], state: null,
-    results: {}, stored: [], unsent: [], sent: 0, refused: 0, downloaded: 0, player: null, resolution: 0,
+    results: {}, stored: [], unsent: [], sent: 0, refused: [], downloaded: 0, player: null, resolution: 0,
   };
   window.hpamdpGame = game;
 
@@ -230,8 +232,9 @@ function playGame(makeTask) {
       boat: game.boat, outcome: state.outcome, fuel: state.fuel / rules.tank, score: physics.score(state.outcome, state.fuel),
     };
     task.add(result);
+    record(result); // first, so that no mistake in what follows loses the episode
+    task.compare(result);
     shownResults().push(result);
-    record(result);
     document.querySelectorAll(".key.down").forEach((button) => button.classList.remove("down"));
     show("result");
     $("#result").innerHTML = outcomeText(result) + task.describe(result);
@@ -261,7 +264,7 @@ function playGame(makeTask) {
   // ---- what is kept ----
 
   function record(result) {
-    if (!$("#consent").checked) return;
+    if (!hasAgreed()) return;
     const own = task.record(result);
     if (own === null) return;
     const episode = {
@@ -285,7 +288,7 @@ function playGame(makeTask) {
   }
 
   let isSending = false;
-  let isWaiting = false; // whether the notice says that episodes wait
+  let whyUnsent = ""; // why episodes wait
   async function send() {
     if (isSending) return;
     isSending = true;
@@ -295,22 +298,34 @@ function playGame(makeTask) {
         const answer = await fetch("episodes", { method: "POST", headers: { "Content-Type": "application/json" }, body });
         if (answer.status >= 500) throw new Error((await answer.text()).trim() || `the server answered ${answer.status}`);
         if (answer.ok) game.sent += 1;
-        else {
-          game.refused += 1;
-          notice(`The ${task.noun} was refused: ${await answer.text()}`);
-        }
+        else game.refused.push({ index: game.unsent[0].index, why: (await answer.text()).trim() });
         game.unsent.shift();
       }
-      if (isWaiting) notice("");
-      isWaiting = false;
+      whyUnsent = "";
     } catch (error) {
-      const num = game.unsent.length;
-      notice(`${num} ${task.noun}${num === 1 ? " waits" : "s wait"} for the server (${error.message}). You can go on playing.`);
-      isWaiting = true;
+      whyUnsent = error.message;
       setTimeout(send, 3000);
     } finally {
       isSending = false;
     }
+    showNotice();
+  }
+
+  // Refused episodes that are in no file.
+  const lost = () => game.refused.filter(({ index }) => index >= game.downloaded);
+
+  function showNotice() {
+    const count = (num, one, more) => `${num} ${task.noun}${num === 1 ? ` ${one}` : `s ${more}`}`;
+    const parts = [];
+    const refused = lost();
+    if (refused.length) {
+      const keep = `Finish, and download the ${task.noun}s to keep ${refused.length === 1 ? "it" : "them"}.`;
+      parts.push(`${count(refused.length, "was", "were")} refused (${refused.at(-1).why}). ${keep}`);
+    }
+    if (whyUnsent) {
+      parts.push(`${count(game.unsent.length, "waits", "wait")} for the server (${whyUnsent}). You can go on playing.`);
+    }
+    $("#notice").textContent = parts.join(" ");
   }
 
   function download() {
@@ -321,14 +336,14 @@ function playGame(makeTask) {
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10000); // some browsers start reading only later
     game.downloaded = game.stored.length;
+    showNotice();
   }
 
   // Ask before the page closes if it holds the only copy of an episode.
   window.addEventListener("beforeunload", (event) => {
-    if (data.has_server ? game.unsent.length : game.downloaded < game.stored.length) event.preventDefault();
+    const isUnsaved = data.has_server ? game.unsent.length || lost().length : game.downloaded < game.stored.length;
+    if (isUnsaved) event.preventDefault();
   });
-
-  const notice = (text) => { $("#notice").textContent = text; };
 
   // ---- what is shown ----
 
@@ -336,7 +351,7 @@ function playGame(makeTask) {
   const share = (results) => mean(results.map((r) => (r.outcome === "success" ? 1 : 0)));
   const cssPercent = (value) => `${100 * value}%`;
   const percent = (value) => `${(100 * value).toFixed(0)} %`;
-  const colourOf = (i) => COLOURS.agents[i % COLOURS.agents.length];
+  const colourOf = (i) => COLOURS.agents[i];
   const swatch = (colour, dashes) => `<span class="swatch" style="border-color:${colour};border-top-style:${dashes}"></span>`;
   const escape = (text) => text.replace(/[&<>"]/g, (c) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;" }[c]));
 
@@ -530,8 +545,9 @@ function playGame(makeTask) {
   const bytes = crypto.getRandomValues(new Uint8Array(8));
   game.player = Array.from(bytes, (byte) => byte.toString(16).padStart(2, "0")).join("");
   game.resolution = clockStep();
-  const task = makeTask(game, { data, physics, sailed, mean, share, percent, escape, swatch, colourOf, tableOf, picture,
-    compass, COLOURS });
+  const hasAgreed = () => $("#consent").checked;
+  const task = makeTask(game, { data, physics, sailed, hasAgreed, mean, share, percent, escape, swatch, colourOf,
+    tableOf, picture, compass, COLOURS });
   $("#consent-text").textContent = `Record my ${task.noun}s: the times and keys of my presses, the layout, the boat and the ` +
     "outcome. They carry a random number, which changes each time the page is loaded. " +
     (data.has_server ? "They are stored in a file on the computer that serves this page." :

@@ -15,6 +15,7 @@ playGame((game, tools) => {
   let number = parseInt(game.player.slice(0, 8), 16) % data.sessions.length;
   let begun = 1; // sessions on this page
   let trips = []; // those of this session that have ended
+  let isAgreed = true; // whether the player agreed during all of them
   game.results = { session: [] };
   game.session = data.sessions[number];
   const isOver = () => trips.length === rules.trips;
@@ -23,6 +24,7 @@ playGame((game, tools) => {
     number = (number + 1) % data.sessions.length;
     begun += 1;
     trips = [];
+    isAgreed = true;
     game.session = data.sessions[number];
   }
 
@@ -52,11 +54,12 @@ playGame((game, tools) => {
 
   function add(result) {
     trips.push({ boat: Number(result.boat), ...tools.sailed(result) });
+    isAgreed &&= tools.hasAgreed();
     Object.assign(result, { trip: trips.length, best: game.layout.best });
   }
 
   function record() {
-    return isOver() ? { rules, boats: game.session.boats, trips } : null;
+    return isOver() && isAgreed ? { rules, boats: game.session.boats, trips } : null;
   }
 
   function describe(result) {
@@ -103,12 +106,13 @@ playGame((game, tools) => {
   const boats = rules.boats === 1 ? "a boat that you do not know" : "two boats that you do not know; you choose one for each trip";
   document.querySelector("#session-text").textContent =
     `A session has ${rules.trips} ${rules.trips === 1 ? "trip" : "trips"} with ${boats}. Each trip shows a boat and a dock in a ` +
-    `round harbour. The next session has ${rules.boats === 1 ? "another boat" : "other boats"}. If you leave during a trip, its session does not count.`;
+    `round harbour. The next session has ${rules.boats === 1 ? "another boat" : "other boats"}. If you leave during a trip, its session does not count. ` +
+    "A session is recorded only if you agree before its first trip.";
   document.querySelector("#family-text").textContent = FAMILIES[rules.family];
   document.querySelector("#press-text").textContent = `A press lasts at least ${rules.shortest_press} s.`;
 
   return {
-    noun: "session", showsDirections: false, begin: () => {}, status, next, add, record, describe, tracks: () => [],
-    isPause: isOver, isDone: () => false, endText, table, curve, boat: (name) => game.session.boats[name], sailText, leave,
+    noun: "session", showsDirections: false, begin: () => {}, status, next, add, record, compare: () => {}, describe,
+    tracks: () => [], isPause: isOver, isDone: () => false, endText, table, curve, boat: (name) => game.session.boats[name], sailText, leave,
   };
 });
