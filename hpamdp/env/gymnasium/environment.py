@@ -257,11 +257,12 @@ class GymnasiumEnv(PAMDPEnv):
         It ends the running episode of this copy.
         """
         (first,) = _seeds(seed, 1, _FIXED)
-        begun = []
-        for _ in range(2):
+
+        def begun() -> np.ndarray:
             self._copies.reset({0: first})
-            begun.append(self._copies.results.observation[0].copy())
-        if not np.array_equal(*begun, equal_nan=True):
+            return self._copies.results.observation[0].copy()
+
+        if not np.array_equal(begun(), begun(), equal_nan=True):
             warn(
                 f"{self._name}: two resets with the same seed began differently, so evaluations cannot be repeated, "
                 "and copies may play the same episodes; call super().reset(seed=seed) and draw from self.np_random"
