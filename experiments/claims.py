@@ -1846,7 +1846,6 @@ def peers() -> list[Claim]:
         for library, name in (("xuance", "mpdqn"), ("xuance", "pdqn"), ("hpamdp", "pdqn_published"), ("hpamdp", "pdqn"))
     }
     (hppo,) = last("hpamdp", "hppo").values()
-    di_engine = max(last("di-engine", "hppo").values(), key=np.mean)
     limit = rows("peers/curves.csv")[0]["limit_s"]
     pdqn_runs = [
         runs for (low,), runs in groups(rows("peers/curves.csv", library="hpamdp"), "learner").items() if low == "pdqn"
@@ -1854,10 +1853,9 @@ def peers() -> list[Claim]:
     late = [row for runs in pdqn_runs for row in runs if row["cpu_s"] >= 0.1 * limit]
     ways = groups(rows("peers/curves.csv", library="di-engine"), "acts").values()
     best_way = max(ways, key=lambda way: np.mean([run[-1]["score"] for run in groups(way, "seed").values()]))
-    rising = [
-        run[-1]["score"] == max(column(run, "score")) > run[len(run) // 2]["score"] + 0.1
-        for run in groups(best_way, "seed").values()
-    ]
+    of_best_way = [column(run, "score") for run in groups(best_way, "seed").values()]
+    di_engine = [run[-1] for run in of_best_way]
+    rising = [run[-1] == max(run) > run[len(run) // 2] + 0.1 for run in of_best_way]
     numbers = dict(
         limit=limit,
         early=0.1 * limit,

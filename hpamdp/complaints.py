@@ -10,25 +10,18 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from hpamdp.messages import one_line
 from hpamdp.renamed import elsewhere, renamed
 
 _MOST_COMPLAINTS = 3
 _MOST_GUESSES = 3
 _ABOUT_AS_CLOSE = 0.1  # difference of two names' similarities to a third, for which both are guesses
-_LONGEST_VALUE, _LONGEST_CODE = 300, 80  # letters of a value in a message
+_LONGEST_VALUE = 300  # letters of a value in a message
 
 
 def as_json(value: object) -> str:
     """Return a value as JSON, for a message; a long one is cut short."""
     text = json.dumps(value, default=str)
     return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
-
-
-def as_code(value: object) -> str:
-    """Return a value as Python code shows it, in one line; a long one is cut short."""
-    text = one_line(repr(value))
-    return text if len(text) <= _LONGEST_CODE else f"{text[:_LONGEST_CODE]}..."
 
 
 def no_such(

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO, cast
 
+_LONGEST_CODE = 80  # letters of a value in a message
+
 
 def one_line(text: object) -> str:
     """Return a text or an error's message as one line, with a space in place of every line break.
@@ -16,6 +18,12 @@ def one_line(text: object) -> str:
     """
     line = " ".join(line for line in map(str.strip, str(text).expandtabs().splitlines()) if line)
     return "".join(character if character.isprintable() else "?" for character in line)
+
+
+def as_code(value: object) -> str:
+    """Return a value as Python code shows it, in one line; a long one is cut short."""
+    text = one_line(repr(value))
+    return text if len(text) <= _LONGEST_CODE else f"{text[:_LONGEST_CODE]}..."
 
 
 def first_line(text: object) -> str:

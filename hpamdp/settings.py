@@ -35,7 +35,8 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from hpamdp.complaints import as_code, complaints
+from hpamdp.complaints import complaints
+from hpamdp.messages import as_code
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 PositiveFraction = Annotated[float, Field(gt=0.0, le=1.0)]

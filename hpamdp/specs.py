@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
-from hpamdp.complaints import as_code
 from hpamdp.components import Components
 from hpamdp.geometry import PlaneGeometry, Symmetries
+from hpamdp.messages import as_code
 from hpamdp.observation_entries import ObservationEntry, observation_dtype
 
 # A step or a batch of steps, by name.

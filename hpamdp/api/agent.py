@@ -19,7 +19,6 @@ from hpamdp import keys
 from hpamdp.acting import acting
 from hpamdp.api.arguments import flag, path_argument, problem_arguments, without_env_prefix
 from hpamdp.api.export import export_onnx
-from hpamdp.complaints import as_code
 from hpamdp.config.components import TARGET, Component, component
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
@@ -27,6 +26,7 @@ from hpamdp.config.outside_jobs import composed, word
 from hpamdp.config.schema import Config, EnvConfig
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import DecisionTracker, decision_tracker
+from hpamdp.messages import as_code
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.renamed import no_member
 from hpamdp.run import checkpoint

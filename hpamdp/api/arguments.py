@@ -15,14 +15,14 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 from torchrl.envs import EnvBase
 
-from hpamdp.complaints import as_code, no_such
+from hpamdp.complaints import no_such
 from hpamdp.config.components import GROUPS, takes_settings_model
 from hpamdp.config.compose import conf_dir
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import check_given_once, choosing_class, given_twice, word
 from hpamdp.config.schema import RunConfig
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.messages import first_line
+from hpamdp.messages import as_code, first_line
 
 _ACCEPTED = (
     "a name such as 'platform', a Gymnasium id, a function or class that returns a Gymnasium environment, such an "

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from pydantic import NonNegativeInt, PositiveInt
 
 from hpamdp.api.arguments import plain_name, problem_arguments, without_env_prefix
-from hpamdp.complaints import as_code, close_names, no_such
+from hpamdp.complaints import close_names, no_such
 from hpamdp.config.components import SUPPLIED_ARGUMENTS
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
@@ -22,7 +22,7 @@ from hpamdp.config.outside_jobs import composed, word
 from hpamdp.config.schema import Device, usable_device
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
-from hpamdp.messages import first_line, warn
+from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run.assemble import grouped
 from hpamdp.run.compatibility import lack_of, settings_without_effect
 from hpamdp.settings import SettingError, Settings

@@ -7,8 +7,8 @@ from typing import Any
 
 from hpamdp.analysis.seed_report import DEFAULT_METRIC, report_on
 from hpamdp.api.arguments import path_argument
-from hpamdp.complaints import as_code
 from hpamdp.config.errors import ConfigError
+from hpamdp.messages import as_code
 
 
 def report(*folders: str | Path, metric: str = DEFAULT_METRIC, to: str | Path | None = None) -> list[dict[str, Any]]:

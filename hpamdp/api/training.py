@@ -25,14 +25,14 @@ from hpamdp.api.arguments import (
     unprefixed,
     with_env_prefix,
 )
-from hpamdp.complaints import as_code, no_such
+from hpamdp.complaints import no_such
 from hpamdp.config.components import TARGET
 from hpamdp.config.compose import setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching
 from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.env.errors import closed_on_error
-from hpamdp.messages import reason_of, say, warn
+from hpamdp.messages import as_code, reason_of, say, warn
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import Callback

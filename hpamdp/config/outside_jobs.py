@@ -19,7 +19,6 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hpamdp.complaints import as_code
 from hpamdp.config.command_line import CommandLine, parse
 from hpamdp.config.components import (
     GROUPS,
@@ -34,6 +33,7 @@ from hpamdp.config.components import (
 from hpamdp.config.compose import conf_dir, is_name
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import explained, not_understood
+from hpamdp.messages import as_code
 from hpamdp.shell import for_hydra
 
 # Hydra keeps one state for the whole process.

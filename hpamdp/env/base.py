@@ -15,12 +15,12 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategoric
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
-from hpamdp.complaints import as_code
 from hpamdp.components import MAX_PAIRED, Components
 from hpamdp.env.errors import ProblemError as ProblemError  # part of what a problem may use
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium_form import GymnasiumForm, VectorForm
 from hpamdp.geometry import PlaneGeometry, Symmetries
+from hpamdp.messages import as_code
 from hpamdp.observation_entries import ObservationEntry
 
 if TYPE_CHECKING:

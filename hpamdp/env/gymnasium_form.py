@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.complaints import as_code
+from hpamdp.messages import as_code
 
 if TYPE_CHECKING:
     from hpamdp.env.base import PAMDPEnv

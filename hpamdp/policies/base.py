@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.complaints import as_code
+from hpamdp.messages import as_code
 from hpamdp.policies.masks import random_choice
 from hpamdp.policies.stored_rows import check_stored_rows
 from hpamdp.settings import SettingError

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from hpamdp.complaints import as_code
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import replacing
-from hpamdp.messages import first_line, warn
+from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run_files import BEST_NAME
 from hpamdp.settings import SettingError, Settings
 

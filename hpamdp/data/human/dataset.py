@@ -17,13 +17,13 @@ from torchrl.data.replay_buffers import Sampler
 from hpamdp.data import memmap
 from hpamdp.data.errors import DataError
 from hpamdp.data.export import write_memmap
-from hpamdp.data.human.episodes import check_conditions, select, shown
+from hpamdp.data.human.episodes import check_conditions, select
 from hpamdp.data.human.released_file import SHA256, check_sum, default_path, load_bytes, read
 from hpamdp.data.human.transitions import transitions
 from hpamdp.data.row_checks import TRAJECTORY, check_actions, check_transitions
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.task import MAX_PRESSES, ObservationForm, RewardForm
-from hpamdp.messages import reason_of
+from hpamdp.messages import as_code, reason_of
 from hpamdp.specs import PAMDPSpecs
 
 _FORMAT = 1  # increase it if the transitions of the same file change
@@ -87,10 +87,10 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
     ) -> None:
         check_conditions(complete, successes, best_people, controller)
         if not isinstance(has_choice, bool):
-            raise DataError(f"has_choice={shown(has_choice)}, but must be True or False")
+            raise DataError(f"has_choice={as_code(has_choice)}, but must be True or False")
         for name, given in (("path", path), ("root", root)):
             if not isinstance(given, str | Path | None):
-                raise DataError(f"{name}={shown(given)}, but must be a path or None")
+                raise DataError(f"{name}={as_code(given)}, but must be a path or None")
         self.root = user_cache_path("hpamdp") / "datasets" if root is None else Path(root)
         if checksum is None:
             checksum = hashlib.sha256(load_bytes(default_path() if path is None else Path(path))).hexdigest()

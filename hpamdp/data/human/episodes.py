@@ -8,7 +8,7 @@ from torch import Tensor
 from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import FULL_TANK, HumanData
 from hpamdp.env.boatdock import harbour, physics
-from hpamdp.messages import one_line
+from hpamdp.messages import as_code
 
 
 def score(data: HumanData) -> Tensor:
@@ -39,16 +39,11 @@ def check_conditions(complete: object, successes: object, best_people: object, c
     """
     for name, value in (("complete", complete), ("successes", successes)):
         if not isinstance(value, bool):
-            raise DataError(f"{name}={shown(value)}, but must be True or False")
+            raise DataError(f"{name}={as_code(value)}, but must be True or False")
     if best_people is not None and type(best_people) is not int:
-        raise DataError(f"best_people={shown(best_people)}, but must be a whole number or None")
+        raise DataError(f"best_people={as_code(best_people)}, but must be a whole number or None")
     if controller is not None and controller not in harbour.CONTROLLERS:
-        raise DataError(f"controller={shown(controller)}, but must be one of {', '.join(harbour.CONTROLLERS)}")
-
-
-def shown(value: object) -> str:
-    """Return a value as Python code shows it, in one line of at most 80 letters, for a message."""
-    return one_line(f"{value!r:.80}")
+        raise DataError(f"controller={as_code(controller)}, but must be one of {', '.join(harbour.CONTROLLERS)}")
 
 
 def select(
