@@ -192,6 +192,9 @@ def test_boats_that_are_put_elsewhere_have_the_plans_of_that_place(presses):
     assert torch.equal(planned["parameters"], first.durations[..., 0])
     if presses == 0:
         assert (planned == td["oracle"]).all()
+    restored = BoatDockEnv(16, controller="congruent", oracle=True)
+    restored.set_env_state(env.env_state())
+    assert (restored.read()["oracle"] == planned).all()
 
 
 def follow_held(env, option):

@@ -23,6 +23,7 @@ from hpamdp import keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.gymnasium.values import MisfitError
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.base import CollectionError, WorkerDiedError
@@ -35,7 +36,7 @@ from hpamdp.run.collection.worker import (
     RemoteShard,
     ShardCollector,
     WorkingDir,
-    packed,
+    pack_state,
 )
 from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, call_worker
 from hpamdp.run.recorder import Recorder
@@ -164,7 +165,7 @@ def test_a_copy_takes_all_that_a_policy_acts_by(low):
     for _ in range(2):
         parts.agent.learn(collection.next())
     batch = collection.next()[:, 0].select(*parts.policy.in_keys, strict=False)
-    copy.receive(packed(parts.policy))
+    copy.receive(pack_state(parts.policy))
     assert copy.cpu_s() > 0.0
     assert_same_state(parts.policy.state_dict(), copy.policy.state_dict())
     buffers, copied = (sorted(each.named_buffers(remove_duplicate=False)) for each in (parts.policy, copy.policy))
@@ -266,9 +267,9 @@ def test_a_resumed_run_of_a_gymnasium_environment_begins_new_episodes_with_the_s
 def test_a_frozen_presser_goes_with_the_share(tmp_path):
     parts = assemble(make_config([*SMALL, "high=ucb", "low.freeze=true"]))
     torch.manual_seed(5)
-    work = share(tmp_path, "high=ucb", "low.freeze=true", low=packed(parts.agent.router))
+    work = share(tmp_path, "high=ucb", "low.freeze=true", low=pack_state(parts.agent.router))
     env, policy = work.make_env(), work.make_policy()
-    policy.receive(packed(parts.policy))
+    policy.receive(pack_state(parts.policy))
     one, other = parts.env.reset(), env.reset()
     option = torch.tensor([0, 1] * 4)
     one, other = parts.env.step(one.set("option", option)), env.step(other.set("option", option))
@@ -396,6 +397,13 @@ def test_the_death_after_the_last_restart_ends_the_run_with_the_last_known_state
         assert collection.state() is state
 
 
+class ArrayMemoryError(MemoryError):
+    """As NumPy's own, which is not made from a text."""
+
+    def __init__(self, size, dtype):
+        super().__init__(f"{size} of {dtype}")
+
+
 @pytest.mark.parametrize(
     ("error", "kind", "text"),
     [
@@ -403,6 +411,8 @@ def test_the_death_after_the_last_restart_ends_the_run_with_the_last_known_state
         (RuntimeError("a\nbug"), RemoteError, "RuntimeError: a bug\n\nIn a worker:\nTraceback"),
         (OSError(28, "No space left on device"), RemoteError, "OSError: "),
         (MemoryError("too much"), MemoryError, "too much"),
+        (MisfitError([1], "a number"), ProblemError, "gave [1], which must be a number"),
+        (ArrayMemoryError(9, "float64"), MemoryError, "9 of float64"),
     ],
 )
 def test_an_error_in_a_workers_environment_is_no_death(error, kind, text, tmp_path, monkeypatch):

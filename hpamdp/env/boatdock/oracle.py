@@ -42,6 +42,7 @@ class BoatDockOracle:
     Attributes:
         option: the best controller, int64 `[N]`.
         keys, durations: keys and durations of the planned presses, `[N, num_plans, MAX_PRESSES]`.
+        planned_at: presses before the plan, int64 `[N]`; not 0 where a boat was put in the middle of an episode.
     """
 
     def __init__(self, num_envs: int, rules: Rules, device: torch.device) -> None:
@@ -50,17 +51,18 @@ class BoatDockOracle:
         shape = (num_envs, _num_plans(rules), planner.MAX_PRESSES)
         self.keys = torch.zeros(shape, dtype=torch.long, device=device)
         self.durations = torch.zeros(shape, device=device, dtype=torch.float32)
-        self._planned_at = torch.zeros(num_envs, dtype=torch.long, device=device)  # presses before the plan
+        self.planned_at = torch.zeros(num_envs, dtype=torch.long, device=device)
 
     def plans(self) -> dict[str, Tensor]:
-        """Return the plans for a checkpoint. They are made only at the start of an episode."""
-        return {"option": self.option, "keys": self.keys, "durations": self.durations}
+        """Return the plans for a checkpoint, with `planned_at` if a boat was put in the middle of an episode."""
+        plans = {"option": self.option, "keys": self.keys, "durations": self.durations}
+        return plans | ({"planned_at": self.planned_at} if self.planned_at.any() else {})
 
     def set_plans(self, plans: Mapping[str, Tensor]) -> None:
         """Restore the result of `plans`."""
+        self.planned_at.zero_()
         for name, plan in plans.items():
             getattr(self, name).copy_(plan)
-        self._planned_at.zero_()
 
     def plan(self, state: BoatState, rows: Tensor) -> None:
         """Plan for the environments of `rows`, bool `[N]`, from their current positions."""
@@ -69,7 +71,7 @@ class BoatDockOracle:
         self.option[rows] = planner.better_option(plans)
         self.keys[rows] = plans.keys
         self.durations[rows] = plans.durations
-        self._planned_at[rows] = boats.presses.long()
+        self.planned_at[rows] = boats.presses.long()
 
     def read(self, state: BoatState) -> TensorDict:
         """Return `option` `[N]` and the next press of each plan, `discrete` and `parameters` `[N, num_plans]`."""
@@ -77,7 +79,7 @@ class BoatDockOracle:
         # controllers' plans.
         if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0 or self.rules.switch_cost is not None:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))
-        num_presses = state.presses.long() - self._planned_at
+        num_presses = state.presses.long() - self.planned_at
         index = num_presses.clamp(max=planner.MAX_PRESSES - 1).view(-1, 1, 1).expand(-1, self.keys.shape[1], 1)
         keys = self.keys.gather(-1, index).squeeze(-1)
         durations = self.durations.gather(-1, index).squeeze(-1)

@@ -18,7 +18,14 @@ from hpamdp.run.state_checks import SavedPart, check_columns, check_generator, c
 
 
 class CollectionState(SavedPart):
-    """State of a collection, as `Collection.state` returns it."""
+    """State of a collection, as `Collection.state` returns it.
+
+    Attributes:
+        env: the environments' `env_state`, first dimension `num_envs`.
+        root: the steps `[num_envs]` from which the next ones are made, if `env` holds the current episodes.
+        generators: states of the worker processes' random generators.
+        coming: the batch that was collected ahead, if there is one.
+    """
 
     env: dict[str, Tensor]
     root: dict[str, Any] | None = None

@@ -31,15 +31,15 @@ from hpamdp.specs import PAMDPSpecs
 _CPU = torch.device("cpu")
 
 
-def packed(module: nn.Module) -> bytes:
+def pack_state(module: nn.Module) -> bytes:
     """Return a module's state as bytes. Unlike tensors, bytes share no memory between processes."""
     file = io.BytesIO()
     torch.save(module.state_dict(), file)
     return file.getvalue()
 
 
-def unpack(module: nn.Module, state: bytes) -> None:
-    """Load a `packed` state of any device into a module on the CPU."""
+def unpack_state(module: nn.Module, state: bytes) -> None:
+    """Load a packed state of any device into a module on the CPU."""
     module.load_state_dict(torch.load(io.BytesIO(state), map_location=_CPU, weights_only=True))
 
 
@@ -58,11 +58,11 @@ class PolicyCopy(TensorDictModuleBase):
         return self.policy(td)
 
     def receive(self, state: bytes) -> None:
-        """Load the `packed` state of the learner's policy."""
-        unpack(self.policy, state)
+        """Load the packed state of the learner's policy."""
+        unpack_state(self.policy, state)
 
     def cpu_s(self) -> float:
-        """Return this process's CPU seconds so far."""
+        """Return the CPU seconds of this process since the policy was built."""
         return time.process_time() - self._cpu_before
 
     def generator_state(self) -> Tensor:
@@ -83,7 +83,7 @@ class Collected:
     """What a worker returns with a batch.
 
     Attributes:
-        cpu_s: CPU seconds of the process, those of the batch included.
+        cpu_s: CPU seconds of the process since its policy was built, those of the batch included.
         batch: `[num_envs, steps_per_batch]`; None if it lies in the memory of the last batch.
         statistics: what the environments have taken by `take_new_statistics`.
     """
@@ -110,7 +110,7 @@ class ShardCollector(Collector):
         self._carrier.update(self.env.reset())
 
     def collect(self, policy: bytes, statistics: Mapping[str, Tensor]) -> Collected:
-        """Load the `packed` policy and the environments' common `statistics`, and collect a batch.
+        """Load the packed policy and the environments' common `statistics`, and collect a batch.
 
         Raises:
             ProblemError: the problem broke its contract.
@@ -124,8 +124,11 @@ class ShardCollector(Collector):
                 self.env.base_env.set_statistics(statistics)
             batch = self.next()
             return Collected(self.policy.cpu_s(), batch, self.take_new_statistics())
-        except (ProblemError, MemoryError) as error:
-            raise type(error)(str(error)) from None
+        # Of subclasses, whose constructors want other arguments, the learner's process gets the base class.
+        except ProblemError as error:
+            raise ProblemError(str(error)) from None
+        except MemoryError as error:
+            raise MemoryError(str(error)) from None
         except EnvironmentFaultError as error:
             raise EnvironmentFaultError(error.line, error.frames) from None
         except Exception as error:  # the learner's process may not have its class
@@ -158,7 +161,7 @@ class EnvShard:
         num_envs: number of its environments.
         env_seed: seed of the environments.
         exploration_seed: seed of the worker's global generator.
-        low: the `packed` low level of a run with `low.freeze`, whose environments play whole episodes with it.
+        low: the packed low level of a run with `low.freeze`, whose environments play whole episodes with it.
     """
 
     config: Config
@@ -176,7 +179,7 @@ class EnvShard:
         torch.set_num_threads(1)
         agent = self._make_agent()
         if self.low is not None:
-            unpack(agent.router, self.low)
+            unpack_state(agent.router, self.low)
         env = make_env(self.config, self.num_envs, _CPU, self.env_seed, self.first_env)
         return acting(env, agent, self.config)[0]
 

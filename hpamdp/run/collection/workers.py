@@ -24,7 +24,7 @@ from hpamdp.messages import first_line
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state, random_seeds
 from hpamdp.run.collection.limits import limit_of
-from hpamdp.run.collection.worker import EnvShard, RemoteError, packed
+from hpamdp.run.collection.worker import EnvShard, RemoteError, pack_state
 from hpamdp.search_path import protect_children, unprotect_children
 from hpamdp.settings import Settings
 
@@ -79,7 +79,7 @@ class WorkerCollection(Collection):
         self._parts = parts
         self._policy = parts.policy
         self._specs = parts.agent.specs
-        self._frozen = packed(parts.agent.router) if config.run.low.freeze else None
+        self._frozen = pack_state(parts.agent.router) if config.run.low.freeze else None
         self._device = parts.device
         self._problem = parts.env.base_env  # never stepped; it has the statistics of all workers
         self._keeps_episodes = parts.env.keeps_episodes
@@ -219,7 +219,7 @@ class WorkerCollection(Collection):
             CollectionError: a worker died and is not replaced, or this machine reached a limit.
         """
         self._is_idle = False
-        policy = packed(self._policy)
+        policy = pack_state(self._policy)
         self._coming = self._coming or self._begin(policy)
         batch = self._finished()
         for number, new in enumerate(self._new_statistics):
