@@ -13,7 +13,7 @@ from hpamdp import keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.released_file import read
-from hpamdp.data.human.rest_to_rest import TAP, to_rest_to_rest
+from hpamdp.data.human.rest_to_rest import MIN_DISTANCE, to_rest_to_rest
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
@@ -204,7 +204,7 @@ def test_a_rest_to_rest_press_brings_a_gliding_boat_to_where_the_next_one_began(
     kept = ~moved_presses["is_final"]
     assert kept.sum() > 50
     distance = physics.total_distance(moved_presses["duration"][kept])
-    assert (distance >= TAP - 1e-3).all()
+    assert (distance >= MIN_DISTANCE - 1e-3).all()
     assert (moved_presses["duration"] <= physics.MAX_DURATION).all()
     # The presses of each episode are numbered from 0 in order.
     first = torch.searchsorted(moved_presses["episode"], moved_presses["episode"])

@@ -125,6 +125,7 @@ def sarsa_rows(phi, next_phi, discrete, reward, terminated, done) -> TensorDict:
             "terminated": torch.tensor(terminated),
             "done": torch.tensor(done),
             "mask": torch.ones(shape, dtype=torch.bool),
+            "is_first": torch.zeros(shape, dtype=torch.bool),
         },
         shape,
     )
@@ -216,6 +217,7 @@ def test_updates_of_groups_of_environments_follow_one_another():
             "terminated": torch.rand(5, 3) < 0.2,
             "done": torch.rand(5, 3) < 0.4,
             "mask": torch.rand(5, 3) < 0.8,
+            "is_first": torch.zeros(5, 3, dtype=torch.bool),
         },
         [5, 3],
     )

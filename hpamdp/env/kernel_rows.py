@@ -66,7 +66,7 @@ class KernelRows:
         self._advance = advance
         self._num_rows = num_rows
         self._observation_dim, self._num_extras = reading_dims
-        self._places = np.concatenate([[0], np.cumsum(parameter_dims)]).astype(np.int64)
+        self._parameter_offsets = np.concatenate([[0], np.cumsum(parameter_dims)]).astype(np.int64)
         self._bounds = np.ascontiguousarray(bounds, np.float32)
         self._settings = np.array([0.0, 0.0, 0.0, first_env, *settings])
         self._all = np.ones(num_rows, np.bool_)
@@ -157,7 +157,7 @@ class KernelRows:
             self._no_choice if option is None else option,
             discrete,
             parameters,
-            self._places,
+            self._parameter_offsets,
             self._bounds,
             self._all if mask is None else mask,
             self._settings,

@@ -54,8 +54,7 @@ def have_stepped(parts: Mapping[str, Any]) -> bool:
 
 def option_ends(batch: TensorDictBase) -> Tensor:
     """Return where an episode or an option ends, bool `[*B, T, 1]`; another option's rows may follow."""
-    is_end = batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
-    return is_end | batch.get(("next", keys.OPTION_ENDED), False)
+    return known_ends(batch) | batch.get(("next", keys.OPTION_ENDED), False)
 
 
 def known_ends(batch: TensorDictBase) -> Tensor:
@@ -79,8 +78,8 @@ def added_later(module: nn.Module) -> set[str]:
 def step_discounts(batch: TensorDictBase, gamma: float) -> float | Tensor:
     """Return `gamma`, or if the environment writes durations, its power for each step, `[*B, T, 1]`.
 
-    If long and short steps had one discount, an agent would gain by stretching time: if costs are going to rise, many
-    short steps put them off. H-PPO and the learners with a replay buffer count durations; Q-PAMDP, planning by a model
+    With one discount per step, an agent could put off costs by taking many short steps, which discount the future more.
+    H-PPO and the learners with a replay buffer count durations; Q-PAMDP, planning by a model
     and selectors do not.
     """
     duration = batch.get(("next", keys.DURATION), None)
@@ -242,7 +241,7 @@ class Selector(Level, TensorDictModuleBase):
     A decision is due if an episode begins or the previous option has ended. `forward` holds the options between
     decisions. A subclass writes `select` and, if it learns, `learn`::
 
-        class GreedyMean(Selector):  # epsilon-greedy by the mean rewards of the options
+        class GreedyMean(Selector):  # epsilon-greedy by the mean rewards of the options, all of which are allowed
             def __init__(self, specs: PAMDPSpecs, *, epsilon: Fraction) -> None:
                 super().__init__(specs)
                 self.epsilon = epsilon
@@ -289,8 +288,8 @@ class Selector(Level, TensorDictModuleBase):
             the value of the next decision, see `next_discount`.
         ends_options: whether the selector can decide where options end, by `ends`.
         decides_ends: whether it does so in this run (`agent.termination=learned`). The agent sets it.
-        no_lengths: why the selector cannot choose pairs of an option and its length (`agent.termination=chosen`). If
-            None, it can: its `specs` then list the pairs as options. If it `needs` the environment's entries or
+        lengths_refusal: why the selector cannot choose pairs of an option and its length (`agent.termination=chosen`).
+            If None, it can: its `specs` then list the pairs as options. If it `needs` the environment's entries or
             `asks_learners`, the run knows that it cannot.
         is_bandit: True if the selector uses an option's return as its full value, that is, does not bootstrap. Its
             options must last as long as their episodes or trips; others are refused.
@@ -306,7 +305,7 @@ class Selector(Level, TensorDictModuleBase):
     asks_learners: ClassVar[bool] = False
     is_bandit: ClassVar[bool] = False
     ends_options: ClassVar[bool] = False
-    no_lengths: ClassVar[str | None] = None
+    lengths_refusal: ClassVar[str | None] = None
     decides_ends: bool = False
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     gamma: float = 1.0
@@ -337,7 +336,7 @@ class Selector(Level, TensorDictModuleBase):
         raise NotImplementedError
 
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return a fresh choice: a tensor `[*B]` for each of `out_keys`.
+        """Return a fresh choice: a tensor `[*B, ...]` for each of `out_keys`.
 
         Override it instead of `select` if there is more to return than the option.
         """
@@ -353,7 +352,7 @@ class Selector(Level, TensorDictModuleBase):
         self.option_values = option_values
 
     def option_probabilities(self, td: TensorDictBase) -> Tensor | None:
-        """Return the probabilities of the options at a decision, `[*B, num_options]`; None if one is chosen for sure.
+        """Return the probabilities of the options at a decision, `[*B, num_options]`; None if one is certain.
 
         They are those of the policy that the selector follows or learns, without exploration. Off-policy learners
         bootstrap from the mean of the options' values with these weights. Override it if that policy is stochastic.
@@ -369,7 +368,7 @@ class Selector(Level, TensorDictModuleBase):
         return lambda td: self.choose(td)[keys.OPTION]
 
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return a uniformly random choice: a tensor `[*B]` for each of `out_keys`."""
+        """Return a uniformly random choice: a tensor `[*B, ...]` for each of `out_keys`."""
         mask = td.get(keys.OPTION_MASK, None)
         return {keys.OPTION: random_choice(td.batch_size, self.specs.num_options, mask, self.is_uniform.device)}
 

@@ -679,7 +679,7 @@ def selector_chooses_lengths(config: Config, problem: ProblemFacts) -> str | Non
     """Require a selector that can choose lengths with `agent.termination=chosen`."""
     if config.run.agent.termination != "chosen":
         return None
-    why: str | None = getattr(config.high.cls, "no_lengths", None)
+    why: str | None = getattr(config.high.cls, "lengths_refusal", None)
     if getattr(config.high.cls, "asks_learners", False):
         why = "compares the learners' values, which do not depend on an option's length"
     elif _needs(config.high):

@@ -45,7 +45,7 @@ def download(url: str, target: Path | None = None, *, checksum: str = SHA256) ->
             path=target.parent,
             progressbar=sys.stderr.isatty(),
         )
-    # The requests library raises OSErrors. An archive without the file raises a LookupError.
+    # The requests library raises OSErrors, an unexpected reply of an archive a LookupError.
     except (OSError, ValueError, EOFError, LookupError, ftplib.Error) as error:
         raise DataError(f"{url}: cannot be fetched ({error}); you can also put the file at {target} by hand") from error
     return target

@@ -8,7 +8,7 @@ A learner that imitates the recorded presses learns presses that are too short, 
 
 A rest-to-rest press starts from rest and lasts until the boat has come to rest again:
 - The new duration of a press takes the boat, from rest to rest, to the point where the next press began.
-- Presses that moved the boat by less than `TAP` are left out.
+- Presses that moved the boat by less than `MIN_DISTANCE` are left out.
 - Final presses are left out if, by our physics, they would not have ended their episode as recorded.
 
 If the final press is left out, the last remaining press leads to the start of the final one. The episode is then
@@ -24,7 +24,7 @@ from torch import Tensor
 from hpamdp.data.human.released_file import FULL_TANK, TICKS_PER_SECOND, HumanData
 from hpamdp.env.boatdock import harbour, physics
 
-TAP = 4.0  # px
+MIN_DISTANCE = 4.0  # px
 _CENTRE = torch.tensor(harbour.CENTRE, dtype=torch.float32)
 
 
@@ -45,7 +45,7 @@ def to_rest_to_rest(data: HumanData) -> HumanData:
     moved = ((presses["next_position"] - presses["position"]) * heading).sum(1).nan_to_num()
     reach = torch.minimum(moved.clamp(min=0.0), physics.total_distance(presses["duration"]))
     duration = torch.where(is_final, presses["duration"], physics.press_for(reach))
-    is_kept = torch.where(is_final, _ends_as_recorded(presses, episodes, heading), reach >= TAP)
+    is_kept = torch.where(is_final, _ends_as_recorded(presses, episodes, heading), reach >= MIN_DISTANCE)
 
     kept = presses[is_kept].clone()
     kept["duration"] = duration[is_kept]

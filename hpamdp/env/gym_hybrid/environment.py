@@ -1,6 +1,7 @@
 """Moving and Sliding as batched TorchRL environments: drive to a target and stop there.
 
-Source: Xiong et al. 2018, arXiv:1810.06394, in the version of gym-hybrid; see `hpamdp.env.gym_hybrid.rules`.
+Source: Xiong et al. 2018, arXiv:1810.06394, and Fan et al. 2019, arXiv:1903.01344, in the version of gym-hybrid; see
+`hpamdp.env.gym_hybrid.rules`.
 """
 
 from __future__ import annotations

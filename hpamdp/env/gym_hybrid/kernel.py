@@ -47,7 +47,7 @@ _OBSERVATION_DIM = len(rules.OBSERVATION_NAMES)
 
 _F = np.float32
 _PUSH, _STEP, _BRAKE, _RIGHT_ANGLE = _F(rules.LARGEST_PUSH), _F(rules.STEP), _F(rules._BRAKE), _F(rules._TURN)
-_RADIUS, _START_BOUND, _STEP_COST = _F(rules.TARGET_RADIUS), _F(rules._START_BOUND), _F(rules._STEP_COST)
+_RADIUS, _TARGET_BOUND, _STEP_COST = _F(rules.TARGET_RADIUS), _F(rules._TARGET_BOUND), _F(rules._STEP_COST)
 _SUCCESS_REWARD, _FAILURE_REWARD = _F(rules._SUCCESS_REWARD), _F(rules._FAILURE_REWARD)
 _TURNS = _F(0.5 / math.pi)
 _MOST_STEPS = 2.0**31 - 1.0  # that an int32 counts
@@ -134,8 +134,8 @@ def _observe(lanes: Any, numbers: Any, latest: Any, seen: Any) -> None:
 @part
 def _start(lanes: Any, numbers: Any, j: Any, bits: Any, step: Any) -> None:
     """Put vehicle and target of a lane anywhere in the field: `rules.start`."""
-    lanes[_TARGET_X * _LANES + j] = _START_BOUND * (TWO * kernels.uniform(bits, step, 0) - ONE)
-    lanes[_TARGET_Y * _LANES + j] = _START_BOUND * (TWO * kernels.uniform(bits, step, 1) - ONE)
+    lanes[_TARGET_X * _LANES + j] = _TARGET_BOUND * (TWO * kernels.uniform(bits, step, 0) - ONE)
+    lanes[_TARGET_Y * _LANES + j] = _TARGET_BOUND * (TWO * kernels.uniform(bits, step, 1) - ONE)
     lanes[_X * _LANES + j] = TWO * kernels.uniform(bits, step, 2) - ONE
     lanes[_Y * _LANES + j] = TWO * kernels.uniform(bits, step, 3) - ONE
     heading = TURN * kernels.uniform(bits, step, 4)

@@ -40,7 +40,7 @@ LARGEST_PUSH = 0.5  # the most that an acceleration adds to the speed
 STEP = 0.005  # distance covered in a step at speed 1
 _BRAKE = 0.1
 _TURN = math.pi / 2.0
-_START_BOUND = 0.9  # bound of the target's coordinates
+_TARGET_BOUND = 0.9  # bound of the target's coordinates
 _STEP_COST = 0.001
 _SUCCESS_REWARD, _FAILURE_REWARD = 1.0, -1.0
 
@@ -66,11 +66,11 @@ class VehicleState(NamedTuple):
 
 def start(episode: Tensor, rng: RngKey) -> VehicleState:
     """Return the initial states of the episodes with these numbers, int32 `[N]`."""
-    target_x, target_y = (_START_BOUND * (2.0 * counter_rng.uniform(rng, index) - 1.0) for index in range(2))
+    target_x, target_y = (_TARGET_BOUND * (2.0 * counter_rng.uniform(rng, index) - 1.0) for index in range(2))
     x, y = (2.0 * counter_rng.uniform(rng, index) - 1.0 for index in range(2, 4))
     heading = 2.0 * math.pi * counter_rng.uniform(rng, 4)
-    none = torch.zeros_like(episode)
-    return VehicleState(x, y, torch.zeros_like(x), heading, heading, target_x, target_y, none, none, episode)
+    zeros = torch.zeros_like(episode)
+    return VehicleState(x, y, torch.zeros_like(x), heading, heading, target_x, target_y, zeros, zeros, episode)
 
 
 def act(
@@ -92,13 +92,13 @@ def act(
     y = state.y + STEP * speed * course.sin()
     steps = state.steps + 1
     after = state._replace(x=x, y=y, speed=speed, heading=heading, course=course, steps=steps)
-    left = distance(after)
-    has_stopped = (left < TARGET_RADIUS) & (speed == 0.0)
+    remaining = distance(after)
+    has_stopped = (remaining < TARGET_RADIUS) & (speed == 0.0)
     is_outside = (x.abs() > 1.0) | (y.abs() > 1.0)
     is_late = steps >= max_steps
-    reward = distance(state) - left - _STEP_COST
+    reward = distance(state) - remaining - _STEP_COST
     reward = torch.where(is_outside | is_late, _FAILURE_REWARD, reward)
-    reward = torch.where(has_stopped, distance(state) - left - _STEP_COST + _SUCCESS_REWARD, reward)
+    reward = torch.where(has_stopped, distance(state) - remaining - _STEP_COST + _SUCCESS_REWARD, reward)
     outcome = torch.where(is_late, TIME_LIMIT, GOING_ON)
     outcome = torch.where(is_outside, LEFT_FIELD, outcome)
     outcome = torch.where(has_stopped, STOPPED, outcome).int()
@@ -148,11 +148,11 @@ def distance(state: VehicleState) -> Tensor:
 
 def observe(state: VehicleState, max_steps: int) -> Tensor:
     """Return the observation `[N, 10]` with the entries OBSERVATION_NAMES, for episodes of `max_steps` actions."""
-    left = distance(state)
-    inside = (left <= TARGET_RADIUS).to(left.dtype)
-    time = state.steps.to(left.dtype) / max(max_steps - 1, 1)
+    remaining = distance(state)
+    inside = (remaining <= TARGET_RADIUS).to(remaining.dtype)
+    time = state.steps.to(remaining.dtype) / max(max_steps - 1, 1)
     cos, sin = state.heading.cos(), state.heading.sin()
-    seen = [state.x, state.y, state.speed, cos, sin, state.target_x, state.target_y, left, inside, time]
+    seen = [state.x, state.y, state.speed, cos, sin, state.target_x, state.target_y, remaining, inside, time]
     return torch.stack(seen, -1)
 
 
@@ -161,10 +161,10 @@ def observation_bounds(max_steps: int) -> tuple[list[float], list[float]]:
     speed = LARGEST_PUSH * max_steps
     # The last step may leave the field. The extra 0.001 allows for rounding.
     edge = 1.001 + STEP * speed
-    furthest = math.sqrt(2.0) * (edge + _START_BOUND)
+    furthest = math.sqrt(2.0) * (edge + _TARGET_BOUND)
     latest = 1.001 * max_steps / max(max_steps - 1, 1)
-    high = [edge, edge, speed, 1.001, 1.001, _START_BOUND, _START_BOUND, furthest, 1.0, latest]
-    low = [-edge, -edge, 0.0, -1.001, -1.001, -_START_BOUND, -_START_BOUND, 0.0, 0.0, 0.0]
+    high = [edge, edge, speed, 1.001, 1.001, _TARGET_BOUND, _TARGET_BOUND, furthest, 1.0, latest]
+    low = [-edge, -edge, 0.0, -1.001, -1.001, -_TARGET_BOUND, -_TARGET_BOUND, 0.0, 0.0, 0.0]
     return low, high
 
 
@@ -179,11 +179,11 @@ def scripted_action(state: VehicleState) -> tuple[Tensor, Tensor]:
 
     It turns towards the target, accelerates, and brakes in time. It turns only at rest, so it also works in Sliding.
     """
-    left = distance(state)
+    remaining = distance(state)
     bearing = torch.atan2(state.target_y - state.y, state.target_x - state.x)
     error = (bearing - state.heading + math.pi).remainder(2.0 * math.pi) - math.pi
     stops_within = 0.5 * STEP / _BRAKE * state.speed * (state.speed + _BRAKE) + _MARGIN
-    must_brake = left <= stops_within
+    must_brake = remaining <= stops_within
     must_turn = (error.abs() > _TOLERANCE) & (state.speed == 0.0)
     # At travelling speed the vehicle turns by 0, because no action does nothing.
     can_speed_up = state.speed < _CRUISE

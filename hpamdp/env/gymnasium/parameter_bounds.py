@@ -138,8 +138,9 @@ def agent_bounds(actions: ActionSpace, low: np.ndarray, high: np.ndarray) -> tup
 
     Returns:
         The lower and the upper bounds of the agent's parameters, float32 `[N, num_parameters]` each. They are rounded
-        inwards, so every float32 between them is within the exact bounds. Last, all lower and all upper bounds as the
-        agent observes them, float32 `[N, 2 num_parameters]`: scaled so that the bounds of the space are -1 and 1.
+        inwards, so every float32 between them is within the exact bounds. If no float32 lies between these, both are
+        the smallest one above the lower bound. Last, all lower and all upper bounds as the agent observes them, float32
+        `[N, 2 num_parameters]`: scaled so that the bounds of the space are -1 and 1.
     """
     exact = actions.to_agent(low), actions.to_agent(high)
     width = actions.high.astype(np.float64) - actions.low

@@ -40,8 +40,8 @@ class PlatformEnv(BatchedEnv[PlatformState]):
     [0, 430] px. Only the parameter of the chosen action counts; outside its bounds it is clipped, NaN and infinity are
     refused. A run takes a second, a jump lasts until the agent lands.
 
-    The reward is the distance covered as a share of the course, so an agent that arrives has the return 1. An episode
-    terminates at the end of the course, in a gap or at an enemy.
+    The reward is the distance covered as a fraction of the course, so an agent that arrives has the return 1. An
+    episode terminates at the end of the course, in a gap or at an enemy.
 
     Only the noise is random. For the constructor's arguments and errors see `BatchedEnv`.
     """
@@ -58,7 +58,7 @@ class PlatformEnv(BatchedEnv[PlatformState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem; options to begin with are run and jump."""
+        """Return the facts of the problem. The default options are run and jump."""
         return ProblemFacts(title=cls.__name__, default_options={"run": ["run"], "jump": ["hop", "leap"]})
 
     def kernel_settings(self) -> Sequence[float]:
@@ -85,7 +85,7 @@ class PlatformEnv(BatchedEnv[PlatformState]):
         return rules.start(episode)
 
     def act(self, state: PlatformState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[PlatformState, Tensor]:
-        """Return the states after one action, and the distances covered as shares of the course, `[N]`."""
+        """Return the states after one action, and the distances covered as fractions of the course, `[N]`."""
         # Rows that do not move simulate a run, which is shorter than a jump.
         simulated = torch.where(is_idle, rules.RUN, action.discrete)
         normal = partial(counter_rng.normal, rng)

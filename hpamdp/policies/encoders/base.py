@@ -16,12 +16,12 @@ _PIECE = 256
 
 
 class Encoder(nn.Module):
-    """Turns one entry of the observation, a picture, into features.
+    """Turn one entry of the observation, a picture, into features.
 
     A learner makes one encoder for each entry that is a picture, and trains it together with its own networks. Vectors
     are passed on unchanged::
 
-        class Downscaled(Encoder):  # mean colours of 8 x 8 areas
+        class Downscaled(Encoder):  # mean colours on a grid of 8 x 8
             def __init__(self, entry: ObservationEntry) -> None:
                 super().__init__(entry)
                 self.num_features = 64 * entry.picture_shape[0]
@@ -58,7 +58,7 @@ class Encoder(nn.Module):
 
 
 class JoinedEncoders(nn.Module):
-    """Concatenates the features of all entries of an observation; the one-hot option stays at the end.
+    """Concatenate the features of all entries of an observation; the one-hot option stays at the end.
 
     Args:
         specs: of the learner or the selector. `specs.encoder` makes the encoders; by default a `CNN` for each picture.

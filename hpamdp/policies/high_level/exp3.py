@@ -44,8 +44,8 @@ class Exp3(Bandit):
     def __init__(self, specs: PAMDPSpecs, options: Exp3Options | None = None, **settings: Any) -> None:
         super().__init__(specs, options, **settings)
         self.out_keys = [*self.out_keys, PROBABILITY]
-        # `statistics` holds the rewards. Of these, rewards divided by their probabilities, and the divisors' inverses:
-        # the range is not part of them, since it grows.
+        # `weighted` sums reward / probability, and `inverse` sums 1 / probability. `gains` scales both, because the
+        # range of the rewards may still grow.
         self.weighted = RewardStatistics(specs.num_options, self.options)
         self.inverse = RewardStatistics(specs.num_options, self.options)
         self.register_buffer("low", torch.tensor(torch.inf, dtype=torch.float64))
@@ -81,19 +81,19 @@ class Exp3(Bandit):
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return options and their probabilities, `[*B]` each."""
         option = self.select(td)
-        probability = self.probabilities.float()[option]
+        probabilities = self.probabilities.float()
         mask = td.get(keys.OPTION_MASK, None)
-        if mask is not None:
-            probability = probability / (self.probabilities.float() * mask).sum(-1)
-        return {keys.OPTION: option, PROBABILITY: probability}
+        allowed = 1.0 if mask is None else (probabilities * mask).sum(-1)
+        return {keys.OPTION: option, PROBABILITY: probabilities[option] / allowed}
 
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return uniformly random options and their probabilities, `[*B]` each."""
         chosen = super().choose_uniformly(td)
-        uniform = 1.0 / self.specs.num_options
-        chosen[PROBABILITY] = torch.full_like(chosen[keys.OPTION], uniform, dtype=torch.float32)
         mask = td.get(keys.OPTION_MASK, None)
-        if mask is not None:
+        if mask is None:
+            uniform = 1.0 / self.specs.num_options
+            chosen[PROBABILITY] = torch.full_like(chosen[keys.OPTION], uniform, dtype=torch.float32)
+        else:
             chosen[PROBABILITY] = 1.0 / mask.sum(-1)
         return chosen
 

@@ -30,7 +30,7 @@ class Fixed(Selector):
     """
 
     Options = FixedOptions
-    no_lengths: ClassVar[str | None] = "has a setting for the option, but none for its length"
+    lengths_refusal: ClassVar[str | None] = "has a setting for the option, but none for its length"
     takes_pictures = True
 
     def __init__(self, specs: PAMDPSpecs, options: FixedOptions | None = None, **settings: Any) -> None:

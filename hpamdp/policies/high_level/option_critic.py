@@ -72,7 +72,9 @@ class OptionCritic(RemembersDecisions):
     Options = OptionCriticOptions
     ends_options: ClassVar[bool] = True
     modes: ClassVar[tuple[str, ...]] = ("train",)
-    no_lengths: ClassVar[str | None] = "learns from single steps, which do not tell how long their options still last"
+    lengths_refusal: ClassVar[str | None] = (
+        "learns from single steps, which do not tell how long their options still last"
+    )
 
     num_steps: Tensor
 

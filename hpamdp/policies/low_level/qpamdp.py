@@ -9,9 +9,9 @@ Osentoski and Thomas 2011, *Value Function Approximation in Reinforcement Learni
 on the step: Dabney and Barto 2012, *Adaptive Step-Size for Online Temporal Difference Learning*.
 
 Differs from the source:
-- All environments learn together. Sarsa makes one update for each time step and group of environments, the mean over
-  the group, and the bound on its step size holds for that mean. eNAC accumulates its regression as normal equations,
-  with a ridge penalty.
+- All environments learn together. For each time step and group of environments, Sarsa makes one update: the mean over
+  the group. The bound on its step size holds for that mean. eNAC accumulates its regression as normal equations, with a
+  ridge penalty.
 - The value of the next discrete action is its expectation under the softmax if that action is not in the batch: in the
   batch's last column, and where an episode is truncated.
 - If an option ends inside its episode, the step is terminal, and its reward includes the discounted value under the
@@ -21,9 +21,9 @@ Differs from the source:
 - By default all weights of the values have the same step size. Dabney and Barto's bound limits it again at each step,
   whatever the sign of the change. The temperature is constant, also in the parameter phases, and sigma decays.
   The settings of Bester et al.'s code on Platform: step_scaling=true, step_bound=non_increasing, temperature=1,
-  temperature_decay=0.995, samples_in_parameter_phase=false, sigma_decay=1. Below, "published" means these. There each
-  phase of Sarsa restarts at the initial temperature, and the discount counts ticks. Their code on Goal has no bound, a
-  constant temperature, alpha 0.01, gradients of unit norm and a baseline of three features.
+  temperature_decay=0.995, samples_in_parameter_phase=false, sigma_decay=1. The settings below call these published.
+  There each phase of Sarsa restarts at the initial temperature, and the discount counts ticks. Their code on Goal has
+  no bound, a constant temperature, alpha 0.01, gradients of unit norm and a baseline of three features.
 - Parameters are in units where their bounds are [-1, 1], and sigma is a standard deviation. eNAC's returns are not
   discounted, and the divergence from the old policy bounds its step.
 """
@@ -78,11 +78,11 @@ class QPAMDPOptions(Settings):
     phi_order: PositiveInt = 5
     """Highest order of the Fourier basis of the discrete actions' values."""
     phi_max_coupled: PositiveInt = 2
-    """Largest number of entries in a feature of the values, of which there are fewer than (order + 1)^entries."""
+    """Largest number of observation entries that one feature of the values depends on. Fewer give fewer features."""
     psi_order: PositiveInt = 3
     """Highest order of the Fourier basis of the mean parameters."""
     psi_max_coupled: PositiveInt = 2
-    """Largest number of entries in a feature of the mean parameters."""
+    """Largest number of observation entries that one feature of the mean parameters depends on."""
     warmup_steps: PositiveInt = 2_000
     """Steps of the initial policy, from which the ranges of the entries are taken."""
     initial_episodes: PositiveInt = 1_000
@@ -118,7 +118,7 @@ class QPAMDPOptions(Settings):
     parameter_updates: PositiveInt | None = 10
     """Parameter updates in a phase: the k of Q-PAMDP(k). If null, that is Q-PAMDP(infinity), see `patience`."""
     patience: Annotated[PositiveInt, OnlyWith("parameter_updates", None)] = 5
-    """Windows without a record of the mean return after which a phase ends, if `parameter_updates` is null.
+    """Number of windows without a new best mean return after which a phase ends. Used if `parameter_updates` is null.
 
     A window is a parameter update, or `relearning_episodes` of Sarsa(lambda).
     """
@@ -195,11 +195,15 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         """Return the means `[*B, num_parameters]` for observations `[*B, observation_dim]`."""
         return self.psi(observation) @ self.theta.T + self.initial(observation)
 
+    def q(self, observation: Tensor) -> Tensor:
+        """Return the values of the discrete actions `[*B, num_discrete]`."""
+        return self.phi(observation) @ self.w.T
+
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, the parameters and their raw sample, each `[*B, num_parameters]`."""
         observation = td.get(keys.OBSERVATION)
         allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
-        q = masked_values(self.phi(observation) @ self.w.T, allowed)
+        q = masked_values(self.q(observation), allowed)
         raw = self.mean(observation)
         is_exploring = not is_greedy()
         discrete = sample_index(q / self.temperature) if is_exploring and self.samples_discrete else q.argmax(-1)
@@ -228,8 +232,8 @@ class SarsaLambda(SizedByData):
             w: weights `[num_discrete, num_features]`.
             rows: `[N, T]` with `phi` and `next_phi` `[N, T, num_features]`, and `discrete`, `reward`, `terminated`,
                 `done` and `mask` `[N, T]`; only the rows in `mask` count. `next_allowed` `[N, T, num_discrete]`: the
-                discrete actions that may be taken in the next states, if not all. `is_first` `[N, T]`, if known:
-                whether a row begins an episode or an option; the one before it may have been abandoned.
+                discrete actions that may be taken in the next states, if not all. `is_first` `[N, T]`: whether a
+                row begins an episode or an option; the one before it may have been abandoned.
             temperature: of the softmax policy, `[]`.
             step_scale: factors on the steps of the features' weights, `[num_features]`.
 
@@ -239,8 +243,7 @@ class SarsaLambda(SizedByData):
         num_envs, num_steps = rows.shape
         if self.traces.shape != (num_envs, *w.shape):
             self.traces = w.new_zeros(num_envs, *w.shape)
-        if "is_first" in rows.keys():
-            self.traces[rows["is_first"][:, 0]] = 0.0
+        self.traces[rows["is_first"][:, 0]] = 0.0
         # The action at the next time step; -1 in the last column, where it is not known.
         next_discrete = F.pad(rows["discrete"][:, 1:], (0, 1), value=-1)
         size = num_envs if self.options.envs_per_update is None else self.options.envs_per_update
@@ -346,14 +349,13 @@ class NaturalActorCritic(SizedByData):
         Args:
             rows: `[N, T]` with `gradient` `[N, T, num_weights]`, `phi` `[N, T, num_features]`, and `reward`, `done` and
                 `mask` `[N, T]`; only the episodes whose last row is in `mask` count. `is_first` as for `SarsaLambda`.
-            ended_before: where an episode ended with the batch before, as this one shows, bool `[N]`; None: nowhere.
+            ended_before: where an episode ended with the batch before, as this one shows, bool `[N]`. If None, nowhere.
             value_before: what to add to their returns, `[N]`.
         """
         ended = torch.zeros_like(self.is_whole) if ended_before is None else ended_before & self.is_whole
         ended_regressors = [self.regressors[ended]]
         ended_returns = [(self.returns + value_before)[ended]]
-        if "is_first" in rows.keys():
-            self.is_fresh = self.is_fresh | rows["is_first"][:, 0]
+        self.is_fresh = self.is_fresh | rows["is_first"][:, 0]
         for t in range(rows.shape[1]):
             row = rows[:, t]
             gradient = row["gradient"]
@@ -390,7 +392,7 @@ class NaturalActorCritic(SizedByData):
         return solution.float(), (0.5 * solution @ fisher @ solution).float()
 
 
-class OpenOptions(SizedByData):
+class PendingOptionEnds(SizedByData):
     """Remembers options that may have ended with a batch's last step, and the discounted values of their next states.
 
     If the selector decides where options end, the next batch shows whether one ended.
@@ -459,7 +461,7 @@ class QPAMDP(Learner):
         self.policy = QPAMDPPolicy(specs, self.options)
         self.sarsa = SarsaLambda(self.options)
         self.enac = NaturalActorCritic(self.options.ridge)
-        self.open = OpenOptions()
+        self.open = PendingOptionEnds()
         self.register_buffer("mask", specs.parameter_mask.float())
         self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf, dtype=torch.float32))
         self.register_buffer("high", torch.full((specs.observation_dim,), -torch.inf, dtype=torch.float32))
@@ -498,8 +500,8 @@ class QPAMDP(Learner):
             rows["reward"] = rows["reward"] + rows["open_value"]
             rows["terminated"] = rows["terminated"] | rows["is_open"]
             scalars["td_error"] = self._update_values(rows, num_episodes)
-            is_first = self.updates == 0 and self.windows == 0
-            wanted = self.options.initial_episodes if is_first else self.options.relearning_episodes
+            is_first_phase = self.updates == 0 and self.windows == 0
+            wanted = self.options.initial_episodes if is_first_phase else self.options.relearning_episodes
             is_full = self.window_episodes >= wanted
         else:
             self.enac.collect(rows, ended_before, value_before)
@@ -580,7 +582,7 @@ class QPAMDP(Learner):
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the expected value of the softmax policy's discrete action, `[N]`."""
-        q = self.policy.phi(observation) @ self.policy.w.T
+        q = self.policy.q(observation)
         logits = masked_logits(q / self.policy.temperature, self.specs.allowed(observation, action_mask))
         return (logits.softmax(-1) * q).sum(-1)
 

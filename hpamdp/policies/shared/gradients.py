@@ -1,4 +1,4 @@
-"""Steps of an optimizer down the gradient of a loss, and gradients that `torch.compile` makes code of.
+"""Optimizer steps, with gradients that `torch.compile` can compile.
 
 Compiled code merges the many small operations around the matrix products.
 """
@@ -28,7 +28,7 @@ class Descent:
     def __init__(self) -> None:
         self._gradients_of: Gradients = gradients_of
         self._while_compiling: Callable[[], AbstractContextManager] = nullcontext
-        self._losses: set[str] = set()  # of which the gradients have been compiled
+        self._compiled_losses: set[str] = set()  # names of the losses whose gradients are compiled
         self.precision = torch.float32
 
     def compile(
@@ -54,7 +54,7 @@ class Descent:
 
     def same_precision(self, device: torch.device) -> AbstractContextManager:
         """Return a context in which products have the precision of those in `step`."""
-        return lower_products(device, self.precision)
+        return matmul_precision(device, self.precision)
 
     def step(
         self,
@@ -77,11 +77,11 @@ class Descent:
         """
         groups = optimizer.param_groups
         parameters = [parameter for group in groups for parameter in group["params"] if parameter.requires_grad]
-        is_first = self._gradients_of is not gradients_of and loss_of.__qualname__ not in self._losses
+        is_first = self._gradients_of is not gradients_of and loss_of.__qualname__ not in self._compiled_losses
         with self._while_compiling() if is_first else nullcontext():
             scalars, gradients = self._gradients_of(loss_of, parameters, *inputs, precision=self.precision)
         if is_first:
-            self._losses.add(loss_of.__qualname__)
+            self._compiled_losses.add(loss_of.__qualname__)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         if max_grad_norm is not None:
@@ -98,12 +98,12 @@ def expectile_loss(excess: Tensor, expectile: float) -> Tensor:
 
     Args:
         excess: of the targets over the predictions, `[B]`.
-        expectile: of the targets, from 0.5, their mean, towards 1, the largest.
+        expectile: 0.5 gives the mean of the targets; towards 1 it approaches their maximum.
     """
     return (torch.where(excess > 0.0, expectile, 1.0 - expectile).float() * excess.square()).mean()
 
 
-def lower_products(device: torch.device, precision: torch.dtype) -> AbstractContextManager:
+def matmul_precision(device: torch.device, precision: torch.dtype) -> AbstractContextManager:
     """Return a context in which matrix products have this precision."""
     return nullcontext() if precision == torch.float32 else torch.autocast(device.type, precision)
 
@@ -112,15 +112,15 @@ def gradients_of(
     loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs, precision: torch.dtype = torch.float32
 ) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
     """Return the scalars of a loss and its gradients, None for parameters that it does not depend on."""
-    with lower_products(parameters[0].device, precision):
+    with matmul_precision(parameters[0].device, precision):
         loss, scalars = loss_of(*inputs)
     gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-    # A fused optimizer takes it for granted that gradients lie in memory as their parameters do.
+    # A fused optimizer requires that gradients lie in memory as their parameters do.
     in_order = tuple(None if gradient is None else gradient.contiguous() for gradient in gradients)
     return {name: value.detach() for name, value in scalars.items()}, in_order
 
 
-def _is_to_be_checked(guards: Sequence[GuardFilterEntry]) -> list[bool]:
+def _kept_guards(guards: Sequence[GuardFilterEntry]) -> list[bool]:
     """Return which conditions of compiled code to check at every call.
 
     The checks left out are two thirds of all: that functions, modules and classes are still those of their names, and
@@ -159,7 +159,7 @@ def compiled(device: torch.device, *, any_size: bool) -> Gradients:
     # A wrapper in C++ calls the products and kernels sooner than one in Python. For a GPU it would take a CUDA toolkit.
     options: dict[str, str | int | bool | Callable[..., Any]] = {
         "cpp_wrapper": device.type == "cpu",
-        "guard_filter_fn": _is_to_be_checked,
+        "guard_filter_fn": _kept_guards,
     }
     fast = torch.compile(gradients_of, dynamic=any_size, fullgraph=True, options=options)
 

@@ -1,4 +1,4 @@
-"""What a policy remembers of the observations of its history, and where that history begins.
+"""What a policy remembers of earlier observations: the last few, or the state of a GRU.
 
 The state of a memory is one vector `[*B, size]` in the tensordict. In a step it is the state after that step's
 observation. An empty memory, which has seen nothing, is zeros.
@@ -24,13 +24,11 @@ from typing_extensions import Self
 
 from hpamdp.settings import OnlyWith, Settings
 
-MemoryKind = Literal["none", "stack", "gru"]
-
 
 class StackOptions(Settings):
     """Settings of a memory of the last observations."""
 
-    memory: MemoryKind = "none"
+    memory: Literal["none", "stack"] = "none"
     """What the networks see beside the observation. `none`: nothing; `stack`: the observations before it."""
     stack_steps: Annotated[int, Field(ge=2, le=1000), OnlyWith("memory", "stack")] = 4
     """With `memory=stack`: number of observations that the networks see, the current one included.
@@ -49,7 +47,7 @@ class StackOptions(Settings):
 class MemoryOptions(StackOptions):
     """Settings of a memory."""
 
-    memory: MemoryKind = "none"
+    memory: Literal["none", "stack", "gru"] = "none"  # type: ignore[assignment]
     """What the networks see beside the observation. `none`: nothing; `stack`: the observations before it.
 
     `gru`: the state of a GRU that has seen all observations since the memory was reset.

@@ -1,7 +1,8 @@
-"""The base of bandits that may count the rewards of a session alone: those of its trips so far.
+"""The base of bandits that can learn within a session.
 
-In each session a bandit of its own begins with nothing, as in Auer, Cesa-Bianchi and Fischer 2002 with as many rounds
-as the session has trips. So nothing is learned across sessions, and exploring is part of the greedy policy.
+With `memory=session`, each session starts a new bandit, which counts only the rewards of the session's own trips, as in
+Auer, Cesa-Bianchi and Fischer 2002 with a round for each trip. Nothing is learned across sessions, so the greedy policy
+explores, too.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ class SessionBandit(Bandit):
 
     @abstractmethod
     def session_values(self, rewards: SessionRewards) -> Tensor:
-        """Return the number of each option `[*B, num_options]`, of which the choice takes the highest."""
+        """Return a value for each option, `[*B, num_options]`; the option with the highest is chosen."""
         raise NotImplementedError
 
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
@@ -102,7 +103,7 @@ class SessionBandit(Bandit):
         return torch.where(begins, 0.0, before + added)
 
     def has_updated(self) -> bool:
-        """Return whether any reward is known, or none is learned from."""
+        """Return whether any reward is known; always true with `memory=session`, which learns nothing."""
         return self.memory_key is not None or super().has_updated()
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from hpamdp.policies.base import Bonus
-from hpamdp.policies.shared.gradients import lower_products
+from hpamdp.policies.shared.gradients import matmul_precision
 from hpamdp.policies.shared.planning import Prediction, absolute_temperature, discounted_return, elite_weights
 from hpamdp.policies.shared.planning_policy import PlanningOptions
 from hpamdp.specs import PAMDPSpecs
@@ -140,7 +140,7 @@ class Planner:
             horizon = discrete.shape[2]
             for h in range(horizon):
                 before = rows
-                with lower_products(rows.device, self.precision):
+                with matmul_precision(rows.device, self.precision):
                     chosen = discrete[:, :, h].flatten(0, 1)
                     predicted = self.model(before, chosen, unit_parameters[:, :, h].flatten(0, 1))
                 if bonus is not None:
