@@ -479,7 +479,11 @@ def hierarchy() -> list[Claim]:
         Claim(RESULTS, "| people | | {people:.3f} | | {people_agreement:.1f} % |", numbers),
         Claim(RESULTS, "The mean ceiling of {seeds:word} seeds is {ceiling:.3f},", meta_critic),
         Claim(RESULTS, "that of the fixed layouts {ceiling:.3f}.", numbers),
-        Claim(RESULTS, "Over H-PPO, selectors that see the layout gain another {mean_gain:.1f}.", numbers),
+        Claim(
+            RESULTS,
+            "Over H-PPO, selectors that see the layout score {mean_gain:.1f} higher than those that do not.",
+            numbers,
+        ),
         Claim(
             page("hierarchy"),
             "the `actor`, with uniform options at first, and the `meta_critic` both end {actor_below:.2f} "
@@ -566,8 +570,8 @@ def hierarchy() -> list[Claim]:
         ),
         Claim(
             "docs/selectors/meta_critic.md",
-            "It has the highest score with default settings, {mean:.3f} on the whole task, and chooses the planner's "
-            "controller in {agreement:.0f} % of the layouts.",
+            "On boats it has the highest score with its recipe, {mean:.3f} on the whole task, and chooses the "
+            "planner's controller in {agreement:.0f} % of the layouts.",
             meta_critic,
         ),
         Claim(
@@ -632,13 +636,15 @@ def few_steps() -> list[Claim]:
         Claim(
             README,
             "With declared symmetry `low=pets` reaches the human mean after {median} presses (median of {seeds} seeds "
-            "per controller; slowest {slowest:,.0f}; {undeclared:,.0f} without;",
+            "per controller; slowest {slowest:,.0f}), without it after {undeclared:,.0f} ({undeclared_seeds} seeds, "
+            "congruent controller;",
             numbers,
         ),
         Claim(
             RESULTS,
             "With declared symmetry `low=pets` reaches the human mean score ({people:.2f}) after {median} presses "
-            "(median of {seeds} seeds per boat; slowest {slowest:,.0f}), and without it after {undeclared:,.0f}",
+            "(median of {seeds} seeds per boat; slowest {slowest:,.0f}), and without it after {undeclared:,.0f} "
+            "({undeclared_seeds} seeds, congruent boat;",
             numbers,
         ),
         Claim(

@@ -4,7 +4,7 @@ The picture is drawn from the vector that the agent would otherwise observe, so 
 the agent, which is in the middle; +y is up.
 
 - Red: the target, a disc with the radius that counts as a hit. The view spans 2.56 to each side. If the target is
-  further away, the view widens, and the disc is smaller by the same factor.
+  further than 2.24 along x or y, the view widens, and the disc is smaller by the same factor.
 - Green: the agent; with `progress` also two bars, at the top the time and at the bottom the misses.
 - Blue: the velocity, a line from the agent, 25 px for a velocity of 1.
 
