@@ -756,12 +756,12 @@ def domains() -> list[Claim]:
         Claim(
             page("domains"),
             "On each of the {all:word} domains with published scores, the highest mean among our learners ({seeds} "
-            "seeds that nobody had used before) lies above the best published mean. The learner with this mean is one "
-            "of {learners} with {fewest:word} seeds or more.",
+            "seeds that nobody had used before) lies above the best published mean. It is the best of {learners} "
+            "learners, each with at least {fewest:word} seeds.",
             numbers,
             holds=all(is_above) and all(are_fresh),
         ),
-        Claim(page("domains"), "All runs took {cpu_hours:.1f} hours of CPU time,", numbers),
+        Claim(page("domains"), "the study took {cpu_hours:.1f} hours of CPU time.", numbers),
     ]
 
 

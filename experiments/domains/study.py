@@ -233,13 +233,13 @@ def _not_clearly_lower(values: dict[str, list[float]], best: str, others: Sequen
 
 
 def cost_table(results: Rows) -> str:
-    """Return a line for each learner and domain with steps, CPU and wall time of a run, and a line for all runs."""
+    """Return a line for each learner and domain with steps, CPU and wall time of a run, and a line for all of them."""
     lines = ["| domain | learner | seeds | steps | CPU | wall |", "|---|---|---|---|---|---|"]
     for (name, low, frames), rows in groups(results, "domain", "learner", "frames").items():
         cpu_s, wall_s = (np.mean([row[column] for row in rows]) for column in ("cpu_s", "wall_s"))
         lines.append(f"| {name} | {low} | {len(rows)} | {frames:,.0f} | {cpu_s:.0f} s | {wall_s:.0f} s |")
     cpu_h, wall_h = (sum(row[column] for row in results) / 3600.0 for column in ("cpu_s", "wall_s"))
-    lines.append(f"| all runs | | {len(results)} | | {cpu_h:.1f} h | {wall_h:.1f} h |")
+    lines.append(f"| all runs above | | {len(results)} | | {cpu_h:.1f} h | {wall_h:.1f} h |")
     return "\n".join(lines)
 
 
