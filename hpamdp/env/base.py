@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 
 from hpamdp import keys
 from hpamdp.components import MAX_PAIRED, Components
+from hpamdp.devices import checked_device
 from hpamdp.env.errors import ProblemError as ProblemError  # part of what a problem may use
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium_form import GymnasiumForm, VectorForm
@@ -123,6 +124,9 @@ class PAMDPEnv(EnvBase):
         Metric("score", "Score"),
         Metric("success", "Episodes that succeed", "share"),
     )
+
+    def __init__(self, *, device: torch.device | str | None = None, **arguments: Any) -> None:
+        super().__init__(device=None if device is None else checked_device(self, device), **arguments)
 
     @classmethod
     def facts(cls, options: Settings) -> ProblemFacts | None:
