@@ -778,8 +778,8 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make_gymnasium("platform", device="gpu"), 'device="gpu": must be auto, cpu, cuda or cuda:N'),
         (lambda: hpamdp.make_gymnasium("boatdock", 2, device="cuda:9"), "device=cuda:9: this machine has "),
         (lambda: hpamdp.make_gymnasium("platform", options={}), "options: must be PlatformOptions, not dict$"),
-        (lambda: hpamdp.make_gymnasium("platform", 2, autoreset_mode="x"), "Platform-v0: 'x' is not a valid"),
-        (lambda: hpamdp.make_gymnasium("platform", 2, vectorization_mode="x"), "Invalid vectorization mode: 'x'"),
+        (lambda: hpamdp.make_gymnasium("platform", 2, autoreset_mode="x"), "Platform-v0: autoreset_mode='x': "),
+        (lambda: hpamdp.make_gymnasium("platform", 2, vectorization_mode="x"), "vectorization_mode='x': must be"),
         (lambda: gymnasium.make("hpamdp/Office-v0", num_envs=3), "num_envs=3: this is one environment; use "),
         (lambda: hpamdp.make_gymnasium("platform").reset(options=5), "reset: options must be a dict, but is a int"),
         (lambda: hpamdp.make_gymnasium("office", 2).reset(options=5), "reset: options must be a dict, but is a "),
@@ -827,6 +827,71 @@ def test_wrong_arguments_of_constructors_are_one_line(make, message):
     with pytest.raises(ValueError, match=message) as raised:
         make()
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+@pytest.mark.parametrize("name", ["platform", "lunar_lander", "CartPole-v1"])
+@pytest.mark.parametrize(
+    ("argument", "value", "allowed"),
+    [
+        ("wrappers", 3, "a list of functions or classes that wrap an environment"),
+        ("wrappers", [3], "a list of functions or classes that wrap an environment"),
+        ("max_episode_steps", "a", "a whole number of at least 1, or -1 for no limit"),
+        ("max_episode_steps", 0, "a whole number of at least 1, or -1 for no limit"),
+        ("max_episode_steps", True, "a whole number of at least 1, or -1 for no limit"),
+        ("disable_env_checker", "no", "a valid boolean"),
+        ("render_mode", 3, "a valid string"),
+        ("autoreset_mode", 3, "one of NextStep, SameStep, Disabled"),
+        ("vectorization_mode", "a", "one of async, sync, vector_entry_point"),
+        ("vector_kwargs", 3, "a valid dictionary"),
+    ],
+)
+def test_a_wrong_argument_of_gymnasium_is_refused_in_one_line_that_names_it(name, num_envs, argument, value, allowed):
+    with pytest.raises(hpamdp.ConfigError) as raised:
+        hpamdp.make_gymnasium(name, num_envs, **{argument: value})
+    assert str(raised.value).endswith(f"{name if '-' in name else ''}: {argument}={value!r}: must be {allowed}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"wrappers": [gymnasium.Wrapper]}, "wrappers: only a vector takes it; give num_envs, too$"),
+        ({"vector_kwargs": {"copy": True}}, "vector_kwargs: only a vector takes it; give num_envs, too$"),
+        ({"num_envs": 2, "wrappers": [gymnasium.Wrapper]}, "own vector takes none; use vectorization_mode='sync'$"),
+        ({"num_envs": 2, "vector_kwargs": {"copy": True}}, "own vector takes none; use vectorization_mode='sync'$"),
+        (
+            {"num_envs": 2, "vectorization_mode": "sync", "vector_kwargs": {"copi": True}},
+            "vector_kwargs: copi: no such argument; did you mean copy?",
+        ),
+        (
+            {"num_envs": 2, "vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": "x"}},
+            "autoreset_mode='x': must be one of NextStep",
+        ),
+    ],
+)
+def test_an_argument_that_does_not_go_with_the_kind_of_vector_is_refused_in_one_line(arguments, message):
+    with pytest.raises(hpamdp.ConfigError, match=message) as raised:
+        hpamdp.make_gymnasium("platform", **arguments)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["platform", "lunar_lander"])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", gymnasium.vector.AutoresetMode.DISABLED, None])
+def test_the_vector_of_every_problem_restarts_as_autoreset_mode_says(name, mode):
+    given = {} if mode is None else {"autoreset_mode": mode}
+    env = hpamdp.make_gymnasium(name, 2, max_episode_steps=np.int64(9), vectorization_mode="sync", **given)
+    expected = gymnasium.vector.AutoresetMode("SameStep" if mode is None else mode)
+    assert env.metadata["autoreset_mode"] == expected
+    env.close()
+
+
+def test_an_id_with_its_module_is_made_as_a_vector_and_its_arguments_are_named(tmp_path, monkeypatch):
+    own = "import gymnasium\ngymnasium.register('OwnPole-v0', 'gymnasium.envs.classic_control:CartPoleEnv')\n"
+    (tmp_path / "own_pole.py").write_text(own)
+    monkeypatch.syspath_prepend(tmp_path)
+    hpamdp.make_gymnasium("own_pole:OwnPole-v0", 2, max_episode_steps=5).close()
+    with pytest.raises(hpamdp.ConfigError, match=r"render_mod: no such argument; did you mean render_mode\?"):
+        hpamdp.make_gymnasium("own_pole:OwnPole-v0", 2, render_mod="rgb_array")
 
 
 FIVE_STEPS = {"name": "platform", "max_steps": 5}
