@@ -21,8 +21,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 import hpamdp
+from hpamdp import keys
+from hpamdp.env.boatdock.gymnasium_adapter import BoatDockVector
 from hpamdp.run_files import CHECKPOINT_NAME, METRICS_NAME
 
+USAGE = Path(__file__).resolve().parent.parent / "docs" / "usage.md"
 TINY = {"total_frames": 1024, "num_envs": 8, "steps_per_batch": 64, "eval.layouts": 4, "progress": False}
 OWN = {**TINY, "env.max_steps": 5, "low": "hppo"}
 
@@ -369,6 +372,31 @@ def test_an_agent_scores_alike_in_vectors_that_restart_in_the_same_and_in_the_ne
         return np.array([of_row[:4] for of_row in scores])
 
     np.testing.assert_allclose(first_scores(autoreset_mode="NextStep"), first_scores(), atol=1e-4)
+
+
+def test_the_loop_of_the_page_starts_no_episode_with_an_option_of_the_one_before(monkeypatch):
+    """The loop plays a vector that restarts in the next step. A first observation of an episode needs a decision."""
+    (code,) = re.findall(r"### Act in a vector\n.*?^```python\n(.*?)^```", USAGE.read_text(), re.MULTILINE | re.DOTALL)
+    assert "next_step=restarts_next_step" in code
+    starts, seen = [], []
+    act, step = hpamdp.Agent.act, BoatDockVector.step
+
+    def noted_act(agent, observation):
+        action = act(agent, observation)
+        seen.append(agent._last[keys.IS_DECISION].squeeze(-1).numpy().copy())
+        return action
+
+    def noted_step(vector, action):
+        was_over = vector._problem.is_over.copy()
+        result = step(vector, action)
+        starts.append(was_over)
+        return result
+
+    monkeypatch.setattr(hpamdp.Agent, "act", noted_act)
+    monkeypatch.setattr(BoatDockVector, "step", noted_step)
+    exec(code, {"hpamdp": hpamdp})
+    begins = np.array(starts[:-1])  # with the observation that follows each step
+    assert begins.sum() > 8 and np.array(seen)[1:][begins].all()
 
 
 def test_a_missing_reset_is_refused_once_an_episode_is_longer_than_the_problem_allows(boat_agent):
@@ -878,8 +906,7 @@ def test_an_argument_that_does_not_go_with_the_kind_of_vector_is_refused_in_one_
 @pytest.mark.parametrize("name", ["platform", "lunar_lander"])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", gymnasium.vector.AutoresetMode.DISABLED, None])
 def test_the_vector_of_every_problem_restarts_as_autoreset_mode_says(name, mode):
-    given = {} if mode is None else {"autoreset_mode": mode}
-    env = hpamdp.make_gymnasium(name, 2, max_episode_steps=np.int64(9), vectorization_mode="sync", **given)
+    env = hpamdp.make_gymnasium(name, 2, autoreset_mode=mode)
     expected = gymnasium.vector.AutoresetMode("SameStep" if mode is None else mode)
     assert env.metadata["autoreset_mode"] == expected
     env.close()

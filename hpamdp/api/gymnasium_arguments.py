@@ -101,6 +101,8 @@ def vector_arguments(env_id: str, given: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         SettingError: an argument does not go with the kind of the vector.
     """
+    if given.get("autoreset_mode") is None:
+        given = {name: value for name, value in given.items() if name != "autoreset_mode"}
     default = VectorizeMode.SYNC
     if _find_spec(env_id).vector_entry_point is not None:
         default = VectorizeMode.VECTOR_ENTRY_POINT
@@ -116,7 +118,7 @@ def vector_arguments(env_id: str, given: Mapping[str, Any]) -> dict[str, Any]:
     for name in of_vector:
         if name not in names:
             raise SettingError(f"vector_kwargs: {name}: {no_such('argument', name, names)}")
-    if given.get("autoreset_mode") is not None:
+    if "autoreset_mode" in given:
         of_vector = {**of_vector, "autoreset_mode": given["autoreset_mode"]}
     of_vector = checked_arguments(of_vector)
     others = {name: value for name, value in given.items() if name != "autoreset_mode"}
