@@ -399,6 +399,31 @@ def test_the_loop_of_the_page_starts_no_episode_with_an_option_of_the_one_before
     assert begins.sum() > 8 and np.array(seen)[1:][begins].all()
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("Actor", "EpsilonGreedy", "Exp3", "LinThompson", "LinUCB", "MetaCritic", "OptionCritic", "Thompson", "UCB"),
+        *("DLPA", "PETS"),
+    ],
+)
+def test_a_step_without_a_batch_dimension_is_refused_in_one_line(name, boat_agent):
+    level = getattr(hpamdp, name)(boat_agent.specs)
+    policy = level if isinstance(level, hpamdp.Selector) else level.policy
+    step = {"observation": torch.zeros(boat_agent.specs.observation_dim), "is_decision": torch.ones(1, dtype=bool)}
+    with pytest.raises(
+        ValueError, match=r"the step has batch size \[\], but must have \[N\]; for one environment"
+    ) as raised:
+        policy(TensorDict(step))
+    assert "\n" not in str(raised.value)
+    policy(TensorDict(step).unsqueeze(0))
+
+
+def test_a_step_without_is_decision_is_refused_in_one_line(boat_agent):
+    step = TensorDict({"observation": torch.zeros(2, boat_agent.specs.observation_dim)}, [2])
+    with pytest.raises(ValueError, match=r"^UCB: the step has no is_decision, bool \[N, 1\]$"):
+        hpamdp.UCB(boat_agent.specs)(step)
+
+
 def test_a_missing_reset_is_refused_once_an_episode_is_longer_than_the_problem_allows(boat_agent):
     boat_agent.reset()
     observation, _ = hpamdp.make_gymnasium("boatdock").reset(seed=0)
