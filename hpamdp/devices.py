@@ -28,7 +28,7 @@ def checked_device(owner: object, device: Any) -> torch.device:
     except RuntimeError as error:
         raise SettingError(f"{given}: must be cpu, cuda, cuda:N or another device of torch") from error
     try:
-        torch.empty(0, device=named)
+        torch.empty(0, device=named, dtype=torch.float32)
     except (RuntimeError, AssertionError) as error:  # torch without CUDA raises the latter
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         there = f"has CUDA devices 0 to {count - 1}" if count else "has no usable CUDA device"
