@@ -21,8 +21,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 import hpamdp
+from hpamdp import keys
+from hpamdp.env.boatdock.gymnasium_adapter import BoatDockVector
 from hpamdp.run_files import CHECKPOINT_NAME, METRICS_NAME
 
+USAGE = Path(__file__).resolve().parent.parent / "docs" / "usage.md"
 TINY = {"total_frames": 1024, "num_envs": 8, "steps_per_batch": 64, "eval.layouts": 4, "progress": False}
 OWN = {**TINY, "env.max_steps": 5, "low": "hppo"}
 
@@ -369,6 +372,56 @@ def test_an_agent_scores_alike_in_vectors_that_restart_in_the_same_and_in_the_ne
         return np.array([of_row[:4] for of_row in scores])
 
     np.testing.assert_allclose(first_scores(autoreset_mode="NextStep"), first_scores(), atol=1e-4)
+
+
+def test_the_loop_of_the_page_starts_no_episode_with_an_option_of_the_one_before(monkeypatch):
+    """The loop plays a vector that restarts in the next step. A first observation of an episode needs a decision."""
+    (code,) = re.findall(r"### Act in a vector\n.*?^```python\n(.*?)^```", USAGE.read_text(), re.MULTILINE | re.DOTALL)
+    assert "next_step=restarts_next_step" in code
+    starts, seen = [], []
+    act, step = hpamdp.Agent.act, BoatDockVector.step
+
+    def noted_act(agent, observation):
+        action = act(agent, observation)
+        seen.append(agent._last[keys.IS_DECISION].squeeze(-1).numpy().copy())
+        return action
+
+    def noted_step(vector, action):
+        was_over = vector._problem.is_over.copy()
+        result = step(vector, action)
+        starts.append(was_over)
+        return result
+
+    monkeypatch.setattr(hpamdp.Agent, "act", noted_act)
+    monkeypatch.setattr(BoatDockVector, "step", noted_step)
+    exec(code, {"hpamdp": hpamdp})
+    begins = np.array(starts[:-1])  # with the observation that follows each step
+    assert begins.sum() > 8 and np.array(seen)[1:][begins].all()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("Actor", "EpsilonGreedy", "Exp3", "LinThompson", "LinUCB", "MetaCritic", "OptionCritic", "Thompson", "UCB"),
+        *("DLPA", "PETS"),
+    ],
+)
+def test_a_step_without_a_batch_dimension_is_refused_in_one_line(name, boat_agent):
+    level = getattr(hpamdp, name)(boat_agent.specs)
+    policy = level if isinstance(level, hpamdp.Selector) else level.policy
+    step = {"observation": torch.zeros(boat_agent.specs.observation_dim), "is_decision": torch.ones(1, dtype=bool)}
+    with pytest.raises(
+        ValueError, match=r"the step has batch size \[\], but must have \[N\]; for one environment"
+    ) as raised:
+        policy(TensorDict(step))
+    assert "\n" not in str(raised.value)
+    policy(TensorDict(step).unsqueeze(0))
+
+
+def test_a_step_without_is_decision_is_refused_in_one_line(boat_agent):
+    step = TensorDict({"observation": torch.zeros(2, boat_agent.specs.observation_dim)}, [2])
+    with pytest.raises(ValueError, match=r"^UCB: the step has no is_decision, bool \[N, 1\]$"):
+        hpamdp.UCB(boat_agent.specs)(step)
 
 
 def test_a_missing_reset_is_refused_once_an_episode_is_longer_than_the_problem_allows(boat_agent):
@@ -778,8 +831,8 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make_gymnasium("platform", device="gpu"), 'device="gpu": must be auto, cpu, cuda or cuda:N'),
         (lambda: hpamdp.make_gymnasium("boatdock", 2, device="cuda:9"), "device=cuda:9: this machine has "),
         (lambda: hpamdp.make_gymnasium("platform", options={}), "options: must be PlatformOptions, not dict$"),
-        (lambda: hpamdp.make_gymnasium("platform", 2, autoreset_mode="x"), "Platform-v0: 'x' is not a valid"),
-        (lambda: hpamdp.make_gymnasium("platform", 2, vectorization_mode="x"), "Invalid vectorization mode: 'x'"),
+        (lambda: hpamdp.make_gymnasium("platform", 2, autoreset_mode="x"), "Platform-v0: autoreset_mode='x': "),
+        (lambda: hpamdp.make_gymnasium("platform", 2, vectorization_mode="x"), "vectorization_mode='x': must be"),
         (lambda: gymnasium.make("hpamdp/Office-v0", num_envs=3), "num_envs=3: this is one environment; use "),
         (lambda: hpamdp.make_gymnasium("platform").reset(options=5), "reset: options must be a dict, but is a int"),
         (lambda: hpamdp.make_gymnasium("office", 2).reset(options=5), "reset: options must be a dict, but is a "),
@@ -827,6 +880,70 @@ def test_wrong_arguments_of_constructors_are_one_line(make, message):
     with pytest.raises(ValueError, match=message) as raised:
         make()
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+@pytest.mark.parametrize("name", ["platform", "lunar_lander", "CartPole-v1"])
+@pytest.mark.parametrize(
+    ("argument", "value", "allowed"),
+    [
+        ("wrappers", 3, "a list of functions or classes that wrap an environment"),
+        ("wrappers", [3], "a list of functions or classes that wrap an environment"),
+        ("max_episode_steps", "a", "a whole number of at least 1, or -1 for no limit"),
+        ("max_episode_steps", 0, "a whole number of at least 1, or -1 for no limit"),
+        ("max_episode_steps", True, "a whole number of at least 1, or -1 for no limit"),
+        ("disable_env_checker", "no", "a valid boolean"),
+        ("render_mode", 3, "a valid string"),
+        ("autoreset_mode", 3, "one of NextStep, SameStep, Disabled"),
+        ("vectorization_mode", "a", "one of async, sync, vector_entry_point"),
+        ("vector_kwargs", 3, "a valid dictionary"),
+    ],
+)
+def test_a_wrong_argument_of_gymnasium_is_refused_in_one_line_that_names_it(name, num_envs, argument, value, allowed):
+    with pytest.raises(hpamdp.ConfigError) as raised:
+        hpamdp.make_gymnasium(name, num_envs, **{argument: value})
+    assert str(raised.value).endswith(f"{name if '-' in name else ''}: {argument}={value!r}: must be {allowed}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"wrappers": [gymnasium.Wrapper]}, "wrappers: only a vector takes it; give num_envs, too$"),
+        ({"vector_kwargs": {"copy": True}}, "vector_kwargs: only a vector takes it; give num_envs, too$"),
+        ({"num_envs": 2, "wrappers": [gymnasium.Wrapper]}, "own vector takes none; use vectorization_mode='sync'$"),
+        ({"num_envs": 2, "vector_kwargs": {"copy": True}}, "own vector takes none; use vectorization_mode='sync'$"),
+        (
+            {"num_envs": 2, "vectorization_mode": "sync", "vector_kwargs": {"copi": True}},
+            "vector_kwargs: copi: no such argument; did you mean copy?",
+        ),
+        (
+            {"num_envs": 2, "vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": "x"}},
+            "autoreset_mode='x': must be one of NextStep",
+        ),
+    ],
+)
+def test_an_argument_that_does_not_go_with_the_kind_of_vector_is_refused_in_one_line(arguments, message):
+    with pytest.raises(hpamdp.ConfigError, match=message) as raised:
+        hpamdp.make_gymnasium("platform", **arguments)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["platform", "lunar_lander"])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", gymnasium.vector.AutoresetMode.DISABLED, None])
+def test_the_vector_of_every_problem_restarts_as_autoreset_mode_says(name, mode):
+    env = hpamdp.make_gymnasium(name, 2, autoreset_mode=mode)
+    expected = gymnasium.vector.AutoresetMode("SameStep" if mode is None else mode)
+    assert env.metadata["autoreset_mode"] == expected
+    env.close()
+
+
+def test_an_id_with_its_module_is_made_as_a_vector_and_its_arguments_are_named(tmp_path, monkeypatch):
+    own = "import gymnasium\ngymnasium.register('OwnPole-v0', 'gymnasium.envs.classic_control:CartPoleEnv')\n"
+    (tmp_path / "own_pole.py").write_text(own)
+    monkeypatch.syspath_prepend(tmp_path)
+    hpamdp.make_gymnasium("own_pole:OwnPole-v0", 2, max_episode_steps=5).close()
+    with pytest.raises(hpamdp.ConfigError, match=r"render_mod: no such argument; did you mean render_mode\?"):
+        hpamdp.make_gymnasium("own_pole:OwnPole-v0", 2, render_mod="rgb_array")
 
 
 FIVE_STEPS = {"name": "platform", "max_steps": 5}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
+import re
 import warnings
 from functools import partial
 
@@ -14,13 +16,15 @@ import torch
 from batched_players import action, is_unchanged, play, random_player, restart, snapshot
 from conftest import global_generators_unmoved
 from gymnasium.utils.env_checker import check_env
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
+import hpamdp
 from hpamdp import keys
 from hpamdp.env import counter_rng, point_pictures
 from hpamdp.env.batched_adapter import BatchedEnvAdapter
 from hpamdp.env.batched_env import GOING_ON, BatchedEnv
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.circuit.environment import CircuitEnv
 from hpamdp.env.circuit.registration import CIRCUIT_IDS
@@ -33,6 +37,7 @@ from hpamdp.env.office.environment import OfficeEnv
 from hpamdp.env.pinball.environment import PinballEnv
 from hpamdp.env.platform import rendering
 from hpamdp.env.platform.environment import PlatformEnv
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 POINTS = [CatchPointEnv, HardMoveEnv, MovingEnv, SlidingEnv]
@@ -436,6 +441,90 @@ def test_a_closed_environment_needs_a_reset_before_the_next_step():
     envs.close()
     with pytest.raises(gymnasium.error.ResetNeeded):
         envs.step(envs.action_space.sample())
+
+
+@pytest.mark.parametrize("name", ["platform", "boatdock", "office"])
+def test_a_closed_batch_needs_a_reset_before_the_next_step(name):
+    env = hpamdp.make(name, 2)
+    action = env.rand_action(env.reset())
+    env.close()
+    with pytest.raises(RuntimeError, match="no episode has begun; call reset before step"):
+        env.step(action.clone())
+    env.reset()
+    env.step(action.clone())
+
+
+@pytest.mark.parametrize("num_workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_closed_copies_of_a_gymnasium_environment_neither_step_nor_begin(num_workers):
+    env = GymnasiumEnv(2, id="CartPole-v1", num_workers=num_workers)
+    action = env.rand_action(env.reset())
+    env.close()
+    with pytest.raises(RuntimeError, match="CartPole-v1 is closed; make a new one"):
+        env.step(action)
+    with pytest.raises(RuntimeError, match="CartPole-v1 is closed; make a new one"):
+        env.reset()
+
+
+MAKERS = {
+    "PlatformEnv": PlatformEnv,
+    "BoatDockEnv": BoatDockEnv,
+    "GymnasiumEnv": partial(GymnasiumEnv, id="CartPole-v1"),
+}
+
+
+@pytest.mark.parametrize("make", MAKERS)
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ({"seed": 1.5}, "seed=1.5: must be a whole number of at least 0"),
+        ({"seed": -1}, "seed=-1: must be a whole number of at least 0"),
+        ({"seed": True}, "seed=True: must be a whole number of at least 0"),
+        ({"num_envs": 1.5}, "num_envs=1.5: must be a whole number of at least 1"),
+        ({"num_envs": 0}, "num_envs=0: must be a whole number of at least 1"),
+        ({"num_envs": "2"}, "num_envs='2': must be a whole number of at least 1"),
+        ({"num_envs": True}, "num_envs=True: must be a whole number of at least 1"),
+        ({"first_env": -1}, "first_env=-1: must be a whole number of at least 0"),
+        ({"first_env": 1.5}, "first_env=1.5: must be a whole number of at least 0"),
+    ],
+)
+def test_a_wrong_number_given_to_a_constructor_is_refused_in_one_line(make, arguments, line):
+    with pytest.raises(SettingError) as raised:
+        MAKERS[make](**arguments)
+    assert str(raised.value) == f"{make}: {line}"
+
+
+@pytest.mark.parametrize("make", MAKERS)
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [(TensorDict(), "[]"), (TensorDict(batch_size=[3]), "[3]"), ({}, "a dict"), (np.zeros(2), "a ndarray")],
+    ids=["none", "other", "dict", "array"],
+)
+def test_a_step_and_a_reset_without_the_batch_size_are_refused_in_one_line(make, given, shown):
+    env = MAKERS[make](2)
+    line = f"{re.escape(env.title)}: must get a TensorDict with batch size \\[2\\], but got {re.escape(shown)}$"
+    for take in (env.step, env.reset):
+        with pytest.raises(ValueError, match=line):
+            take(given)
+
+
+@pytest.mark.parametrize("seed", [3, 2**31 + 3, 2**32 - 1])
+@pytest.mark.parametrize("way", ["constructor", "set_seed", "seed_evaluation", "reset", "reset of a vector", "copies"])
+def test_a_seed_beyond_32_bits_has_episodes_of_its_own_however_it_is_given(way, seed):
+    def begun(number):
+        if way == "constructor":
+            return SlidingEnv(4, seed=number).reset()[keys.OBSERVATION]
+        if way in ("set_seed", "seed_evaluation"):
+            env = SlidingEnv(4)
+            getattr(env, way)(number)
+            return env.reset()[keys.OBSERVATION]
+        if way == "copies":
+            return GymnasiumEnv(4, id="CartPole-v1", seed=number).reset()[keys.OBSERVATION]
+        env = hpamdp.make_gymnasium("sliding", None if way == "reset" else 4)
+        return torch.from_numpy(env.reset(seed=number)[0])
+
+    drawn = [begun(number) for number in (seed, seed + 2**32, seed + 2**33, seed + 2**64)]
+    assert all((one != other).any() for one, other in itertools.combinations(drawn, 2))
+    torch.testing.assert_close(drawn[1], begun(seed + 2**32), rtol=0.0, atol=0.0)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from gymnasium_players import step
 from PIL import Image
 from tensordict import TensorDict
 
+from hpamdp.analysis import film
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 
@@ -78,8 +79,8 @@ def test_something_else_than_a_picture_is_told_in_one_line():
 def test_watch_films_an_environment_of_ones_own(command, tmp_path):
     code, out, err = command("watch", "low=random", *WORDS, "env.kwargs={render_mode:rgb_array}", "--episodes", "2")
     assert code == 0 and not err and "2 episodes" in out
-    with Image.open(tmp_path / "episodes.gif") as film:
-        assert film.n_frames > 4 and film.size == (640, 320)
+    with Image.open(tmp_path / "episodes.gif") as image:
+        assert image.n_frames > 4 and image.size == (640, 320)
     code, _, err = command("watch", "low=random", *WORDS)
     assert code == 2 and err.count("\n") == 1 and "has no pictures to film" in err
 
@@ -89,3 +90,11 @@ def test_a_run_with_running_statistics_evaluates_and_leaves_a_film(command, tmp_
     code, _, err = command(*words, "num_envs=2", "steps_per_batch=4", "total_frames=16", "eval.layouts=2")
     assert code == 0, err
     assert list(tmp_path.rglob("episodes.gif"))
+
+
+def test_watch_refuses_more_pictures_than_it_may_keep_and_names_the_settings(command, monkeypatch, tmp_path):
+    monkeypatch.setattr(film, "MOST_KEPT", 1 << 20)
+    code, _, err = command("watch", "low=random", *WORDS, "env.kwargs={render_mode:rgb_array}", "--episodes", "3")
+    assert code == 2 and err.count("\n") == 1
+    assert "--episodes 3: the pictures of 3 steps take more than 1 MiB of memory" in err
+    assert "use fewer --episodes or a smaller env.max_steps" in err and not (tmp_path / "episodes.gif").exists()

@@ -132,3 +132,11 @@ def test_watch_names_the_setting_with_which_it_is_drawn_before_it_plays(command,
     monkeypatch.setattr(LunarLanderEnv, "step", lambda *_: pytest.fail("it was played"))
     code, _, err = command("watch", "env=lunar_lander", "high=none", "low=random", "--episodes", "2")
     assert code == 2 and err == "env=lunar_lander: has no pictures to film; use env.render=true\n"
+
+
+def test_a_closed_lander_needs_a_reset_before_the_next_step():
+    env = HybridLunarLander()
+    env.reset(seed=0)
+    env.close()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(env.action_space.sample())

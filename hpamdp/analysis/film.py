@@ -24,7 +24,7 @@ MOST_FPS = 240
 MOST_PIXELS = 8192  # from edge to edge of a film
 _PAUSE = 1.5  # seconds for which the last picture stays
 _GIF_COLOURS = 128
-_MOST_KEPT = 1 << 31  # bytes of the pictures of a GIF
+MOST_KEPT = 1 << 31  # bytes of pictures that wait in memory
 
 Track = Sequence[Mapping[str, Tensor]]
 
@@ -35,6 +35,10 @@ class FilmError(ValueError):
 
 class NoPictureError(FilmError):
     """Raised if there is no picture to write."""
+
+
+class TooLargeError(FilmError):
+    """Raised if the pictures take too much memory. The caller knows the settings that make them smaller."""
 
 
 def grid(num_episodes: int) -> tuple[int, int]:
@@ -93,7 +97,8 @@ def write(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 
     Raises:
         NoPictureError: there is no picture.
-        FilmError: the path has another suffix, imageio is missing, or the pictures of a GIF take too much memory.
+        TooLargeError: the pictures of a GIF take too much memory.
+        FilmError: the path has another suffix, or imageio is missing.
     """
     remaining = iter(pictures)
     first = next(remaining, None)
@@ -117,14 +122,13 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:
     for picture in pictures:
         shape = picture.shape
         compressed = zlib.compress(picture.tobytes(), 1)
-        if not kept or compressed != kept[-1]:
-            num_bytes += len(compressed) + shape[0] * shape[1]  # Pillow keeps a byte for each pixel
+        if kept and compressed == kept[-1]:
+            kept.append(kept[-1])  # the same object, which takes no further memory
+            continue
         kept.append(compressed)
-        if num_bytes > _MOST_KEPT:
-            raise FilmError(
-                f"{path}: the pictures of the GIF take more than {_MOST_KEPT >> 20} MiB; lower the size, the pictures "
-                "a second or the number of episodes, or write an .mp4"
-            )
+        num_bytes += len(compressed) + shape[0] * shape[1]  # Pillow keeps a byte for each pixel
+        if num_bytes > MOST_KEPT:
+            raise TooLargeError(f"{path}: the pictures of the GIF take more than {MOST_KEPT >> 20} MiB of memory")
 
     def restored(number: int) -> np.ndarray:
         return np.frombuffer(zlib.decompress(kept[number]), np.uint8).reshape(shape)

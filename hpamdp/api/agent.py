@@ -100,7 +100,8 @@ class Agent:
         """Return the action for an observation, in Gymnasium's form.
 
         The agent holds its option, and what its policy remembers, until `reset` says that a new episode begins. Agents
-        that hold nothing need no `reset`.
+        that hold nothing need no `reset`. In vectors that restart in the next step, the default of
+        `gymnasium.make_vec`, say `reset(done, next_step=True)`. The agent cannot notice a wrong mode.
 
         Args:
             observation: one observation, or a batch, in which every leaf has a leading `[N]`.
@@ -140,6 +141,9 @@ class Agent:
     def reset(self, starts: Any = None, *, next_step: bool = False) -> None:
         """Begin new episodes with the next `act`.
 
+        No observation shows how a vector restarts its episodes, so `next_step` must say so. Otherwise an option or a
+        memory is taken into the next episode.
+
         Args:
             starts: which of a batch begin, bool `[N]`, such as `terminated | truncated`. If None, all of them.
             next_step: whether the vector restarts them in its next step, as in the mode `NextStep`, the default of
@@ -149,6 +153,15 @@ class Agent:
 
         Raises:
             ValueError: the mask does not fit the batch.
+
+        Example:
+            >>> import gymnasium, hpamdp
+            >>> agent = hpamdp.load("hppo_platform")
+            >>> vector = gymnasium.make_vec("hpamdp/Platform-v0", num_envs=4)
+            >>> observations, infos = vector.reset(seed=0)
+            >>> agent.reset()
+            >>> observations, _, terminated, truncated, infos = vector.step(agent.act(observations))
+            >>> agent.reset(terminated | truncated, next_step=True)
         """
         flag("reset: next_step", next_step)
         if starts is None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import torch
 from gymnasium.vector import VectorEnv
 from torchrl.envs import EnvBase
 
@@ -96,6 +97,7 @@ def settings_words(settings: Mapping[str, Any]) -> list[str]:
     for name, value in settings.items():
         if name.partition(".")[0] == "hydra":
             raise ConfigError(f"{name}: Hydra runs no job here; give folder or config_dirs instead")
+        value = str(value) if isinstance(value, torch.device) else value
         words += _group_words(name, value) if name in GROUPS else [word(name, value)]
     return words
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
 import re
-from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
-from gymnasium import VectorizeMode
-from gymnasium.envs.registration import load_env_creator
-from gymnasium.vector import AutoresetMode
 from pydantic import NonNegativeInt, PositiveInt
 
 from hpamdp.api.arguments import plain_name, problem_arguments, without_env_prefix
+from hpamdp.api.gymnasium_arguments import check_single, checked_arguments, names_of_arguments, vector_arguments
 from hpamdp.complaints import close_names, no_such
 from hpamdp.config.components import SUPPLIED_ARGUMENTS
 from hpamdp.config.compose import read
@@ -111,26 +107,16 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
     if "device" in sizes:
         own["device"] = usable_device(checked.device)
     try:
+        own = checked_arguments(own)
         if num_envs is None:
+            check_single(env_id, own)
             return gymnasium.make(env_id, **own)
-        if env_id.startswith("hpamdp/"):
-            own = _restarting_in_same_step(env_id, own)
-        return gymnasium.make_vec(env_id, num_envs=checked.num_envs, **own)
+        return gymnasium.make_vec(env_id, num_envs=checked.num_envs, **vector_arguments(env_id, own))
     except (gymnasium.error.Error, ValueError, ModuleNotFoundError, TypeError) as error:
         complaint = _complaint(error, env_id)
         if complaint is None:
             raise
         raise ConfigError(f"{env_id}: {complaint}") from error
-
-
-def _restarting_in_same_step(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a vector that restarts in the same step, unless they say otherwise."""
-    modes = (None, VectorizeMode.VECTOR_ENTRY_POINT, VectorizeMode.VECTOR_ENTRY_POINT.value)
-    is_own = settings.get("vectorization_mode") in modes and gymnasium.spec(env_id).vector_entry_point is not None
-    if is_own:
-        return {"autoreset_mode": AutoresetMode.SAME_STEP, **settings}
-    of_vector = {"autoreset_mode": AutoresetMode.SAME_STEP, **(settings.get("vector_kwargs") or {})}
-    return {**settings, "vector_kwargs": of_vector}
 
 
 def _complaint(error: Exception, env_id: str) -> str | None:
@@ -142,18 +128,9 @@ def _complaint(error: Exception, env_id: str) -> str | None:
         unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
         if unknown is None:
             return None
-        return f"{unknown.group(1)}: {no_such('argument', unknown.group(1), _arguments_of(env_id))}"
+        return f"{unknown.group(1)}: {no_such('argument', unknown.group(1), names_of_arguments(env_id))}"
     is_refusal = isinstance(error, gymnasium.error.Error | SettingError | ModuleNotFoundError)
     return first_line(error) if is_refusal or env_id.startswith("hpamdp/") else None
-
-
-def _arguments_of(env_id: str) -> list[str]:
-    """Return the names of the arguments that the constructor behind an id takes."""
-    creator: Any = gymnasium.spec(env_id).entry_point
-    if isinstance(creator, str):
-        creator = load_env_creator(creator)
-    parameters = [] if creator is None else inspect.signature(creator).parameters.values()
-    return [each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
 
 
 def _id_of(name: str) -> str:

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
-from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
+from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeInt, PositiveInt
 
 from hpamdp.complaints import as_json
 from hpamdp.config.components import CALLBACK, GROUPS, TARGET, Component, PlaceOf, check_base_class, component, file_of
@@ -27,13 +27,13 @@ RESUME_AUTO = "auto"
 Seed = Annotated[int, Field(ge=0, lt=2**32)]  # NumPy takes no larger ones
 
 
-def _check_device(name: str) -> str:
-    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,2})?", name):
+def _check_device(name: Any) -> Any:
+    if not isinstance(name, str) or not re.fullmatch(r"auto|cpu|cuda(:\d{1,2})?", name):
         raise ValueError("must be auto, cpu, cuda or cuda:N")
     return name
 
 
-Device = Annotated[str, AfterValidator(_check_device)]
+Device = Annotated[str, BeforeValidator(_check_device)]
 
 
 def usable_device(name: str) -> torch.device:

@@ -15,6 +15,7 @@ from hpamdp.data.row_checks import (
     check_returns,
     check_transitions,
 )
+from hpamdp.devices import checked_device
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -45,6 +46,7 @@ class Demonstrations:
         decisions: `[1, K]` or None.
 
     Raises:
+        SettingError: this machine does not have the device.
         DataError: a key is missing, the episodes are out of order, or a value is wrong; the message names its row.
     """
 
@@ -52,8 +54,9 @@ class Demonstrations:
     decisions: TensorDict | None
 
     def __init__(
-        self, transitions: TensorDict, device: torch.device | None = None, *, decisions: TensorDict | None = None
+        self, transitions: TensorDict, device: torch.device | str | None = None, *, decisions: TensorDict | None = None
     ) -> None:
+        device = None if device is None else checked_device(self, device)
         check_transitions(transitions)
         with_sums = with_option_sums(transitions)
         check_returns(with_sums)

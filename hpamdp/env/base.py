@@ -16,12 +16,14 @@ from torchrl.envs import EnvBase
 
 from hpamdp import keys
 from hpamdp.components import MAX_PAIRED, Components
+from hpamdp.devices import checked_device
 from hpamdp.env.errors import ProblemError as ProblemError  # part of what a problem may use
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium_form import GymnasiumForm, VectorForm
 from hpamdp.geometry import PlaneGeometry, Symmetries
 from hpamdp.messages import as_code
 from hpamdp.observation_entries import ObservationEntry
+from hpamdp.settings import SettingError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -123,6 +125,20 @@ class PAMDPEnv(EnvBase):
         Metric("score", "Score"),
         Metric("success", "Episodes that succeed", "share"),
     )
+
+    def __init__(self, *, device: torch.device | str | None = None, **arguments: Any) -> None:
+        super().__init__(device=None if device is None else checked_device(self, device), **arguments)
+
+    @classmethod
+    def checked_numbers(cls, num_envs: int, seed: int, first_env: int) -> tuple[int, int, int]:
+        """Return these arguments of a constructor.
+
+        Raises:
+            SettingError: one is no whole number, or too small.
+        """
+        given = {"num_envs": (num_envs, 1), "seed": (seed, 0), "first_env": (first_env, 0)}
+        numbers = [checked_number(f"{cls.__name__}: {name}", *value) for name, value in given.items()]
+        return numbers[0], numbers[1], numbers[2]
 
     @classmethod
     def facts(cls, options: Settings) -> ProblemFacts | None:
@@ -264,7 +280,7 @@ class PAMDPEnv(EnvBase):
         Raises:
             ValueError: the seed is no whole number of at least 0.
         """
-        return super().set_seed(None if seed is None else _checked_seed(seed), static_seed)
+        return super().set_seed(None if seed is None else checked_number("seed", seed), static_seed)
 
     def seed_evaluation(self, seed: int) -> None:
         """Seed the episodes and the noise of an evaluation, which should differ from those of training with any seed.
@@ -272,7 +288,7 @@ class PAMDPEnv(EnvBase):
         The default is `set_seed` with another seed. With random numbers from `counter_rng`, draw them from the streams
         EVALUATION and EVALUATION_NOISE until the next `set_seed`.
         """
-        self.set_seed(_checked_seed(seed) ^ _EVALUATION)
+        self.set_seed(checked_number("seed", seed) ^ _EVALUATION)
 
     def warn_if_seed_is_ignored(self, seed: int) -> None:
         """Warn if episodes with the same seed begin differently, which only somebody else's environment can do."""
@@ -453,6 +469,14 @@ class PAMDPEnv(EnvBase):
         tensordict.pop("_reset", None)
         return tensordict.update(tensordict_reset)
 
+    def _assert_tensordict_shape(self, tensordict: Any) -> None:  # TorchRL's name
+        is_tensordict = isinstance(tensordict, TensorDictBase)
+        if is_tensordict and tensordict.batch_size == self.batch_size:
+            return
+        given = list(tensordict.batch_size) if is_tensordict else f"a {type(tensordict).__name__}"
+        size = list(self.batch_size)
+        raise ValueError(f"{self.title}: must get a TensorDict with batch size {size}, but got {given}")
+
     def check_action(self, tensordict: TensorDictBase) -> None:
         """Check the action leaves' shapes and types; their values are the subclass's to check.
 
@@ -520,7 +544,12 @@ def checked_option_names(given: object) -> tuple[str, ...]:
     return tuple(given)
 
 
-def _checked_seed(seed: Any) -> int:
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"seed={as_code(seed)}: must be a whole number of at least 0")
-    return int(seed)
+def checked_number(name: str, value: Any, least: int = 0) -> int:
+    """Return an argument that is a whole number of at least `least`.
+
+    Raises:
+        SettingError: it is something else.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise SettingError(f"{name}={as_code(value)}: must be a whole number of at least {least}")
+    return int(value)

@@ -149,8 +149,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         **settings: Any,
     ) -> None:
         self.options = self.Options.of(options, settings)
-        if num_envs < 1:
-            raise SettingError(f"{type(self).__name__}: num_envs={num_envs}, but must be at least 1")
+        num_envs, seed, first_env = self.checked_numbers(num_envs, seed, first_env)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         facts = self.facts(self.options)
@@ -400,6 +399,11 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         self.set_seed(seed)
         self._streams = (counter_rng.EVALUATION, counter_rng.EVALUATION_NOISE)
         self._begin()
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """End the episodes; the environments must be reset before they are used again."""
+        self._has_episodes = False
+        super().close(raise_if_closed=raise_if_closed)
 
     def _make_specs(self, low: Tensor, high: Tensor) -> None:
         n, device = self.num_envs, self.device

@@ -22,6 +22,17 @@ from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 
+def check_batch(owner: object, step: TensorDictBase) -> None:
+    """Refuse a step without a batch dimension.
+
+    Raises:
+        ValueError: its batch size is [].
+    """
+    if not step.batch_dims:
+        name = type(owner).__name__
+        raise ValueError(f"{name}: the step has batch size [], but must have [N]; for one environment use [1]")
+
+
 class ActionFeature(Enum):
     """What an action may have beyond one choice with bounded parameters, and its name in refusals."""
 
@@ -457,8 +468,15 @@ class Selector(Level, TensorDictModuleBase):
 
         If the selector decides where options end, what `td` held before is kept under `held`: the choice whose option
         has ended here. Where an episode begins, nothing was held, and the entries mean nothing.
+
+        Raises:
+            ValueError: the step has no batch dimension, or no `is_decision`.
         """
-        is_decision = td.get(keys.IS_DECISION).squeeze(-1)
+        check_batch(self, td)
+        is_decision = td.get(keys.IS_DECISION, None)
+        if is_decision is None:
+            raise ValueError(f"{type(self).__name__}: the step has no {keys.IS_DECISION}, bool [N, 1]")
+        is_decision = is_decision.squeeze(-1)
         held = {key: td.get(key, None) for key in self.out_keys}
         nothing_held = any(value is None for value in held.values())
         if self.decides_ends and not nothing_held:

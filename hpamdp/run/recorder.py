@@ -17,6 +17,7 @@ from hpamdp import keys
 from hpamdp.analysis import figures, film
 from hpamdp.config.schema import Config
 from hpamdp.files import replacing
+from hpamdp.messages import warn
 from hpamdp.metrics_file import FRAMES, STOPPED, WALL_SECONDS, Metrics, MetricsFile, MetricsInMemory, rows_up_to
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
@@ -223,6 +224,9 @@ class Recorder:
         try:
             film.write(path, pictures, _FPS)
         except film.NoPictureError:
+            return None
+        except film.TooLargeError as error:
+            warn(f"{error}; film=false leaves the film out")
             return None
         return path
 

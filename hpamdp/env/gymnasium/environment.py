@@ -159,8 +159,7 @@ class GymnasiumEnv(PAMDPEnv):
             given = "neither is" if options.id is None else "both are"
             raise SettingError(f"set env.id=Name-v0 or env.entry_point=package.module:name; {given} set")
         register()
-        if num_envs < 1:
-            raise SettingError(f"GymnasiumEnv: {num_envs=}, but must be at least 1")
+        num_envs, seed, first_env = self.checked_numbers(num_envs, seed, first_env)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.first_env = first_env
@@ -355,10 +354,14 @@ class GymnasiumEnv(PAMDPEnv):
             yield from itertools.repeat(picture, max(shown[1] - shown[0], int(is_last)))
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close the copies."""
+        """Close the copies, which can neither step nor begin an episode afterwards."""
         if not self.is_closed:
             self._copies.close()
         super().close(raise_if_closed=raise_if_closed)
+
+    def _check_open(self) -> None:
+        if self.is_closed:
+            raise RuntimeError(f"{self._name} is closed; make a new one")
 
     def _names_of_options(self) -> tuple[str, ...]:
         num_options = self._copies.options.num_options
@@ -406,6 +409,7 @@ class GymnasiumEnv(PAMDPEnv):
         ]
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        self._check_open()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         given = None if tensordict is None else tensordict.get(_SEED, None)
         if given is not None and (given.shape != (self.num_envs,) or given.is_floating_point() or (given < 0).any()):
@@ -423,6 +427,7 @@ class GymnasiumEnv(PAMDPEnv):
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._check_open()
         chosen, values = self._read_action(tensordict)
         option = self._read_option(tensordict)
         results, is_stepped = self._copies.results, ~self._is_over

@@ -94,6 +94,11 @@ class HybridLunarLander(gymnasium.Wrapper):
         self._is_over = terminated or truncated
         return observation, float(reward), terminated, truncated, {**info, "is_success": self._return >= SOLVED}
 
+    def close(self) -> None:
+        """End the episode; the environment must be reset before it is used again."""
+        self._is_over = True
+        super().close()
+
 
 def continuous_action(action: dict[str, Any]) -> np.ndarray:
     """Return the action of LunarLanderContinuous-v3 that fires the same engines equally strongly, float32 `[2]`.

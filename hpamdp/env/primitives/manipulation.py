@@ -182,7 +182,8 @@ class Manipulation(gymnasium.Env):
         return None if self.render_mode is None else np.ascontiguousarray(self._arm.render()[::-1])
 
     def close(self) -> None:
-        """Close the simulator."""
+        """End the episode and close the simulator."""
+        self._ticks_left = 0
         self._arm.close()
 
 

@@ -23,6 +23,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from hpamdp import keys
+from hpamdp.devices import checked_device
 from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.exploration.base import Explored
 from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
@@ -135,7 +136,7 @@ class Counts(RewardsNewStates):
         super().__init__(learner, options.weight)
         self.options = options
         self.table = VisitTable(learner.specs.observation_dim, self.options)
-        self.to(device)
+        self.to(checked_device(self, device))
         learner.take_bonus(Bonus(self.options.weight, self.table.bonus))
 
     def acting_policy(self, learner: Learner) -> TensorDictModuleBase:

@@ -26,6 +26,7 @@ from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.devices import checked_device
 from hpamdp.policies.base import Learner
 from hpamdp.policies.exploration.base import Exploration, Explored
 from hpamdp.policies.masks import random_discrete
@@ -185,7 +186,7 @@ class Held(Exploration):
         self.policy = HeldPolicy(learner.policy, learner.specs, self.options)
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         learner.is_overruled = True
-        self.to(device)
+        self.to(checked_device(self, device))
 
     def acting_policy(self, learner: Learner) -> TensorDictModuleBase:
         """Return the policy that holds actions."""

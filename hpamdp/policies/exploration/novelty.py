@@ -36,6 +36,7 @@ from torchrl.envs.transforms import RunningMeanStd
 from torchrl.objectives import RNDLoss
 
 from hpamdp import keys
+from hpamdp.devices import checked_device
 from hpamdp.messages import warn
 from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.encoders.base import JoinedEncoders
@@ -150,7 +151,7 @@ class Novelty(RewardsNewStates):
         self.network: RandomDistillation | None = None
         if not self._asks_ensemble(learner):
             self.network = RandomDistillation(learner.specs, self.options)
-            self.to(device)
+            self.to(checked_device(self, device))
             predictor = self.network.loss.predictor_network.parameters()
             self.optimizer = torch.optim.Adam(predictor, lr=self.options.lr, fused=True)
         learner.take_bonus(Bonus(self.options.weight, None if self.network is None else self.network.bonus))

@@ -31,6 +31,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.devices import checked_device
 from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.policies.shared.networks import mlp
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised
@@ -83,7 +84,7 @@ class Actor(OnPolicy, RemembersDecisions):
         num_inputs = self.perception.specs.observation_dim
         self.logits = mlp(num_inputs, self.options.hidden_dims, specs.num_options)
         self.critic = mlp(num_inputs, self.options.hidden_dims, 1)
-        self.to(device)
+        self.to(checked_device(self, device))
         self.optimizer = torch.optim.Adam(self.parameters(), lr=self.options.lr, eps=1e-5, fused=True)
 
     @torch.no_grad()

@@ -27,6 +27,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.devices import checked_device
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
@@ -76,6 +77,7 @@ class MetaCritic(RemembersDecisions):
         **settings: Any,
     ) -> None:
         super().__init__(specs)
+        device = checked_device(self, device)
         self.options: MetaCriticOptions = MetaCriticOptions.of(options, settings)
         self.gamma = self.options.gamma
         self.set_perception(self.options)

@@ -32,6 +32,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.devices import checked_device
 from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.networks import mlp, polyak_update
@@ -87,6 +88,7 @@ class OptionCritic(RemembersDecisions):
         **settings: Any,
     ) -> None:
         super().__init__(specs)
+        device = checked_device(self, device)
         self.options: OptionCriticOptions = OptionCriticOptions.of(options, settings)
         self.gamma = self.options.gamma
         self.set_perception(self.options)

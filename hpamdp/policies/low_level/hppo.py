@@ -37,6 +37,7 @@ from torch.nn import functional as F
 from typing_extensions import Self
 
 from hpamdp import keys
+from hpamdp.devices import checked_device
 from hpamdp.policies.base import ActionFeature, Learner, step_discounts
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.credit import Credit, CreditCritic
@@ -206,7 +207,7 @@ class HPPO(OnPolicy, Learner):
             self.actor, specs, writes_raw=True, samples_when_greedy=samples, perception=self.perception
         )
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
-        self.to(device)
+        self.to(checked_device(self, device))
         self.optimizer = torch.optim.Adam(self.parameters(), lr=options.lr, eps=1e-5, fused=True)
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:

@@ -43,6 +43,7 @@ from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.devices import checked_device
 from hpamdp.policies.base import ActionFeature, Learner, known_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
@@ -469,7 +470,7 @@ class QPAMDP(Learner):
         self.register_buffer("window_return", torch.zeros((), dtype=torch.float32))
         for name in ("frames", "phase", "window_episodes", "windows", "windows_since_best", "updates"):
             self.register_buffer(name, torch.zeros((), dtype=torch.long))
-        self.to(device)
+        self.to(checked_device(self, device))
 
     def steps_to_update(self) -> dict[str, int]:
         """Return the length of the warm-up and one step after it."""

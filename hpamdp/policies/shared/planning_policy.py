@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.policies.base import check_batch
 from hpamdp.policies.masks import random_discrete
 from hpamdp.policies.shared.end_values import EndValueOptions
 from hpamdp.policies.shared.perception import Perception
@@ -70,7 +71,12 @@ class PlanningPolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write the discrete action `[*B]`, the parameters `[*B, num_parameters]` and the memory's state, if any."""
+        """Write the discrete action `[*B]`, the parameters `[*B, num_parameters]` and the memory's state, if any.
+
+        Raises:
+            ValueError: the step has no batch dimension.
+        """
+        check_batch(self, td)
         self.perception.see(td)
         observation = td.get(keys.OBSERVATION).flatten(0, -2)
         num, device = len(observation), observation.device

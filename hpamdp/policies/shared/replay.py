@@ -16,6 +16,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from typing_extensions import Self
 
 from hpamdp import keys
+from hpamdp.devices import checked_device
 from hpamdp.observation_entries import packed, unpacked
 from hpamdp.policies.base import Bonus, Learner, step_discounts
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
@@ -116,11 +117,12 @@ class ReplayLearner(Learner):
 
     def __init__(self, specs: PAMDPSpecs, device: torch.device | str, options: ReplayOptions) -> None:
         super().__init__(specs)
+        device = checked_device(self, device)
         self.options = options
         self.stores_own_parameters = self.stores_own_parameters and specs.components.is_single
         remembers = isinstance(options, MemoryOptions) and options.memory != "none"
         augment = specs.symmetries is not None and not remembers if options.augment == "auto" else options.augment
-        self.symmetry = RandomSymmetry(specs, torch.device(device)) if augment else None
+        self.symmetry = RandomSymmetry(specs, device) if augment else None
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
