@@ -272,7 +272,7 @@ def table1() -> list[Claim]:
         Claim(
             "docs/learners/hppo.md",
             "Of the paper's learners it has the highest scores with one controller, within {hppo_below:.2f} of the "
-            "ceiling,",
+            "ceiling.",
             numbers,
             holds=all(score <= scores["hppo", boat] for (_, boat), score in scores.items()),
         ),
@@ -825,14 +825,15 @@ def learners_on_domains() -> list[Claim]:
         ),
         Claim(
             "docs/learners/paddpg.md",
-            "PATD3 (`twin=true`) scores {patd3_hard_move[0]:.2f} on Hard Move 4 (published {patd3_hard_move[1]:.2f}) "
-            "and {patd3_catch[0]:.2f} on Catch Point (published {patd3_catch[1]:.2f}).",
+            "PATD3 (`twin=true`) succeeds in {patd3_hard_move[0]:.2f} of the episodes of Hard Move 4 (published "
+            "{patd3_hard_move[1]:.2f}) and {patd3_catch[0]:.2f} of those of Catch Point (published "
+            "{patd3_catch[1]:.2f}).",
             numbers,
         ),
         Claim(
             "docs/learners/paddpg.md",
-            "On Platform PATD3 returns {patd3_mean:.3f} in the mean of {patd3_seeds:word} new seeds, and "
-            "{patd3_worst:.3f} with the worst; PADDPG, with one critic, {paddpg:.3f}.",
+            "On Platform PATD3 has a mean return of {patd3_mean:.3f} over {patd3_seeds:word} new seeds; the worst seed "
+            "returns {patd3_worst:.3f}. PADDPG, with one critic, has {paddpg:.3f}.",
             numbers,
         ),
         Claim(

@@ -57,7 +57,8 @@ def test_a_run_of_ones_own_classes_is_resumed_by_their_names(tmp_path):
 def test_the_page_extend_quotes_the_examples_and_their_commands_to_the_letter():
     page = (FOLDER.parent.parent / "docs/extend.md").read_text()
     sources = [file.read_text() for file in FOLDER.glob("*.py")]
-    quotes = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    sources += [file.read_text() for file in FOLDER.glob("conf/*/*.yaml")]
+    quotes = re.findall(r"^```(?:python|yaml)\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert len(quotes) > 5
     assert not [quote for quote in quotes if not any(quote.rstrip() in source for source in sources)]
     assert re.findall(r"^python (-m hpamdp\.cli .*)$", page, re.MULTILINE) == COMMANDS
