@@ -45,8 +45,8 @@ for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, sig
 # Two processes on two cores fight over threads otherwise.
 torch.set_num_threads(1)
 
-# With Python's own thresholds, garbage collections take a twelfth of the time of the tests; they find little.
-gc.set_threshold(10_000, 50)
+# With Python's own thresholds, full collections take a twentieth of the time of the tests, and find little.
+gc.set_threshold(700, 10, 200)
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 CROSSING = Path(__file__).resolve().parent.parent / "examples" / "crossing"
