@@ -33,7 +33,7 @@ test coverage slow-tests ray-launcher lowest: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/.installed-dev
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
-	$(PYTHON) -m mypy hpamdp
+	$(PYTHON) tests/compile_kernels.py & $(PYTHON) -m mypy hpamdp && wait $$!
 	$(PYTHON) -m pytest -n auto --dist worksteal $(ARGS)
 
 # What takes longer, one after another: coverage, launchers, Ray, the wheel, the oldest dependencies.

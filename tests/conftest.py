@@ -45,6 +45,9 @@ for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, sig
 # Two processes on two cores fight over threads otherwise.
 torch.set_num_threads(1)
 
+# With Python's own thresholds, full collections take a twentieth of the time of the tests, and find little.
+gc.set_threshold(700, 10, 200)
+
 CONF = Path(__file__).resolve().parent.parent / "conf"
 CROSSING = Path(__file__).resolve().parent.parent / "examples" / "crossing"
 sys.path.insert(0, str(CROSSING))
@@ -89,6 +92,8 @@ def yaml_files_read_once() -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ConfigRepository, "load_config", _read_once(ConfigRepository.load_config))
+        # Each composition copies a repository, to give the copy other sources. It need not copy the sources themselves.
+        patch.setattr(ConfigRepository, "__deepcopy__", lambda repo, memo: copy.copy(repo), raising=False)
         patch.setattr(defaults_list, "_create_defaults_list", _listed_once(defaults_list._create_defaults_list))
         patch.setattr(defaults_list, "_create_interpolation_map", _if_needed(defaults_list._create_interpolation_map))
         merge = ConfigLoaderImpl._compose_config_from_defaults_list
@@ -156,7 +161,9 @@ def _merged_once(merge):
         places, stored = _places_of(repo)
         given = (places, stored, repr(defaults))
         if given not in merged:
-            config = merge(loader, defaults, copy.deepcopy(repo))  # which it changes
+            own = copy.copy(repo)
+            own.cache = pickle.loads(pickle.dumps(repo.cache))  # the merge changes what it holds
+            config = merge(loader, defaults, own)
             if not _OWN_PLACES.issuperset(places):
                 return config
             merged[given] = pickle.dumps(config)

@@ -209,7 +209,7 @@ def test_a_collection_goes_on_where_another_one_stood(workers, tmp_path):
     torch.testing.assert_close(batch["observation"][:, 0], expected["observation"][:, 0])
 
 
-def test_batches_ahead_are_made_by_the_policy_from_before_the_last_update(tmp_path):
+def test_batches_ahead_are_made_by_the_policy_from_before_the_last_update(quick_workers, tmp_path):
     words = ["high=uniform", "collector=multi", "collector.num_workers=1", "collector.ahead=true"]
     parts, collection = make(tmp_path, *words)
     with closing(collection):

@@ -176,7 +176,7 @@ def test_wandb_finds_a_key_in_netrc_and_goes_offline_when_nobody_answers(tmp_pat
     (tmp_path / "netrc").write_text(f"machine 127.0.0.1:9 login user password {'0' * 40}\n")
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
     monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
-    monkeypatch.setattr("hpamdp.run.loggers._WANDB_START", 2.0)
+    monkeypatch.setattr("hpamdp.run.loggers._WANDB_START", 0.5)
     logger = wandb_logger(tmp_path, "auto")
     assert logger.is_offline
     (warning,) = capsys.readouterr().err.splitlines()

@@ -308,7 +308,7 @@ def test_an_oversized_episode_is_refused_before_it_is_read(server):
 
 
 def test_a_body_that_is_shorter_than_it_says_is_refused_and_a_silent_client_keeps_nobody_waiting(tmp_path):
-    with serving(tmp_path / "a.jsonl", patience=0.5) as server:
+    with serving(tmp_path / "a.jsonl", patience=0.2) as server:
         head = f"POST /episodes HTTP/1.1\r\nHost: localhost:{server.server_port}\r\nContent-Type: application/json\r\n"
         assert " 400 " in raw(server, f"{head}Content-Length: 500\r\n\r\n{{}}".encode())
         silent = [socket.create_connection(("127.0.0.1", server.server_port)) for _ in range(20)]
@@ -317,6 +317,15 @@ def test_a_body_that_is_shorter_than_it_says_is_refused_and_a_silent_client_keep
         for connection in silent:
             connection.close()
         assert send(server, EPISODES[1])[0] == 201
+
+
+def test_a_class_of_browsers_connects_at_once(tmp_path):
+    page = BoatPage(seed=0)
+    with PageServer(("127.0.0.1", 0), page, {}, EpisodeFile(tmp_path / "a.jsonl", page)) as server:
+        # The server accepts none of them yet. A connection beyond the queue would time out.
+        waiting = [socket.create_connection(("127.0.0.1", server.server_port), timeout=0.5) for _ in range(100)]
+        for connection in waiting:
+            connection.close()
 
 
 @pytest.mark.parametrize(

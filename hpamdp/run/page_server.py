@@ -208,6 +208,7 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
     allow_reuse_address = True
+    request_queue_size = 128  # with the usual 5, browsers that come at the same time wait for seconds
 
     def __init__(
         self, address: tuple[str, int], page: PlayPage, data: Mapping[str, Any], episodes: EpisodeFile
