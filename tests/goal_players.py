@@ -95,7 +95,7 @@ def look_ahead_player(num_samples: int = 6) -> Player:
     seeds = itertools.count(1000)
 
     def values(env: GoalEnv) -> Tensor:
-        """Return the share of goals after each first action and the best shot that follows it, `[N, A]`."""
+        """Return the fraction of goals after each first action and the best shot that follows it, `[N, A]`."""
         outcome, model = tried(env, first_actions(env), next(seeds))
         value = (outcome == rules.GOAL).float().flatten()
         playing = (outcome.flatten() == rules.PLAYING).nonzero().squeeze(-1)

@@ -299,7 +299,7 @@ def _draw_domain(axes: Axes, name: str, curves: Rows, published: Rows) -> None:
     if what == "score":
         axes.set_ylabel("mean return, greedy")
     else:
-        axes.set_ylabel("share of successes, greedy")
+        axes.set_ylabel("fraction of successes, greedy")
         axes.set_ylim(-0.02, 1.02)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.spines[["top", "right"]].set_visible(False)

@@ -32,7 +32,7 @@ LEARNERS = ("hppo", "pdqn")
 # A selector over options that last four steps is a kind of exploration, too; on Crossing every row has one.
 OPTIONS = "options"
 KINDS = ("none", "held", "counts", "novelty", OPTIONS)
-# The share of greedy episodes that succeed, from which on a problem counts as solved.
+# The fraction of greedy episodes that succeed, from which on a problem counts as solved.
 SOLVED = 0.9
 
 

@@ -42,7 +42,7 @@ class Metric:
     Attributes:
         name: in the summary, and with the prefix `eval/` in `metrics.csv`.
         title: what people read.
-        kind: a `number`, a `share` of the episodes (shown in percent), or a `count` (two digits).
+        kind: a `number`, a `share`, that is a fraction of the episodes (shown in percent), or a `count` (two digits).
     """
 
     name: str
@@ -308,7 +308,7 @@ class PAMDPEnv(EnvBase):
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return results of episodes, `[M]` each, from the leaves `result_keys` of their last steps.
 
-        Comparisons of agents use `score`, if there is one, instead of the return. `success` is bool, or a share.
+        Comparisons of agents use `score`, if there is one, instead of the return. `success` is bool, or a fraction.
         """
         return {}
 

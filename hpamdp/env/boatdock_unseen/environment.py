@@ -55,7 +55,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
 
     Entries beside it: `trip_ended` bool `[N, 1]`, whether a trip ended with the last press; `session_score` float32
     `[N, 1]`, the sum of the scores of the trips that have ended, divided by `trips`; `session_success` `[N, 1]`, the
-    share of the session's trips that have ended at the dock.
+    fraction of the session's trips that have ended at the dock.
 
     For the constructor's arguments and errors see `BatchedEnv`.
     """
@@ -289,7 +289,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         return {"optimum": torch.stack([planner.best_scores(layout, boats, shortest) for layout in layouts], -1)}
 
     def final_infos(self, rows: StateArrays) -> dict[str, np.ndarray]:
-        """Return `score` and `success`, the share of trips that docked, of sessions `[N]`."""
+        """Return `score` and `success`, the fraction of trips that docked, of sessions `[N]`."""
         trips = np.float32(self.options.trips)
         return {"score": rows.floats[kernel.TOTAL_SCORE] / trips, "success": rows.integers[kernel.DOCKED] / trips}
 

@@ -53,8 +53,8 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     """Catch the target in `num_envs` planes at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 move, 1 catch; `("action", "parameters")` float32 `[N, 1]`:
-    the direction of a move in [-1, 1], a share of half a turn, clockwise from +y. A move always has full force. Outside
-    its bounds a direction is clipped, NaN and infinity are refused; a catch has no parameter.
+    the direction of a move in [-1, 1], a fraction of half a turn, clockwise from +y. A move always has full force.
+    Outside its bounds a direction is clipped, NaN and infinity are refused; a catch has no parameter.
 
     The reward is minus the squared distance after each step, plus 20 for a catch within 0.2 of the target, which ends
     the episode. A catch elsewhere is a miss.
@@ -180,7 +180,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         return rules.scripted_action(state)
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return the figures of the hand-written player, and the share of starts from which the target is in reach."""
+        """Return figures of the hand-written player, and the fraction of starts from which the target is in reach."""
         ceiling = {"ceiling": {"success": _CEILING[self.max_steps]}} if self.max_steps in _CEILING else {}
         is_published = (self.max_steps, self.options.catches, self.options.late_end) == (
             25,

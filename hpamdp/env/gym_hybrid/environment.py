@@ -122,8 +122,8 @@ class MovingEnv(_VehicleEnv):
     """Drive to the target and stop there, in `num_envs` fields at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 accelerate, 1 turn, 2 brake; `("action", "parameters")`
-    float32 `[N, 2]`: the acceleration in [0, 1] and the turn in [-1, 1], a share of a right angle. Outside its bounds a
-    parameter is clipped, NaN and infinity are refused; braking has none.
+    float32 `[N, 2]`: the acceleration in [0, 1] and the turn in [-1, 1], a fraction of a right angle. Outside its
+    bounds a parameter is clipped, NaN and infinity are refused; braking has none.
 
     The reward is the way made towards the target, less 0.001 a step, plus 1 for stopping within 0.1 of it. Who leaves
     the field or runs out of time gets -1 instead. An episode terminates at rest in the target and outside the field.

@@ -141,7 +141,7 @@ class HardMoveEnv(PointEnv[HardMoveState]):
         return self._script(state)
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return the success of the hand-written player, and the share of starts from which the target is in reach."""
+        """Return the hand-written player's success, and the fraction of starts from which the target is in reach."""
         if self.max_steps not in _CEILING:
             return {}
         scripted = {"scripted": {"success": _SCRIPTED[self.options.n]}} if self.max_steps == 30 else {}
