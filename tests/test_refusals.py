@@ -232,6 +232,13 @@ def saved(tmp_path_factory):
             "env.nose: no such setting of PlatformEnv; did you mean noise? It has ",
         ),
         ("env.noise=-1", "env.noise=-1: must be greater than or equal to 0"),
+        ("seed=5", "seed=5: the run in "),
+        (
+            "env.noise=0",
+            "has env.noise=0.5; leave it out when you resume, or start a run with low.checkpoint=",
+        ),
+        ("env.max_steps=3", "has env.max_steps=200; leave it out"),
+        ("env=goal", "env=goal: the run in "),
         ("data=human", "data=human: low=hppo learns from its own steps only"),
         ("total_frames=16", "total_frames=16: the run that is continued has 32 already; set more, or leave it out"),
     ],
@@ -239,6 +246,19 @@ def saved(tmp_path_factory):
 def test_errors_of_a_resumed_run_name_its_own_parts(word, line, saved, command):
     code, _, err = command(f"resume={saved}", word)
     assert code == 2 and err.count("\n") == 1 and line in err
+
+
+def test_a_resumed_run_may_repeat_its_problem_and_seed_and_change_its_evaluations(saved, command):
+    words = [
+        "env=platform",
+        "env.noise=0.5",
+        "seed=0",
+        "eval.seed=3",
+        "eval.layouts=3",
+        "total_frames=64",
+        "film=false",
+    ]
+    assert command(f"resume={saved}", *words, "hydra.run.dir=repeated")[0] == 0
 
 
 def test_an_agent_is_told_when_its_options_are_others(tmp_path, capsys):
@@ -440,8 +460,8 @@ def test_settings_that_count_with_another_one_name_a_setting_and_its_values(grou
 
 
 def test_a_resumed_run_keeps_the_saved_options_of_the_choices_that_it_does_not_change(saved, command, tmp_path):
-    for number, words in enumerate((["env.max_steps=50"], ["env=platform", "low=hppo"])):
+    for number, words in enumerate((["eval.layouts=3"], ["env=platform", "low=hppo"])):
         assert command(f"resume={saved}", f"hydra.run.dir={number}", *words)[0] == 0
         config = OmegaConf.load(tmp_path / f"{number}/config.yaml")
         assert config.env.noise == 0.5 and config.choices.low == "hppo"
-        assert config.env.max_steps == (50 if number == 0 else 200)
+        assert config.env.max_steps == 200 and (config.eval.layouts == 3) == (number == 0)

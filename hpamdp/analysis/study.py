@@ -24,7 +24,15 @@ from hpamdp.files import replacing
 from hpamdp.messages import file_and_reason, first_line, one_line, warn
 from hpamdp.metrics_file import read_rows
 from hpamdp.renamed import with_new_names
-from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_NAME, saved_config, saved_summary
+from hpamdp.run_files import (
+    CONFIG_NAME,
+    ENV_WITHOUT_INFLUENCE,
+    SUMMARY_NAME,
+    TENSORBOARD_NAME,
+    WANDB_NAME,
+    saved_config,
+    saved_summary,
+)
 
 Rows = list[dict[str, Any]]
 T = TypeVar("T")
@@ -35,8 +43,6 @@ FEWEST_SEEDS = 3  # seeds that a cell needs for a place in a table
 # runs informed settings.
 FIRST_PROTOCOL_SEED = 100
 PLAN_NAME = "cells.csv"  # beside a file of runs: the seeds that the protocol plans for each cell of a table
-# Settings of problems that change no result, or only its rounding.
-_WITHOUT_INFLUENCE = ("compile_rules", "compile_physics", "num_workers", "render", "recording")
 _MOST_FOLDERS = 100_000  # a link may lead to the whole disk
 
 
@@ -177,7 +183,7 @@ def _fault_in_problem(run: Run, settings: Mapping[str, Collection[Any] | None]) 
         return "config.yaml has no settings of the problem"
     own = _own_settings(name, str(run.summary.get("low")))
     for setting, value in with_new_names("env", saved, own).items():
-        if setting in _WITHOUT_INFLUENCE or setting not in own:
+        if setting in ENV_WITHOUT_INFLUENCE or setting not in own:
             continue
         allowed = settings.get(f"{name}.{setting}", (own[setting],))
         if allowed is not None and value not in [*allowed]:
