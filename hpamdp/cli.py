@@ -299,6 +299,7 @@ def _refuse_early(cfg: DictConfig) -> None:
     problem = compatibility.facts_of(config)
     if problem is not None:
         config = compatibility.with_selector(config, problem, job_overrides())
+        compatibility.check_effects_on(problem, config, job_overrides())
     compatibility.check(config)
 
 

@@ -30,6 +30,8 @@ FILM_NAME = "episodes.gif"
 ERROR_NAME = "error.txt"
 # The largest config or summary that is read.
 MAX_TEXT_BYTES = 1 << 24
+# Settings of problems that change no result, or only its rounding.
+ENV_WITHOUT_INFLUENCE = ("compile_rules", "compile_physics", "num_workers", "render", "recording")
 # Settings that change neither the training nor the score.
 _BOOKKEEPING = (
     "resume",

@@ -999,6 +999,41 @@ def test_settings_change_those_that_a_built_problem_brings_along():
     assert hpamdp.make({"name": built, "max_steps": 7}).max_steps == 7
 
 
+def test_a_built_problem_brings_its_options_and_its_number_of_environments_along():
+    built = hpamdp.make("platform", num_envs=8, grouping="default", max_steps=7)
+    again = hpamdp.make(built)
+    assert (again.num_envs, again.max_steps) == (8, 7)
+    assert again.option_names == built.option_names and again.option_actions == built.option_actions
+    assert hpamdp.make(built, num_envs=2).num_envs == 2
+    assert hpamdp.make(built, grouping={"all": [0, 1, 2]}).option_names == ("all",)
+    assert hpamdp.make(hpamdp.make("platform", num_envs=2)).option_names == ()
+    short = {"low": "random", "total_frames": 32, "eval.layouts": 2, "progress": False}
+    agent = hpamdp.train(built, **short)
+    assert agent._env.option_names == built.option_names
+    assert agent.evaluate(built, episodes=2)["steps"] > 0.0
+    for other in (built, {"name": "platform", "grouping": "default"}):
+        with pytest.raises(hpamdp.ConfigError, match=r"^env\.grouping=.*: a trained agent keeps the options"):
+            hpamdp.load("hppo_platform").evaluate(other, episodes=2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [
+        ({"save_best": True}, "save_best=true: writes files, so give the run a folder"),
+        ({"overwrite": True}, "overwrite=True: has no effect without a folder; give folder, or leave it out"),
+        ({"trust": True}, "trust=True: has no effect without a saved run; give resume, or leave it out"),
+        (
+            {"callbacks": [hpamdp.Patience(evaluations=1)], "eval.every": 0},
+            "callbacks: Patience needs evaluations during training; set eval.every above 0",
+        ),
+    ],
+)
+def test_training_refuses_what_has_no_effect_without_a_folder_a_saved_run_or_evaluations(settings, line):
+    with pytest.raises(hpamdp.ConfigError) as error:
+        hpamdp.train("platform", low="random", total_frames=32, progress=False, **settings)
+    assert str(error.value) == line
+
+
 def test_training_has_as_many_environments_as_a_built_problem_unless_told_otherwise():
     built = hpamdp.make("platform", num_envs=3)
     short = {"low": "random", "steps_per_batch": 2, "total_frames": 12, "progress": False, "eval.layouts": 4}

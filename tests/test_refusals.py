@@ -9,6 +9,7 @@ import yaml
 from conftest import CONF, choices, compose_config
 from omegaconf import DictConfig, OmegaConf
 from pydantic import TypeAdapter
+from toy_environments import Toy
 
 import hpamdp
 from hpamdp import memory
@@ -18,7 +19,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.run import capacity
 from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.checkpoint import progress_of
-from hpamdp.run.compatibility import settings_without_effect
+from hpamdp.run.compatibility import check_effects_on, facts_of, settings_without_effect
 from hpamdp.run.players import load_player, split_words
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.train import run
@@ -232,6 +233,13 @@ def saved(tmp_path_factory):
             "env.nose: no such setting of PlatformEnv; did you mean noise? It has ",
         ),
         ("env.noise=-1", "env.noise=-1: must be greater than or equal to 0"),
+        ("seed=5", "seed=5: the run in "),
+        (
+            "env.noise=0",
+            "has env.noise=0.5; leave it out when you resume, or start a run with low.checkpoint=",
+        ),
+        ("env.max_steps=3", "has env.max_steps=200; leave it out"),
+        ("env=goal", "env=goal: the run in "),
         ("data=human", "data=human: low=hppo learns from its own steps only"),
         ("total_frames=16", "total_frames=16: the run that is continued has 32 already; set more, or leave it out"),
     ],
@@ -239,6 +247,19 @@ def saved(tmp_path_factory):
 def test_errors_of_a_resumed_run_name_its_own_parts(word, line, saved, command):
     code, _, err = command(f"resume={saved}", word)
     assert code == 2 and err.count("\n") == 1 and line in err
+
+
+def test_a_resumed_run_may_repeat_its_problem_and_seed_and_change_its_evaluations(saved, command):
+    words = [
+        "env=platform",
+        "env.noise=0.5",
+        "seed=0",
+        "eval.seed=3",
+        "eval.layouts=3",
+        "total_frames=64",
+        "film=false",
+    ]
+    assert command(f"resume={saved}", *words, "hydra.run.dir=repeated")[0] == 0
 
 
 def test_an_agent_is_told_when_its_options_are_others(tmp_path, capsys):
@@ -384,6 +405,12 @@ def test_the_length_of_another_mode_is_refused(mode, word):
             "low=pets exploration=novelty exploration.in_plans=disagreement exploration.lr=0.1",
             "with in_plans=auto or distillation",
         ),
+        (
+            "env=platform high=none low=pdqn low.target_smoothing=0 low.target_smoothing_clip=3",
+            "if target_smoothing is set",
+        ),
+        ("env=platform high=none low=pdqn low.epsilon_episodes=5 low.epsilon_steps=5", "with epsilon_episodes=null"),
+        ("env=platform high=none low=pdqn low.epsilon_steps=5", None),
         ("low=hppo low.memory=gru low.memory_size=8", None),
         ("low=hppo", None),
         ("env=boatdock_unseen high=none low=hppo low.memory_size=8", None),  # whose recipe has low.memory=gru
@@ -414,6 +441,54 @@ def test_a_setting_without_effect_is_found_inside_a_mapping(word, expected):
     assert settings_without_effect(read(composed(*words)), words) == expected
 
 
+BOTH_OPTIONS = "+low.per_option={run: random, jump: random}"
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ("high=none low=hppo agent.uniform_option_steps=10", "env=platform has no options to choose"),
+        ("high=uniform +env.grouping=default low=hppo agent.uniform_option_steps=10", "high=uniform chooses uniformly"),
+        ("high=none low=hppo agent.sharing=shared", "env=platform has no options to choose, and one learner"),
+        (f"high=ucb +env.grouping=default low=hppo {BOTH_OPTIONS} low.lr=0.5", "low.per_option names a learner for"),
+        ("high=none low=hppo total_frames=64 low.budget.total_frames=32", "beside total_frames=64"),
+        ("high=none low=hppo eval.every=64 low.budget.eval_every=32", "beside eval.every=64"),
+        ("mode=offline data=human env=boatdock high=human low=iql low.budget.num_envs=5", "with mode=offline"),
+    ],
+)
+def test_a_setting_that_others_leave_without_effect_is_refused_in_one_line(words, line, command):
+    given = re.findall(r"\+low\.per_option=\{.*?\}|\S+", words)
+    code, _, err = command("env=platform", *given, "film=false")
+    assert code == 2 and err.count("\n") == 1
+    assert err.startswith(f"{given[-1]}: has no effect") and line in err
+
+
+def test_python_refuses_what_has_no_effect_on_an_environment_of_others():
+    with pytest.raises(ConfigError, match=r"^agent.sharing=.*: has no effect, because env=gymnasium has no options"):
+        hpamdp.train(Toy, low="random", num_envs=4, progress=False, max_steps=9, **{"agent.sharing": "shared"})
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "high=none low=hppo agent.uniform_option_steps=0 agent.sharing=per_option",
+        "high=ucb +env.grouping=default low=hppo agent.uniform_option_steps=10 low.minibatch_size=16",
+        f"high=ucb +env.grouping=default low=hppo low.freeze=false {BOTH_OPTIONS}",
+    ],
+)
+def test_settings_with_an_effect_are_taken(words):
+    given = re.findall(r"\+low\.per_option=\{.*?\}|\S+", f"env=platform {words}")
+    config = read(composed(*given))
+    check_effects_on(facts_of(config), config, given)
+
+
+def test_a_grouping_that_leaves_actions_out_is_told(command):
+    words = ["env=platform", "high=ucb", "low=random", "+env.grouping={a: [run]}", *SMALL, "film=false"]
+    code, _, err = command(*words)
+    assert code == 0
+    assert "env.grouping: no option has hop, leap; the agent never takes them (env=platform)\n" in err
+
+
 def test_a_setting_without_effect_is_told_once_by_both_doors(command, capsys):
     words = ["env=platform", "high=none", "low=hppo", "low.minibatch_size=16", "low.memory_size=8"]
     line = "low.memory_size=8: has no effect; memory_size counts only with memory=gru"
@@ -440,8 +515,8 @@ def test_settings_that_count_with_another_one_name_a_setting_and_its_values(grou
 
 
 def test_a_resumed_run_keeps_the_saved_options_of_the_choices_that_it_does_not_change(saved, command, tmp_path):
-    for number, words in enumerate((["env.max_steps=50"], ["env=platform", "low=hppo"])):
+    for number, words in enumerate((["eval.layouts=3"], ["env=platform", "low=hppo"])):
         assert command(f"resume={saved}", f"hydra.run.dir={number}", *words)[0] == 0
         config = OmegaConf.load(tmp_path / f"{number}/config.yaml")
         assert config.env.noise == 0.5 and config.choices.low == "hppo"
-        assert config.env.max_steps == (50 if number == 0 else 200)
+        assert config.env.max_steps == 200 and (config.eval.layouts == 3) == (number == 0)

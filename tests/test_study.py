@@ -57,7 +57,7 @@ def leave_run(folder, low="hppo", seed=0, scores=(-0.9, 1.5, 2.5), high="none", 
         "ceiling": 3.4,
         "references": {"random": {"score": -0.9}},
     }
-    summary |= {"frames": 200, "wall_s": 2.04, "cpu_s": 1.0}
+    summary |= {"frames": 100 * (len(scores) - 1), "wall_s": 2.04, "cpu_s": 1.0}
     (folder / "summary.json").write_text(json.dumps(summary))
     (folder / "config.yaml").write_text(
         CONFIG.format(**{"twin": "true", "multipass": "true", "reward": "paper", "stop_score": "null"} | config)
@@ -266,7 +266,7 @@ def test_the_table_keeps_runs_that_ended_at_peoples_score_apart_from_full_length
     leave_run(tmp_path / "d", high="ucb")
     leave_run(tmp_path / "e", low="random")
     module = study("table1")
-    found = gathered([tmp_path], module.gather, **module.OF_STUDY)
+    found = gathered([tmp_path], module.gather, settings=module.OF_PROBLEM, **module.OF_STUDY)
     assert [(row["reward"], row["score"]) for row in found["results"]] == [("shaped", 3.3), ("sparse", 3.1)]
     assert len(found["curves"]) == 5
     assert [(row["frames"], row["eval/score"]) for row in found["efficiency"]] == [(0.0, 0.0), (100.0, 2.0)]
@@ -466,7 +466,8 @@ def test_a_run_of_another_study_and_a_damaged_one_are_named_and_left_out(tmp_pat
     change_summary(tmp_path / "seed", seed="a")
     (tmp_path / "config" / "config.yaml").write_text("low: {twin: true}\nenv: 4\n")
     (tmp_path / "no_config" / "config.yaml").write_text("low: {twin: true}\n")
-    results, _ = gathered([tmp_path], study("learners").gather, env=("boatdock",))
+    learners = study("learners")
+    results, _ = gathered([tmp_path], learners.gather, settings=learners.OF_PROBLEM, env=("boatdock",))
     assert [row["seed"] for row in results] == [0]
     lines = capsys.readouterr().err.splitlines()
     assert [line.removeprefix(f"{tmp_path}/") for line in lines] == [
@@ -477,6 +478,74 @@ def test_a_run_of_another_study_and_a_damaged_one_are_named_and_left_out(tmp_pat
         "other: env=platform, but runs of this study have boatdock; left out",
         "seed: seed=a: must be a whole number; left out",
     ]
+
+
+def test_runs_that_were_made_under_other_rules_are_named_and_left_out(tmp_path, capsys):
+    problem = "max_steps: 200, noise: 1.0, grouping: null"
+    for name in ("kept", "noise", "grouping", "eval", "short", "nan", "success", "cut"):
+        leave_run(tmp_path / name)
+        change_summary(tmp_path / name, env="platform")
+        (tmp_path / name / "config.yaml").write_text(f"mode: train\nlow: {{gamma: 0.9}}\nenv: {{{problem}}}\n")
+    for name, old, new in (
+        ("noise", "noise: 1.0", "noise: 0.0"),
+        ("grouping", "grouping: null", "grouping: default"),
+        ("eval", "mode: train", "mode: eval"),
+    ):
+        file = tmp_path / name / "config.yaml"
+        file.write_text(file.read_text().replace(old, new))
+    change_summary(tmp_path / "short", frames=200_704)
+    change_summary(tmp_path / "nan", score=math.nan)
+    change_summary(tmp_path / "success", success=math.inf)
+    metrics = tmp_path / "cut/metrics.csv"
+    metrics.write_text(metrics.read_text()[:-3])
+    results, _ = gathered([tmp_path], study("domains").gather, env=("platform",))
+    assert len(results) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.removeprefix(f"{tmp_path}/") for line in lines] == [
+        "cut: metrics.csv has its last evaluation at 100 frames, but the run ended at 200; left out",
+        "eval: mode=eval, but runs of this study have train; left out",
+        "grouping: env.grouping=default, but runs of this study have None; left out",
+        "nan: score=nan: must be a finite number; left out",
+        "noise: env.noise=0.0, but runs of this study have 1.0; left out",
+        "short: metrics.csv has its last evaluation at 200 frames, but the run ended at 200,704; left out",
+        "success: success=inf: must be a finite number; left out",
+    ]
+
+
+def test_a_study_states_which_settings_of_a_problem_its_runs_may_have(tmp_path, capsys):
+    for name, tiles in (("a", 0), ("b", 20), ("c", 40)):
+        leave_run(tmp_path / name)
+        change_summary(tmp_path / name, env="office")
+        (tmp_path / name / "config.yaml").write_text(f"low: {{}}\nenv: {{tiles: {tiles}}}\n")
+    read = {"env": ("office",), "settings": {"office.tiles": (20, 40)}}
+    assert [run.folder.name for run in gathered([tmp_path], list, **read)] == ["b", "c"]
+    assert capsys.readouterr().err == f"{tmp_path / 'a'}: env.tiles=0, but runs of this study have 20 or 40; left out\n"
+    assert len(gathered([tmp_path], list, settings={"office.tiles": None}, env=("office",))) == 3
+
+
+@pytest.mark.parametrize("name", ["learners", "table1", "few_steps", "robustness"])
+def test_studies_of_boats_leave_out_runs_with_another_keymap(name, tmp_path, monkeypatch, capsys):
+    module, folder = study(name), tmp_path / "runs/keymap"
+    monkeypatch.setattr(module, "HERE", tmp_path)
+    leave_run(folder)
+    config = (folder / "config.yaml").read_text()
+    noises = "slip: 0.0, motor_noise: 0.0, sensor_noise: 0.0"
+    low = "augment: auto, num_members: 5, posterior_sampling: auto, updates_per_step: 10.0, horizon: 2"
+    (folder / "config.yaml").write_text(
+        config.replace("env: {", f"env: {{keymap: 0, {noises}, ").replace("low: {", f"low: {{{low}, ")
+    )
+    with pytest.raises(SystemExit, match=r"no finished runs of this study; nothing was written"):
+        module.main([str(tmp_path / "runs")])
+    assert capsys.readouterr().err == f"{folder}: env.keymap=0, but runs of this study have 1; left out\n"
+
+
+def test_robustness_leaves_out_a_run_without_a_boat(tmp_path, monkeypatch, capsys):
+    robustness, folder = study("robustness"), tmp_path / "runs/foreign"
+    monkeypatch.setattr(robustness, "HERE", tmp_path)
+    leave_run(folder)
+    with pytest.raises(SystemExit, match=r"no finished runs of this study; nothing was written"):
+        robustness.main([str(tmp_path / "runs")])
+    assert capsys.readouterr().err == f"{folder}: has no motor_noise, as runs of this study have; left out\n"
 
 
 def test_a_run_on_another_problem_of_gymnasium_does_not_join_those_on_hybrid_shoot(tmp_path, capsys):
@@ -540,12 +609,12 @@ def test_robustness_replaces_the_rows_of_an_agent_and_refuses_it_given_twice(tmp
     of_first = [row for row in stored if all(row[column] == first[column] for column in first)]
     shutil.copy(EXPERIMENTS / "robustness" / "results.csv", tmp_path)
     monkeypatch.setattr(robustness, "HERE", tmp_path)
-    monkeypatch.setattr(robustness, "name_of", lambda run: {**first, "seed": int(first["seed"])})
+    run = (None, {**first, "seed": int(first["seed"])})
     monkeypatch.setattr(robustness, "score", lambda run, evaluations: iter([{**stored[0], "score": 99.0}]))
     with pytest.raises(SystemExit, match="two runs of"):
-        robustness.add([None, None])
+        robustness.add([run, run])
     assert len(read_csv(tmp_path / "results.csv")) == len(stored)
-    robustness.add([None])
+    robustness.add([run])
     assert len(read_csv(tmp_path / "results.csv")) == len(stored) - len(of_first) + 1
 
 

@@ -28,6 +28,12 @@ from hpamdp.messages import exit_code
 HERE = Path(__file__).resolve().parent
 RUN = ("problem", "learner", "exploration", "seed")
 PROBLEMS = ("crossing", "office", "pinball", "platform")
+# Settings of the problem that may differ from its own; those with None tell rows apart.
+OF_PROBLEM = {
+    "office.tiles": (20,),
+    "office.chooses_goal": None,
+    **{f"{problem}.grouping": (None, "default") for problem in PROBLEMS},
+}
 LEARNERS = ("hppo", "pdqn")
 # A selector over options that last four steps is a kind of exploration, too; on Crossing every row has one.
 OPTIONS = "options"
@@ -90,7 +96,9 @@ def cell(rows: Rows) -> str:
 def main(folders: Sequence[str]) -> None:
     """Add the runs in the folders, if any are given, and tabulate."""
     if folders:
-        add_to_tables(HERE, {"results": gathered(folders, gather, env=PROBLEMS, low=LEARNERS)}, RUN)
+        add_to_tables(
+            HERE, {"results": gathered(folders, gather, settings=OF_PROBLEM, env=PROBLEMS, low=LEARNERS)}, RUN
+        )
     print(table(read_csv(HERE / "results.csv")))
 
 

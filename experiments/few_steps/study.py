@@ -31,6 +31,8 @@ from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
+# Settings of the problem that may differ from its own; those with None tell rows apart.
+OF_PROBLEM = {"boatdock.controller": None, "boatdock.reward": None}
 HUMAN_BLOCKS = HERE.parent / "human" / "blocks.csv"
 BOTH_BOATS = -1  # in the column `controller` of these
 BLOCK_EPISODES = 60
@@ -211,7 +213,7 @@ def draw(curves: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        new = gathered(folders, gather, env=("boatdock",))
+        new = gathered(folders, gather, settings=OF_PROBLEM, env=("boatdock",))
         merged = {}
         for name in ("curves", "long"):
             if new[name]:

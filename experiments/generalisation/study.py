@@ -32,6 +32,11 @@ from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
+# Settings of the problem that may differ from its own; those with None tell rows apart.
+OF_PROBLEM = dict.fromkeys(
+    f"boatdock_unseen.{setting}"
+    for setting in ("trips", "boats", "family", "frame", "fleet_size", "fleet_seed", "scored_boats")
+)
 SETTINGS = (
     "family",
     "boats",
@@ -271,7 +276,8 @@ def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        add_to_tables(HERE, {"results": gathered(folders, gather, env=("boatdock_unseen",))}, RUN)
+        new = gathered(folders, gather, settings=OF_PROBLEM, modes=("train", "eval"), env=("boatdock_unseen",))
+        add_to_tables(HERE, {"results": new}, RUN)
     names = ("results", "players", "from_nothing", "transfer", "people")
     stored = [HERE / f"{name}.csv" for name in names]
     results, players, untrained, transfer, people = (read_csv(file) if file.exists() else [] for file in stored)

@@ -34,6 +34,13 @@ from hpamdp.figure_style import STYLE, draw_spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
+# Settings of the problem that may differ from its own; those with None tell rows apart.
+OF_PROBLEM = {
+    "gymnasium.entry_point": None,
+    "gymnasium.action_form": None,
+    "gymnasium.max_steps": (5,),
+    "gymnasium.kwargs": ({"hit_radius": 0.2},),
+}
 RUN = ("problem", "variant", "seed")
 SHOOT = "hybrid_shoot:HybridShootEnv"
 PROBLEMS = {"lunar_lander": "Hybrid LunarLander", "gymnasium": "Hybrid-Shoot"}
@@ -171,7 +178,7 @@ def main(arguments: list[str]) -> None:
     if arguments:
         add_to_tables(
             HERE,
-            gathered(arguments, gather, env=("gymnasium", "lunar_lander"), low=("hppo",)),
+            gathered(arguments, gather, settings=OF_PROBLEM, env=("gymnasium", "lunar_lander"), low=("hppo",)),
             RUN,
         )
     results, curves = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))

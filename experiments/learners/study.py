@@ -36,6 +36,8 @@ from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")
+# Settings of the problem that may differ from its own; those with None tell rows apart.
+OF_PROBLEM = {"boatdock.controller": None, "boatdock.reward": None}
 COLOURS = {
     **LEARNER_COLOURS,
     "pdqn as MP-DQN": LEARNER_COLOURS["mpdqn_published"],
@@ -178,7 +180,7 @@ def _draw_references(axes: Axes, results: Rows, boat: str) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        results, curves = gathered(folders, gather, env=("boatdock", "platform"), high=("none",))
+        results, curves = gathered(folders, gather, settings=OF_PROBLEM, env=("boatdock", "platform"), high=("none",))
         names = ("low", "problem", "reward", "seed")
         add_to_tables(HERE, {"results": results, "curves": curves}, names, steps="presses", sorts=False)
     stored = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))

@@ -177,7 +177,9 @@ def _draw_curve(axes: Axes, rows: Rows, label: str, colour: str, style: str) -> 
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        results, curves = gathered(folders, gather, env=("boatdock",), low=COLOURS, high=("human",))
+        results, curves = gathered(
+            folders, gather, modes=("train", "offline"), env=("boatdock",), low=COLOURS, high=("human",)
+        )
         names = ("low", "start", "data", "episodes", "seed")
         add_to_tables(HERE, {"results": results, "curves": curves}, names, sorts=False)
     results, curves = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))

@@ -204,7 +204,8 @@ def main(folders: Sequence[str]) -> None:
     """Add the runs on Goal, if folders are given, and tabulate."""
     if folders:
         of_study = {"env": ("goal", "hard_goal"), "high": SELECTORS, "frames": (STEPS,)}
-        new = gathered(folders, gather, **of_study)
+        grouped = {f"{name}.grouping": ("default",) for name in of_study["env"]}
+        new = gathered(folders, gather, settings=grouped, **of_study)
         add_to_tables(HERE, {"goal": new}, ("domain", *PAIR, "seed"))
     of_boats = (boats_table(compares_changes) for compares_changes in (False, True))
     print(*of_boats, goal_table(), *(pairs_table(name) for name in ("crossing", "rooms")), sep="\n\n")

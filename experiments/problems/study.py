@@ -37,6 +37,22 @@ from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 ENVIRONMENTS = ("circuit", "office", "pinball", "primitives", "traffic")
+# Settings of the problem that may differ from its own; those with None tell rows apart.
+OF_PROBLEM = {
+    **{f"pinball.{setting}": None for setting in ("map", "start", "training_start", "tiles", "grouping")},
+    "office.tiles": (20,),
+    "office.chooses_goal": None,
+    **{f"primitives.{setting}": None for setting in ("task", "reward", "actions", "grouping")},
+    **{f"primitives.{setting}": None for setting in ("reach", "negative_distances", "decisions")},
+    **{f"traffic.{setting}": None for setting in ("network", "demand", "strategies")},
+    **{f"circuit.{setting}": None for setting in ("task", "gate_set", "target_number", "begin")},
+    "circuit.reward": ("gain", "final"),
+    "circuit.floor": (None, 0.4),
+    "circuit.begin_episodes": (0, 80),
+    "circuit.begin_gates": (6, 8),
+    "circuit.observe_depth": (False, True),
+    "circuit.max_steps": (None, 14),
+}
 CELL = ("problem", "learner", "exploration", "frames")
 RUN = ("problem", "learner", "exploration", "seed")
 # Results of traffic lights that traffic.csv has of the agent and of the players by hand, on the same demands.
@@ -270,7 +286,7 @@ def draw(curves: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Add the runs in the folders, if any are given, then draw and tabulate."""
     if folders:
-        add_to_tables(HERE, gathered(folders, gather, env=ENVIRONMENTS), RUN, lengths_differ=True)
+        add_to_tables(HERE, gathered(folders, gather, settings=OF_PROBLEM, env=ENVIRONMENTS), RUN, lengths_differ=True)
     curves = read_csv(HERE / "curves.csv")
     draw(curves, HERE / "primitives.png")
     print(table(read_csv(HERE / "results.csv"), curves))

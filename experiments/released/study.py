@@ -113,7 +113,7 @@ def main(folders: Sequence[str]) -> None:
     if folders:
         add_to_tables(
             HERE,
-            gathered(folders, gather, env=("boatdock_released",)),
+            gathered(folders, gather, settings={"boatdock_released.controller": None}, env=("boatdock_released",)),
             ("low", "boat", "seed"),
             sorts=False,
         )

@@ -69,6 +69,11 @@ def name_of(run: Run) -> dict[str, Any]:
     }
 
 
+def with_names(runs: Sequence[Run]) -> list[tuple[Run, dict[str, Any]]]:
+    """Return each run with the columns that name its agent."""
+    return [(run, name_of(run)) for run in runs]
+
+
 def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, float | str]]:
     """Yield a row with the score of a run's agent for each noise and level.
 
@@ -97,16 +102,18 @@ def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, fl
             yield {**name, "noise": noise, "level": level, **figures}
 
 
-def add(runs: Sequence[Run]) -> None:
+def add(runs: Sequence[tuple[Run, dict[str, Any]]]) -> None:
     """Score the agents of runs, and replace each agent's rows in results.csv.
+
+    Args:
+        runs: each run with the columns that name its agent.
 
     Raises:
         SystemExit: two of the runs have the same agent.
     """
-    names = [name_of(run) for run in runs]
-    refuse_repeats(names, AGENT_COLUMNS, AGENT_COLUMNS)
+    refuse_repeats([name for _, name in runs], AGENT_COLUMNS, AGENT_COLUMNS)
     evaluations: dict[str, Evaluation] = {}
-    for run, name in zip(tqdm(runs), names, strict=True):
+    for run, name in tqdm(runs):
         new = list(score(run, evaluations))
         old = read_csv(HERE / "results.csv") if (HERE / "results.csv").exists() else []
         kept = [row for row in old if any(row[column] != name[column] for column in AGENT_COLUMNS)]
@@ -209,7 +216,8 @@ def main(folders: Sequence[str]) -> None:
     """Score, draw, tabulate."""
     if folders:
         torch.set_num_threads(1)
-        add(gathered(folders, list, env=("boatdock",)))
+        noises = {f"boatdock.{name}": None for name in ("controller", *LEVELS)}
+        add(gathered(folders, with_names, settings=noises, env=("boatdock",)))
     rows = read_csv(HERE / "results.csv")
     rows.sort(key=_order)
     draw(rows, HERE / "robustness.png")

@@ -52,6 +52,8 @@ NEAR = 1.1  # an evaluation counts for a budget that differs by no more than thi
 TABLES = ("results", "curves", "efficiency")
 CELL = ("low", "boat", "reward")
 LEARNERS = ("hppo", "pdqn", "hyar", "qpamdp", "dlpa")
+# Settings of the problem that may differ from its own; those with None tell rows apart.
+OF_PROBLEM = {"boatdock.controller": None, "boatdock.reward": None}
 OF_STUDY = {"env": ("boatdock",), "high": ("none",), "low": LEARNERS}
 HUMAN_COLOUR, INK, FAINT = "#D98200", "#2b2b2b", "#8c8c8c"
 
@@ -415,7 +417,7 @@ def human_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        new = gathered(folders, gather, **OF_STUDY)
+        new = gathered(folders, gather, settings=OF_PROBLEM, **OF_STUDY)
         add_to_tables(HERE, new, (*CELL, "seed"), steps="presses")
     tables = {name: standing_rows(HERE / f"{name}.csv") for name in TABLES}
     stored = read_csv(HERE / "results.csv")

@@ -3,21 +3,36 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
 from scipy import stats
 
+from hpamdp.config.compose import choosing, compose, plain_groups
+from hpamdp.config.errors import MissingChoiceError
 from hpamdp.files import replacing
 from hpamdp.messages import file_and_reason, first_line, one_line, warn
 from hpamdp.metrics_file import read_rows
-from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_NAME, saved_config, saved_summary
+from hpamdp.renamed import with_new_names
+from hpamdp.run_files import (
+    CONFIG_NAME,
+    ENV_WITHOUT_INFLUENCE,
+    SUMMARY_NAME,
+    TENSORBOARD_NAME,
+    WANDB_NAME,
+    saved_config,
+    saved_summary,
+)
 
 Rows = list[dict[str, Any]]
 T = TypeVar("T")
@@ -73,25 +88,41 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
     return runs
 
 
-def gathered(folders: Iterable[Path | str], gather: Callable[[Sequence[Run]], T], **of_study: Collection[Any]) -> T:
+def gathered(
+    folders: Iterable[Path | str],
+    gather: Callable[[Sequence[Run]], T],
+    *,
+    settings: Mapping[str, Collection[Any] | None] = MappingProxyType({}),
+    modes: Collection[str] = ("train",),
+    **of_study: Collection[Any],
+) -> T:
     """Return what a study's `gather` reads from its finished runs under the folders, and warn about all other runs.
+
+    A run is left out if it is damaged, belongs to another study, or was made with other settings of its problem.
 
     Args:
         folders: the folders.
         gather: reads runs.
-        of_study: what the summaries of the study's runs may have, by name, such as `env=("goal", "hard_goal")`. A run
-            of another problem, or a damaged one, is left out.
+        settings: the values that the study's runs may have instead of the problem's own, such as
+            `{"office.tiles": (20,), "hard_move.n": None}`. With None, any value.
+        modes: what the runs may have as `mode`.
+        of_study: what the summaries of the study's runs may have, by name, such as `env=("goal", "hard_goal")`.
 
     Raises:
         SystemExit: no run is left.
     """
     kept = []
     for run in finished(folders):
-        fault = _fault_in_summary(run, of_study) or _fault_in_files(run, gather)
+        fault = (
+            _fault_in_summary(run, of_study)
+            or _fault_in_mode(run, modes)
+            or _fault_in_files(run, gather)
+            or _fault_in_problem(run, settings)
+        )
         if fault is None:
             kept.append(run)
         else:
-            warn(f"{run.folder}: {fault}; left out")
+            warn(one_line(f"{run.folder}: {fault}; left out"))
     if not kept:
         raise SystemExit("the given folders have no finished runs of this study; nothing was written")
     return gather(kept)
@@ -101,18 +132,37 @@ def _fault_in_summary(run: Run, of_study: Mapping[str, Collection[Any]]) -> str 
     """Return why a run does not belong to a study, or None."""
     for name, allowed in of_study.items():
         if run.summary.get(name) not in [*allowed]:
-            return f"{name}={run.summary.get(name)}, but runs of this study have {' or '.join(map(str, allowed))}"
+            return _not_of_study(name, run.summary.get(name), allowed)
     for name in ("seed", "frames"):
         if type(run.summary.get(name)) is not int:
             return f"{name}={run.summary.get(name)}: must be a whole number"
+    for name in ("score", "success"):
+        value = run.summary.get(name)
+        if isinstance(value, float) and not math.isfinite(value):
+            return f"{name}={value}: must be a finite number"
     return None
+
+
+def _not_of_study(name: str, value: Any, allowed: Iterable[Any]) -> str:
+    return f"{name}={value}, but runs of this study have {' or '.join(map(str, allowed))}"
+
+
+def _fault_in_mode(run: Run, modes: Collection[str]) -> str | None:
+    """Return why a run's mode is not one of these, or None. A config without a mode counts as training."""
+    mode = run.config.get("mode", "train")
+    return None if mode in [*modes] else _not_of_study("mode", mode, modes)
 
 
 def _fault_in_files(run: Run, gather: Callable[[Sequence[Run]], object]) -> str | None:
     """Return why a study cannot read a run, or None."""
     try:
-        if not run.evaluations():
-            return "metrics.csv is missing or has no evaluations"
+        if run.config.get("mode") != "eval":  # which writes no metrics
+            evaluations, ended = run.evaluations(), run.summary["frames"]
+            if not evaluations:
+                return "metrics.csv is missing or has no evaluations"
+            last = evaluations[-1].get("frames", math.nan)
+            if last != ended:
+                return f"metrics.csv has its last evaluation at {last:,.0f} frames, but the run ended at {ended:,}"
         gather([run])
     except KeyError as error:
         return f"has no {error.args[0]}, as runs of this study have"
@@ -121,6 +171,36 @@ def _fault_in_files(run: Run, gather: Callable[[Sequence[Run]], object]) -> str 
     except Exception as error:  # such as a text for a number in a damaged file
         return f"cannot be read by this study: {type(error).__name__}: {first_line(error)}"
     return None
+
+
+def _fault_in_problem(run: Run, settings: Mapping[str, Collection[Any] | None]) -> str | None:
+    """Return a setting of the run's problem that differs from those of the study's runs, or None.
+
+    Only settings in the saved config are compared: earlier versions had fewer.
+    """
+    name, saved = str(run.summary["env"]), run.config.get("env")
+    if not isinstance(saved, Mapping):
+        return "config.yaml has no settings of the problem"
+    own = _own_settings(name, str(run.summary.get("low")))
+    for setting, value in with_new_names("env", saved, own).items():
+        if setting in ENV_WITHOUT_INFLUENCE or setting not in own:
+            continue
+        allowed = settings.get(f"{name}.{setting}", (own[setting],))
+        if allowed is not None and value not in [*allowed]:
+            return _not_of_study(f"env.{setting}", value, allowed)
+    return None
+
+
+@cache
+def _own_settings(env: str, low: str) -> dict[str, Any]:
+    """Return a problem's settings as its yaml file and the recipe with the learner set them.
+
+    They are empty for a problem whose yaml file is not in conf/.
+    """
+    for words in ([choosing("env", env), choosing("low", low)], [choosing("env", env)]):
+        with suppress(MissingChoiceError):
+            return plain_groups(compose(words), {}, ["env"])["env"]
+    return {}
 
 
 def run_folders(folder: Path, seen: set[str], marks: Collection[str] = (SUMMARY_NAME,)) -> Iterator[Path]:

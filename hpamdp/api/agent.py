@@ -19,6 +19,7 @@ from hpamdp import keys
 from hpamdp.acting import acting
 from hpamdp.api.arguments import flag, path_argument, problem_arguments, without_env_prefix
 from hpamdp.api.export import export_onnx
+from hpamdp.complaints import as_json
 from hpamdp.config.components import TARGET, Component, component
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
@@ -270,6 +271,12 @@ class Agent:
         words = arguments.with_words([word(f"env.{name}", value) for name, value in settings.items()])
         with composed(words) as cfg:
             other = read(cfg).with_objects(arguments.objects)
+            grouping = other.run.env.grouping
+            if grouping not in (None, self._config.run.env.grouping, self._env.grouping):
+                raise ConfigError(
+                    f"env.grouping={as_json(grouping)}: a trained agent keeps the options that it has learned with; "
+                    "give a problem without a grouping"
+                )
             own = self._config.env
             if other.env.cls is own.cls and other.env.name == own.name:
                 given = {each.partition("=")[0].removeprefix("env.") for each in words}

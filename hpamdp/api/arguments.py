@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 
 from hpamdp.complaints import no_such
 from hpamdp.config.components import GROUPS, takes_settings_model
-from hpamdp.config.compose import conf_dir
+from hpamdp.config.compose import conf_dir, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import check_given_once, choosing_class, given_twice, word
 from hpamdp.config.schema import RunConfig
@@ -56,7 +56,8 @@ class Arguments:
         """
         given = [*self.words, *others]
         check_given_once(given)
-        return [*self.copied, *given]
+        replaced = {setting_of(each) for each in given}  # Hydra would merge two mappings
+        return [*(each for each in self.copied if setting_of(each) not in replaced), *given]
 
 
 def path_argument(name: str, value: Any) -> Path:
@@ -207,12 +208,13 @@ def plain_name(name: str) -> str:
 
 
 def _words_of_built(env: PAMDPEnv) -> list[str]:
-    """Return the words for a problem like a built one."""
+    """Return the words for a problem like a built one, with its options."""
     cls = type(env)
     if not takes_settings_model(cls):
         raise ConfigError(f"env={as_code(env)}: its settings are unknown; pass the class {cls.__name__}")
     settings = [word(f"env.{name}", value) for name, value in env.options.model_dump(mode="json").items()]
-    return [choosing_class("env", cls), *settings]
+    grouping = [] if env.grouping is None else [word("env.grouping", env.grouping)]
+    return [choosing_class("env", cls), *settings, *grouping]
 
 
 def _copier(env: gymnasium.Env) -> Callable[[], gymnasium.Env]:

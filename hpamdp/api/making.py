@@ -34,12 +34,12 @@ class _Sizes(Settings):
     device: Device = "cpu"
 
 
-def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **settings: Any) -> PAMDPEnv:
+def make(name: Any, num_envs: int | None = None, *, device: Any = "cpu", seed: int = 0, **settings: Any) -> PAMDPEnv:
     """Make a problem as a batched TorchRL environment.
 
     Args:
         name: a choice of `env` on the command line, such as `platform`, a Gymnasium id, or what else `train` takes.
-        num_envs: number of environments in the batch.
+        num_envs: number of environments in the batch. If None, that of a built environment, else 1.
         device: of the tensors.
         seed: of the episodes.
         settings: the problem's settings, such as `max_steps=50` or, as for `train`, `**{"env.max_steps": 50}`.
@@ -55,8 +55,10 @@ def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **
         torch.Size([4, 3, 1])
     """
     supplied = {each: settings.pop(each) for each in SUPPLIED_ARGUMENTS["env"] if each in settings}
-    sizes = validated(_Sizes, {"num_envs": num_envs, "seed": seed, **supplied}, "", "argument", "hpamdp.make")
     arguments = problem_arguments(name)
+    if num_envs is None:
+        num_envs = arguments.num_envs or 1
+    sizes = validated(_Sizes, {"num_envs": num_envs, "seed": seed, **supplied}, "", "argument", "hpamdp.make")
     own = [word(f"env.{each}", value) for each, value in without_env_prefix(settings).items()]
     with composed(arguments.with_words([*own, word("device", str(device))])) as cfg:
         config = read(cfg).with_objects(arguments.objects)

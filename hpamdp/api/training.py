@@ -49,7 +49,7 @@ from hpamdp.run_files import METRICS_NAME
 # Values of the run that count for a trained agent, too.
 _OF_LOADING = ("device", "threads")
 # Values of the run that are of use only if the run writes files.
-_OF_FILES = ("checkpoint_every", "checkpoint_minutes", "film")
+_OF_FILES = ("checkpoint_every", "checkpoint_minutes", "film", "save_best")
 
 
 def train(
@@ -97,8 +97,7 @@ def train(
     callbacks = _checked_callbacks(callbacks)
     arguments = problem_arguments(env)
     goes_on = settings.get("resume") == RESUME_AUTO
-    if goes_on and output_dir is None:
-        raise ConfigError("resume=auto: goes on with the run in a folder, so give folder")
+    _check_what_needs_runs(settings, output_dir)
     if goes_on:
         settings = {**settings, "resume": None}
     saved, words = _words_of(settings, arguments, searching(config_dirs))
@@ -126,6 +125,20 @@ def train(
             say(f"Stopped at {trainer.frames:,}{trainer.unit}")
     parts = trainer.parts
     return Agent(config, parts.agent, parts.problem, trainer.progress(), trainer.recorder.metrics.rows())
+
+
+def _check_what_needs_runs(settings: Mapping[str, Any], folder: Path | None) -> None:
+    """Refuse settings about the run in a folder, or about a saved run, if there is none.
+
+    Raises:
+        ConfigError: there is such a setting.
+    """
+    if folder is None and settings.get("resume") == RESUME_AUTO:
+        raise ConfigError("resume=auto: goes on with the run in a folder, so give folder")
+    if folder is None and settings.get("overwrite") is True:
+        raise ConfigError("overwrite=True: has no effect without a folder; give folder, or leave it out")
+    if settings.get("trust") is True and settings.get("resume") is None:
+        raise ConfigError("trust=True: has no effect without a saved run; give resume, or leave it out")
 
 
 def _check_no_files(config: Config, words: Sequence[str]) -> None:

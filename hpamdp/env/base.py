@@ -191,6 +191,14 @@ class PAMDPEnv(EnvBase):
         self.action_spec = Composite(**leaf, **self.full_action_spec, shape=n)
         self._allowed_by_option = torch.tensor(rows, device=device)
 
+    @property
+    def grouping(self) -> dict[str, list[int]] | None:
+        """Return the discrete actions of each option that `group_actions` made, by number; None if it made none."""
+        if self.option_actions is None:
+            return None
+        rows = zip(self.option_names, self.option_actions, strict=True)
+        return {name: [number for number, allowed in enumerate(row) if allowed] for name, row in rows}
+
     def _number_of_action(self, action: int | str) -> int:
         num_discrete = len(self.parameter_dims)
         names = [name.replace(" ", "_") for name in self.discrete_names]

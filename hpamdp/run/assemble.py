@@ -152,8 +152,11 @@ def check_built(config: Config, env: PAMDPEnv) -> None:
     Raises:
         ConfigError: the settings do not go with the problem.
     """
-    facts = compatibility.facts_of(config) or _facts_of_built(env)
+    facts = facts_about(env, config)
     compatibility.check_problem(config, facts)
+    left_out = actions_in_no_option(env) if isinstance(config.run.env.grouping, dict) else []
+    if left_out:
+        warn(f"env.grouping: no option has {', '.join(left_out)}; the agent never takes them ({config.env})")
     if facts.plans_change_options and config.run.agent.termination == "episode":
         warn(
             f"{config.env}: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; "
@@ -169,6 +172,18 @@ def check_built(config: Config, env: PAMDPEnv) -> None:
     uncounted = compatibility.uncounted_durations(acting) if keys.DURATION in env.observation_spec.keys() else None
     if uncounted is not None:
         warn(uncounted)
+
+
+def actions_in_no_option(env: PAMDPEnv) -> list[str]:
+    """Return the discrete actions of a grouped environment that no option allows, by name if they have names."""
+    names = [*env.discrete_names] or [f"action {number}" for number in range(len(env.parameter_dims))]
+    taken = zip(*(env.option_actions or ()), strict=True)
+    return [name for name, by_options in zip(names, taken, strict=True) if not any(by_options)]
+
+
+def facts_about(env: PAMDPEnv, config: Config) -> ProblemFacts:
+    """Return the facts about a problem from its settings, or else from the built environment."""
+    return compatibility.facts_of(config) or _facts_of_built(env)
 
 
 def _facts_of_built(env: PAMDPEnv) -> ProblemFacts:

@@ -15,6 +15,7 @@ from typing import TypeAlias
 from hpamdp.complaints import as_json
 from hpamdp.config.components import (
     GROUPS,
+    RUN_VALUES,
     Component,
     constructor_arguments,
     is_passed,
@@ -39,7 +40,15 @@ GROUPS_OF_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment
 
 # Words of a command line that change nothing, by the mode of the run: settings, groups, and mappings of settings.
 # There is no run for a `player`, who is watched or played with, and for an `agent` that Python code loads.
-_OF_STEPS = ("total_frames", "num_envs", "steps_per_batch", "collector", "eval.every", "agent.uniform_option_steps")
+_OF_STEPS = (
+    "total_frames",
+    "num_envs",
+    "steps_per_batch",
+    "collector",
+    "eval.every",
+    "low.budget",
+    "agent.uniform_option_steps",
+)
 _OF_LEARNING = ("offline", "data", "log_every", "callbacks", "save_best", "compile_updates", "update_precision")
 _OF_AGENTS_LEARNING = ("agent.values_end", "agent.selector_values_end", "low.freeze", "exploration")
 _OF_CHECKPOINTS = ("checkpoint_every", "checkpoint_minutes", "checkpoint_replay")
@@ -56,6 +65,14 @@ _WHERE = {
     "eval": "without training",
     "player": "on a player",
     "agent": "on a trained agent",
+}
+
+# Values that a learner recommends, by the values of the run that take their place.
+_RECOMMENDED = {
+    "total_frames": "low.budget.total_frames",
+    "num_envs": "low.budget.num_envs",
+    "steps_per_batch": "low.budget.steps_per_batch",
+    "eval.every": "low.budget.eval_every",
 }
 
 Rule: TypeAlias = Callable[[Config], "str | None"]
@@ -106,6 +123,44 @@ def check_effects(mode: str, words: Sequence[str]) -> None:
         given = settings_in(word)
         if any(each == name or each.startswith(f"{name}.") for each in given for name in _WITHOUT_EFFECT[mode]):
             raise ConfigError(f"{word}: has no effect {_WHERE[mode]}; leave it out")
+    word_of = _words_by_setting(words)
+    for name, recommended in _RECOMMENDED.items():
+        if name in word_of and recommended in word_of:
+            raise ConfigError(f"{word_of[recommended]}: has no effect beside {word_of[name]}; leave it out")
+
+
+def _words_by_setting(words: Sequence[str]) -> dict[str, str]:
+    return {name: word for word in words for name in settings_in(word)}
+
+
+def check_effects_on(problem: ProblemFacts, config: Config, words: Sequence[str]) -> None:
+    """Refuse words of a command line that would change nothing on a problem.
+
+    Yaml files may set the same, since they serve several selectors and learners.
+
+    Args:
+        problem: the facts about the problem.
+        config: config of the run, with its selector.
+        words: the words.
+
+    Raises:
+        ConfigError: there is such a word.
+    """
+    agent, has_choice = config.run.agent, _has_choice(config, problem)
+    never_acts = agent.sharing == "per_option" and with_acting_learners(config, problem) is not config
+    for name, word in _words_by_setting(words).items():
+        why = None
+        if name == "agent.uniform_option_steps" and agent.uniform_option_steps:
+            if not has_choice:
+                why = f"{config.env} has no options to choose"
+            elif config.high.name == "uniform":
+                why = f"{config.high} chooses uniformly in all steps"
+        elif name == "agent.sharing" and agent.sharing == "shared" and not has_choice:
+            why = f"{config.env} has no options to choose, and one learner"
+        elif never_acts and name.startswith("low.") and name.split(".")[1] not in RUN_VALUES["low"]:
+            why = "low.per_option names a learner for every option"
+        if why is not None:
+            raise ConfigError(f"{word}: has no effect, because {why}; leave it out")
 
 
 def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
@@ -263,12 +318,22 @@ def stop_score_needs_evaluations(config: Config) -> str | None:
 
 def callbacks_have_evaluations(config: Config) -> str | None:
     """Require evaluations during training if a callback counts them."""
+    return need_of_evaluations(config, [(f"{each}:", each.cls) for each in config.callbacks])
+
+
+def need_of_evaluations(config: Config, callbacks: Iterable[tuple[str, object]]) -> str | None:
+    """Return which of these callbacks counts evaluations that the run does not make, or None.
+
+    Args:
+        config: config of the run.
+        callbacks: each with its name.
+    """
     run = config.run
     if run.mode == "eval" or run.eval_every > 0:
         return None
     every = "offline.eval_every" if run.mode == "offline" else "eval.every"
-    counting = [str(each) for each in config.callbacks if getattr(each.cls, "needs_evaluations", False)]
-    return f"{counting[0]}: needs evaluations during training; set {every} above 0" if counting else None
+    counting = [name for name, each in callbacks if getattr(each, "needs_evaluations", False)]
+    return f"{counting[0]} needs evaluations during training; set {every} above 0" if counting else None
 
 
 # Rules about sessions of trips.

@@ -22,9 +22,10 @@ from hpamdp.config.saved import choices_of, read_saved, upgraded
 from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import warn
+from hpamdp.renamed import with_new_names
 from hpamdp.run import checkpoint, compatibility
 from hpamdp.run.assemble import choose_selector, make_env
-from hpamdp.run_files import flat_settings
+from hpamdp.run_files import ENV_WITHOUT_INFLUENCE, flat_settings
 from hpamdp.shell import setting
 
 # Settings that a run does not take over from the saved run.
@@ -77,8 +78,39 @@ def resolve(
     except MissingChoiceError as error:
         raise _not_there(error, file) from error
     if run.resume is not None:
+        _check_same_run(saved, resolved, file, changes)
         _warn_of_ended_schedules(saved, resolved, source)
     return replace(resolved, config_dirs=folders).with_objects(objects), file
+
+
+def _check_same_run(saved: Mapping[str, Any], resolved: Config, file: Path, words: Sequence[str]) -> None:
+    """Refuse another seed or problem, under whose name the resumed run would be saved.
+
+    A path or an entry point may change, since the files of a run may have moved.
+
+    Raises:
+        ConfigError: a word changes one of them.
+    """
+    seed = saved.get("seed")
+    if seed is not None and resolved.run.seed != seed:
+        raise ConfigError(
+            f"seed={resolved.run.seed}: the run in {file} has seed={seed}; leave seed out when you resume"
+        )
+    given = [word for word in words if setting_of(word).partition(".")[0] == "env"]
+    before, now = upgraded(saved), resolved.to_dict()
+    elsewhere = f"leave it out when you resume, or start a run with {setting('low.checkpoint', str(file.parent))}"
+    if given and before["choices"]["env"] != now["choices"]["env"]:
+        raise ConfigError(f"{given[0]}: the run in {file} has env={before['choices']['env']}; {elsewhere}")
+    if not given:
+        return
+    earlier = with_new_names("env", before["env"], now["env"])
+    for name, value in now["env"].items():
+        has_moved = isinstance(value, str) and resolved.env.is_guarded(name, value)
+        if name not in earlier or value == earlier[name] or name in ENV_WITHOUT_INFLUENCE or has_moved:
+            continue
+        raise ConfigError(
+            f"env.{name}={as_json(value)}: the run in {file} has env.{name}={as_json(earlier[name])}; {elsewhere}"
+        )
 
 
 def _warn_of_ended_schedules(saved: Mapping[str, Any], resolved: Config, source: str) -> None:

@@ -16,11 +16,11 @@ from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError, fault_of
 from hpamdp.messages import first_line, say, warn
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import assemble
+from hpamdp.run.assemble import assemble, facts_about
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, raised_by
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import CollectionError
-from hpamdp.run.compatibility import settings_without_effect
+from hpamdp.run.compatibility import check_effects_on, need_of_evaluations, settings_without_effect
 from hpamdp.run.folder import check_no_link, check_no_training, check_unused
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.stopping import ProgramExitError, exits_explained
@@ -122,6 +122,8 @@ def begin(
     parts = assemble(config)
     try:
         check_saved_options(config, parts.env.base_env)
+        if is_training:
+            check_effects_on(facts_about(parts.env.base_env, config), config, overrides)
         trainer = Trainer(config, parts, output_dir, _all_callbacks(config, callbacks) if is_training else ())
         if source is not None:
             trainer.restore(source)
@@ -138,9 +140,12 @@ def _all_callbacks(config: Config, given: Sequence[Callback]) -> list[Callback]:
     """Build the callbacks of a config, and return them before the given ones.
 
     Raises:
-        ConfigError: a given object is no callback.
+        ConfigError: a given object is no callback, or needs evaluations that the run does not make.
     """
     check_callbacks(given)
+    complaint = need_of_evaluations(config, [(type(each).__name__, each) for each in given])
+    if complaint is not None:
+        raise ConfigError(f"callbacks: {complaint}")
     callbacks = [*(chosen.build() for chosen in config.callbacks), *given]
     if config.run.save_best and not any(isinstance(each, BestAgent) for each in callbacks):
         callbacks.insert(0, BestAgent())

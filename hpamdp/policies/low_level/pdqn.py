@@ -41,10 +41,10 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import PositiveFloat, PositiveInt, model_validator
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -77,7 +77,7 @@ from hpamdp.policies.shared.networks import (
 )
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import PositiveFraction
+from hpamdp.settings import OnlyWith, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 PROCESS = "noise_process"  # the last step's noise, if it is a process, float32 [*B, num_parameters]
@@ -114,6 +114,8 @@ class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
     With `ornstein_uhlenbeck`, `parameter_noise` is the standard deviation of what is added in a step. The process goes
     on from episode to episode.
     """
+    epsilon_steps: Annotated[NonNegativeInt, OnlyWith("epsilon_episodes", None)] = 40_000
+    """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
     epsilon_episodes: PositiveInt | None = None
     """Episodes that end with the learner's own steps, within which the probability of a random action falls.
 

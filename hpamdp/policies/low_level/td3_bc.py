@@ -37,7 +37,7 @@ from hpamdp.policies.shared.actor_critic import ActorCriticOptions, SmoothedTarg
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import LearningRate, PositiveFraction, Widths
+from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -57,7 +57,7 @@ class TD3BCOptions(ActorCriticOptions, TargetRateOptions, SmoothedTargetOptions,
     """Discrete actions less probable in the data than this fraction of the most probable one are never taken."""
     target_smoothing: NonNegativeFloat = 0.05
     """Standard deviation of the noise on the parameters in the target."""
-    target_smoothing_clip: NonNegativeFloat = 0.1
+    target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("target_smoothing")] = 0.1
     """Largest size of this noise."""
     policy_delay: PositiveInt = 2
     """Critic updates for each update of the actor and the target networks."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
 
 from hpamdp.policies.shared.replay import ReplayOptions
-from hpamdp.settings import LearningRate, PositiveFraction, Settings, Widths
+from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction, Settings, Widths
 
 
 class ActorCriticOptions(ReplayOptions):
@@ -34,7 +35,7 @@ class SmoothedTargetOptions(Settings):
 
     target_smoothing: NonNegativeFloat = 0.1
     """Standard deviation of the noise on the target actor's output, in units where its bounds are [-1, 1]."""
-    target_smoothing_clip: NonNegativeFloat = 0.2
+    target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("target_smoothing")] = 0.2
     """Largest size of this noise."""
     policy_delay: PositiveInt = 2
     """Critic updates for each update of the actor."""
