@@ -657,6 +657,15 @@ def test_home_directories_are_written_and_read_by_the_same_rule(tmp_path, monkey
     assert hpamdp.load("~/a.pt").specs == hpamdp.load("~/run").specs
 
 
+def test_a_file_whose_name_begins_with_a_tilde_is_no_home_directory(tmp_path, monkeypatch, platform_agent):
+    monkeypatch.chdir(tmp_path)
+    for path in ("./~a.pt", Path("~nobody.pt"), "./~/b.pt"):
+        Path("./~").mkdir(exist_ok=True)
+        platform_agent.save(path)
+        assert (tmp_path / path).is_file()
+        assert hpamdp.load(path).specs == platform_agent.specs
+
+
 def test_an_agent_that_holds_nothing_takes_the_mask_of_a_vector_loop(platform_agent):
     observations = np.zeros((3, 9), np.float32)
     platform_agent.act(observations)
