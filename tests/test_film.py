@@ -2,6 +2,7 @@
 
 import itertools
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -153,6 +154,17 @@ def test_a_gif_that_takes_too_much_memory_is_refused_before_all_of_its_pictures_
         film.write(tmp_path / "b.gif", film.film(env, [None], 10.0, 100), 10.0)
     assert 90 < env.asked < 110
     assert not (tmp_path / "b.gif").exists()
+
+
+def test_repeated_pictures_of_a_gif_take_memory_once(tmp_path):
+    noise = np.random.default_rng(0).integers(256, size=(100, 100, 3), dtype=np.uint8)
+    tracemalloc.start()
+    try:
+        film.write(tmp_path / "a.gif", itertools.repeat(noise, 200), 10.0)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 100 * noise.nbytes
 
 
 def test_a_path_is_told_from_settings(tmp_path):

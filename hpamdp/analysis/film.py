@@ -75,7 +75,7 @@ def _side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def tracks_of(states: Sequence[Mapping[str, Tensor]], num_steps: int | None = None) -> list[Track]:
-    """Return the tracks of each of N episodes.
+    """Return the track of each of N episodes.
 
     Args:
         states: the columns `[N, ...]` at the start and after every step.
@@ -117,7 +117,9 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:
     for picture in pictures:
         shape = picture.shape
         compressed = zlib.compress(picture.tobytes(), 1)
-        if not kept or compressed != kept[-1]:
+        if kept and compressed == kept[-1]:
+            compressed = kept[-1]  # the same object, which takes memory once
+        else:
             num_bytes += len(compressed) + shape[0] * shape[1]  # Pillow keeps a byte for each pixel
         kept.append(compressed)
         if num_bytes > _MOST_KEPT:
