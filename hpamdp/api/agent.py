@@ -26,6 +26,7 @@ from hpamdp.config.outside_jobs import composed, word
 from hpamdp.config.schema import Config, EnvConfig
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import DecisionTracker, decision_tracker
+from hpamdp.env.registration import SOURCE_SETTINGS
 from hpamdp.messages import as_code
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.renamed import no_member
@@ -33,9 +34,6 @@ from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env, make_evaluation, option_length
 from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
-
-# Settings that say which environment it is.
-_SOURCES = ("id", "entry_point", "kwargs")
 
 
 class _Asked(Settings):
@@ -260,7 +258,7 @@ class Agent:
             own = self._config.env
             if other.env.cls is own.cls and other.env.name == own.name:
                 given = {each.partition("=")[0].removeprefix("env.") for each in words}
-                kept = {name: value for name, value in own.settings.items() if name not in (*given, *_SOURCES)}
+                kept = {name: value for name, value in own.settings.items() if name not in (*given, *SOURCE_SETTINGS)}
                 other = other.with_problem(replace(other.env, settings={**other.env.settings, **kept}))
         return self._fitting(other.env)
 

@@ -32,6 +32,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching
 from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.env.errors import closed_on_error
+from hpamdp.env.registration import NAMING_SETTINGS
 from hpamdp.messages import as_code, reason_of, say, warn
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
@@ -312,8 +313,7 @@ def _check_problem(file: Path, words: Sequence[str]) -> None:
         ConfigError: the problem is unknown.
     """
     saved = checkpoint.progress_of(file)["config"].get("env")
-    sources = ("id", "entry_point")
-    is_named = any(each.startswith(f"env.{name}=") for each in words for name in sources)
-    is_generic = isinstance(saved, Mapping) and {*sources} <= saved.keys()
-    if is_generic and not is_named and all(saved[name] is None for name in sources):
+    is_named = any(each.startswith(f"env.{name}=") for each in words for name in NAMING_SETTINGS)
+    is_generic = isinstance(saved, Mapping) and {*NAMING_SETTINGS} <= saved.keys()
+    if is_generic and not is_named and all(saved[name] is None for name in NAMING_SETTINGS):
         raise ConfigError(f"load: {file}: the agent was trained on an object from Python; pass it again as env")
