@@ -107,8 +107,8 @@ class Agent:
             greedy: whether to take the best action. Otherwise the agent explores as in training.
 
         Raises:
-            ValueError: an argument is wrong, the agent chooses by rewards, which no argument tells, the batch has
-                another size than the last one, or the running episode is longer than the problem allows, so that a
+            ValueError: an argument is wrong; the agent chooses by rewards, which `act` does not get; an agent that
+                holds an option or memory gets a batch of another size; or an episode exceeds the problem's limit, so a
                 `reset` is missing.
 
         Example:
@@ -141,9 +141,9 @@ class Agent:
         Args:
             starts: which of a batch begin, bool `[N]`, such as `terminated | truncated`. If None, all of them.
             next_step: whether the vector restarts them in its next step, as in the mode `NextStep`, the default of
-                `gymnasium.make_vec`. There the next `act` still sees the last observation of the old episode, and its
-                action is ignored, so the new episode begins with the `act` after it.
-                `make_gymnasium` makes vectors that restart in the same step.
+                `gymnasium.make_vec`. The next `act` then still sees the old episode's last observation, and its action
+                is ignored. The new episode begins with the `act` after it. `make_gymnasium` makes vectors that restart
+                in the same step.
 
         Raises:
             ValueError: the mask does not fit the batch.
@@ -206,8 +206,9 @@ class Agent:
         """Play episodes greedily and return their means.
 
         Args:
-            env: another problem, as for `hpamdp.train`, with the same sizes. If it has the class of the agent's own,
-                it takes over those of its settings that `env` does not give. If None, the agent's own.
+            env: another problem, as for `hpamdp.train`, with the same sizes. If None, the agent's own. If it has the
+                same name and class as the agent's own problem, settings that `env` does not give are taken from that
+                one, except `id`, `entry_point` and `kwargs`.
             episodes: number of episodes.
             seed: of the episodes. If None, that of the agent's own evaluations, so 100 episodes are their first 100.
             per_episode: whether to return arrays with one entry for each episode instead of means.
@@ -284,7 +285,7 @@ class Agent:
         The file holds the networks and the settings, not the replay buffer. To continue training, train with a folder.
 
         Raises:
-            ConfigError: the path is none.
+            ConfigError: `path` is not a path.
             OSError: the file cannot be written.
         """
         checkpoint.save_policy(path_argument("save", path), self._agent, self._env, self._progress)
@@ -292,19 +293,28 @@ class Agent:
     def export(self, path: str | Path) -> None:
         """Write the greedy policy to an ONNX file, which runs without torch; an existing file is replaced.
 
-        The inputs are `observation`, float32 `[N, observation_dim]`, the masks `action_mask` and `option_mask` if the
-        problem has them, and, if the agent chooses options, `held_option`, int64 `[N]`, and `is_decision`, bool `[N]`.
-        If the agent also chooses their lengths, `held_length`, int64 `[N]`, follows.
-        The outputs are `discrete`, int64 `[N]`, or `[N, num_components]` if there are several components, `parameters`,
-        float32 `[N, num_parameters]`, `option`, int64 `[N]`, and `option_length`, int64 `[N]`.
+        The inputs are:
+
+        - `observation`, float32 `[N, observation_dim]`;
+        - the masks `action_mask` and `option_mask`, if the problem has them;
+        - if the agent chooses options, `held_option`, int64 `[N]`, and `is_decision`, bool `[N]`;
+        - if the agent also chooses their lengths, `held_length`, int64 `[N]`.
+
+        The outputs are:
+
+        - `discrete`, int64 `[N]`, or `[N, num_components]` if there are several components;
+        - `parameters`, float32 `[N, num_parameters]`;
+        - if the agent chooses options, `option`, int64 `[N]`;
+        - if the agent also chooses their lengths, `option_length`, int64 `[N]`.
+
         Observations or parameters that float32 cannot hold are float64.
         The file scales observations as the agent does. Its properties name the actions and hold the parameters' bounds.
         They also give the numbers of the environment's first discrete actions and of its first option. The file counts
         both from 0.
 
         Raises:
-            ConfigError: the path is none, the agent has no greedy policy that can be exported, or `hpamdp[onnx]` is not
-                installed.
+            ConfigError: `path` is not a path, the agent has no greedy policy that can be exported, or `hpamdp[onnx]` is
+                not installed.
             OSError: the file cannot be written.
 
         Example:

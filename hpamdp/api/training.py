@@ -64,13 +64,19 @@ def train(
 ) -> Agent:
     """Train an agent, as `hpamdp SETTING=VALUE ...` does, and return it.
 
-    Ctrl-C ends training after the current batch. Then the agent with what it has learned so far is returned. Trainings
-    in several threads at once share torch's random numbers. A warning says that no seed repeats them.
+    Ctrl-C ends training after the current batch. Then the agent with what it has learned so far is returned. If several
+    trainings run at once in threads, they share torch's random numbers. No seed then reproduces them, and a warning
+    says so.
 
     Args:
-        env: the problem: the name of a choice of `env`; a Gymnasium id; a function or a class that returns a Gymnasium
-            environment; such an environment, which is copied and itself stays as it is; a `PAMDPEnv` or its class; or
-            a dict of `name` and settings. If None, the default of the command line.
+        env: the problem. If None, the default of the command line. Otherwise one of these:
+
+            - the name of a choice of `env`;
+            - a Gymnasium id;
+            - a function or a class that returns a Gymnasium environment;
+            - such an environment, which is copied and itself stays as it is;
+            - a `PAMDPEnv` or its class;
+            - a dict of `name` and settings.
         folder: folder of the run, as on the command line, created if it is missing. If None, nothing is written.
         callbacks: called during training; see `hpamdp.Callback`.
         config_dirs: folders of yaml files of your own, beside those of the package.
@@ -104,7 +110,7 @@ def train(
         settings = {**settings, "resume": None}
     saved, words = _words_of(settings, arguments, searching(config_dirs))
     with _torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
-        stack.enter_context(_counted())
+        stack.enter_context(_warned_if_concurrent())
         with composed([*saved, *words]) as cfg:
             config, source = resolve(cfg, words, arguments.objects)
             if output_dir is None:
@@ -169,7 +175,7 @@ def _checked_callbacks(given: Any) -> list[Callback]:
     """Return the callbacks as a list; a single one counts as a list of one.
 
     Raises:
-        ConfigError: it is none, or holds something else.
+        ConfigError: it is not a list or tuple of callbacks.
     """
     callbacks = [given] if isinstance(given, Callback) else given
     if not isinstance(callbacks, list | tuple):
@@ -182,7 +188,7 @@ _running = threading.Lock()  # held while a training of this process runs
 
 
 @contextmanager
-def _counted() -> Iterator[None]:
+def _warned_if_concurrent() -> Iterator[None]:
     """Warn if another training runs in this process."""
     is_first = _running.acquire(blocking=False)
     if not is_first:

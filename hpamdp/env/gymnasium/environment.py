@@ -155,11 +155,10 @@ class GymnasiumEnv(PAMDPEnv):
     ) -> None:
         self._flattens_pictures = flatten_pictures
         options = self.options = GymnasiumOptions.of(options, settings)
-        named = [
-            f"env.{name}={getattr(options, name)}" for name in NAMING_SETTINGS if getattr(options, name) is not None
-        ]
-        if make is not None and named:
-            raise SettingError(f"GymnasiumEnv: make={as_code(make)} and {named[0]}: give only one of them")
+        for name in NAMING_SETTINGS:
+            value = getattr(options, name)
+            if make is not None and value is not None:
+                raise SettingError(f"GymnasiumEnv: make={as_code(make)} and env.{name}={value}: give only one of them")
         # Not a check of the model: the command that resumes a run need not repeat them.
         if make is None and (options.id is None) == (options.entry_point is None):
             given = "neither is" if options.id is None else "both are"
