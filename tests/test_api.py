@@ -19,6 +19,7 @@ from gymnasium import spaces
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
+from toy_environments import Toy
 
 import hpamdp
 from hpamdp import keys
@@ -708,6 +709,30 @@ def test_home_directories_are_written_and_read_by_the_same_rule(tmp_path, monkey
     hpamdp.train("platform", low="hppo", folder="~/run", **TINY)
     assert {"a.pt", "run"} == {path.name for path in tmp_path.iterdir()}
     assert hpamdp.load("~/a.pt").specs == hpamdp.load("~/run").specs
+
+
+def test_an_object_takes_the_place_of_the_environment_of_a_saved_run(tmp_path):
+    settings = {**TINY, "max_steps": 5, "low": "hppo"}
+    hpamdp.train("toy_environments:Toy", folder=tmp_path / "run", **settings)
+    made = []
+
+    def make():
+        made.append(Toy())
+        return made[-1]
+
+    agent = hpamdp.load(tmp_path / "run", env=make)
+    assert made and agent._env.envs[0].unwrapped in made
+    with pytest.raises(hpamdp.ConfigError, match=r"env\.entry_point=toy_environments:Toy: give only one of them"):
+        hpamdp.load(tmp_path / "run", env=make, entry_point="toy_environments:Toy")
+
+
+def test_a_file_whose_name_begins_with_a_tilde_is_no_home_directory(tmp_path, monkeypatch, platform_agent):
+    monkeypatch.chdir(tmp_path)
+    for path in ("./~a.pt", Path("~nobody.pt"), "./~/b.pt"):
+        Path("./~").mkdir(exist_ok=True)
+        platform_agent.save(path)
+        assert (tmp_path / path).is_file()
+        assert hpamdp.load(path).specs == platform_agent.specs
 
 
 def test_an_agent_that_holds_nothing_takes_the_mask_of_a_vector_loop(platform_agent):

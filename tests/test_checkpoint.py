@@ -272,7 +272,9 @@ def test_a_kill_while_writing_leaves_the_old_checkpoint_and_its_leftover_is_remo
     file = tmp_path / "checkpoint.zip"
     states = {"collection": {}, "recorder": {}}
     checkpoint.save(file, parts.agent, states, {**PROGRESS, "frames": 1})
-    (tmp_path / ".checkpoint.zip.999.partial.zip").write_bytes(b"half a checkpo")
+    leftover = tmp_path / ".checkpoint.zip.999.partial.zip"
+    leftover.write_bytes(b"half a checkpo")
+    os.utime(leftover, (0.0, 0.0))
     assert checkpoint.progress_of(file)["frames"] == 1
     checkpoint.save(file, parts.agent, states, {**PROGRESS, "frames": 2})
     assert checkpoint.progress_of(file)["frames"] == 2

@@ -318,7 +318,7 @@ def test_a_job_that_was_finished_by_hand_counts_as_finished_in_its_sweep(tmp_pat
         assert command(*words)[0] == 1
     assert command("resume=sweep/0", "hydra.run.dir=sweep/0", "film=false")[0] == 0
     code, out, _ = command(*words)
-    assert code == 0 and "1 jobs: 1 skipped, finished before\n" in out
+    assert code == 0 and "1 job: 1 skipped, finished before\n" in out
 
 
 def after_batches(monkeypatch: pytest.MonkeyPatch, number: int, do: Callable[[], object]) -> None:
@@ -382,4 +382,4 @@ def test_a_job_that_a_signal_stops_is_saved_before_its_launcher_gets_the_signal(
         signal.signal(signal.SIGUSR2, before)
     assert found == [64]
     code, out, _ = command(*words)
-    assert code == 0 and "1 jobs: 1 resumed and finished\n" in out
+    assert code == 0 and "1 job: 1 resumed and finished\n" in out

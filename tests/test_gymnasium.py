@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import sys
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -18,6 +19,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -323,6 +325,12 @@ def mistake_in(**options) -> str:
 )
 def test_a_mistake_is_explained_in_one_line(options, complaint):
     assert complaint in mistake_in(**options)
+
+
+@pytest.mark.parametrize(("name", "value"), [("id", "CartPole-v1"), ("entry_point", TOY)])
+def test_a_function_and_a_name_for_the_same_environment_are_refused(name, value):
+    with pytest.raises(SettingError, match=f"make=.* and env.{name}={value}: give only one of them"):
+        GymnasiumEnv(make=lambda: gymnasium.make("CartPole-v1"), **{name: value})
 
 
 STEP = (np.zeros(2), 0.5, False, False, {})

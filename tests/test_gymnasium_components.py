@@ -250,6 +250,41 @@ def test_a_mask_of_another_form_or_that_allows_nothing_of_a_component_is_told_in
         saying(tree, {"action_mask": mask}, action_mask="info").reset()
 
 
+THREE_BOXES = [UNIT, UNIT, UNIT]
+
+
+@pytest.mark.parametrize(
+    ("space", "mask", "line"),
+    [
+        (Dict(mode=Discrete(3), a=UNIT, b=UNIT, c=UNIT), {"mod": (1, 0, 0)}, "a dict with names of .'mode', 'a', 'b'"),
+        (Dict(mode=Discrete(3), boxes=Tuple(THREE_BOXES)), {"mod": (1, 0, 0)}, "a dict with names of .'mode', 'boxes'"),
+        (OneOf(THREE_BOXES), {"a": 1}, "3 numbers, 0 or 1, or a tuple of 3 masks"),
+        (OneOf(THREE_BOXES), (None, None), "3 numbers, 0 or 1, or a tuple of 3 masks"),
+        (OneOf(THREE_BOXES), (1, 0, None), "3 numbers, 0 or 1, or a tuple of 3 masks"),
+        (
+            Dict(arm=OneOf(THREE_BOXES), leg=Discrete(2)),
+            {"arm": np.array([1, 0]), "leg": None},
+            "3 numbers, 0 or 1, or a tuple of 3 masks",
+        ),
+    ],
+)
+def test_a_mask_of_a_choice_in_another_structure_never_allows_everything(space, mask, line):
+    with pytest.raises(ProblemError, match=f"must be {line}"):
+        ActionSpace(space).read_mask(mask)
+
+
+@pytest.mark.parametrize(
+    ("space", "mask", "flat"),
+    [
+        (Dict(mode=Discrete(3), a=UNIT, b=UNIT, c=UNIT), {"mode": (1, 0, 0), "a": None}, [1, 0, 0]),
+        (OneOf(THREE_BOXES), (None, None, None), [1, 1, 1]),
+        (Dict(arm=OneOf(THREE_BOXES), leg=Discrete(2)), {"arm": np.array([1, 0, 1])}, [1, 0, 1, 1, 1]),
+    ],
+)
+def test_a_mask_of_a_choice_may_leave_out_parts(space, mask, flat):
+    assert ActionSpace(space).read_mask(mask).tolist() == [bool(each) for each in flat]
+
+
 @pytest.mark.parametrize("place", ["info", "observation"])
 def test_a_pair_mask_says_what_goes_together(place):
     pairs = np.ones((5, 5))

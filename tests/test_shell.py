@@ -214,7 +214,7 @@ def test_letters_that_a_terminal_cannot_show_are_replaced(tmp_path, monkeypatch,
             assert forked(ends_with, tmp_path, words, file.fileno(), encoding, err) == 0
         assert forked(ends_with, tmp_path, ["env=Ω"], file.fileno(), encoding, err) == 2
     text = out.read_text(encoding)
-    assert text.count("\\u03a9") == 2 and "1 jobs: 1 finished" in text and "Traceback" not in err.read_text()
+    assert text.count("\\u03a9") == 2 and "1 job: 1 finished" in text and "Traceback" not in err.read_text()
 
 
 def test_a_working_directory_that_is_gone_is_reported_in_one_line(command, tmp_path):

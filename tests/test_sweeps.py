@@ -20,6 +20,7 @@ from hpamdp.config.components import component
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
 from hpamdp.messages import warn
+from hpamdp.run import sweep as run_sweep
 from hpamdp.run import train
 from hpamdp.run.assemble import choose_selector
 
@@ -225,7 +226,24 @@ def test_a_sweep_that_breaks_off_tells_the_jobs_it_leaves(command, jobs, monkeyp
     monkeypatch.setattr(BasicLauncher, "launch", break_off)
     code, out, err = command("-m", "seed=0,4", "hydra.sweep.dir=sweep")
     assert (code, err) == (1, "The sweep broke off: BrokenPipeError: a worker died (sweep/error.txt)\n")
-    assert "1 jobs: 1 finished\n" in out and "hydra.sweep.dir=sweep" in out
+    assert "1 job: 1 finished\n" in out and "hydra.sweep.dir=sweep" in out
+
+
+def test_a_job_whose_sweep_was_killed_has_time_to_finish_its_batch(monkeypatch):
+    now, sent, parents = [0.0], [], iter([7, 7, 1])
+
+    def sleep(seconds):
+        now[0] += seconds
+        if now[0] > 100.0:
+            raise SystemExit
+
+    monkeypatch.setattr("time.sleep", sleep)
+    monkeypatch.setattr("os.getppid", lambda: next(parents))
+    monkeypatch.setattr("os.kill", lambda pid, number: sent.append((now[0], pid, number)))
+    with pytest.raises(SystemExit):
+        run_sweep._watch(7)
+    assert [time for time, *_ in sent] == [2.0, 32.0, 62.0, 92.0]
+    assert {(pid, number) for _, pid, number in sent} == {(os.getpid(), signal.SIGTERM)}
 
 
 def sweep(folder: Path, *words: str) -> subprocess.Popen[str]:
@@ -305,7 +323,7 @@ def test_a_job_of_submitit_that_is_preempted_is_requeued_and_goes_on(tmp_path):
     os.kill(int(job), signal.SIGUSR2)
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
-    assert "1 jobs: 1 resumed and finished\n" in out
+    assert "1 job: 1 resumed and finished\n" in out
     assert frames_of(tmp_path / "sweep/0") == [float(n) for n in range(0, 131073, 2048)]
 
 

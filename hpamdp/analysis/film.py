@@ -79,7 +79,7 @@ def _side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def tracks_of(states: Sequence[Mapping[str, Tensor]], num_steps: int | None = None) -> list[Track]:
-    """Return the tracks of each of N episodes.
+    """Return the track of each of N episodes.
 
     Args:
         states: the columns `[N, ...]` at the start and after every step.

@@ -27,6 +27,7 @@ from hpamdp.config.outside_jobs import composed, word
 from hpamdp.config.schema import Config, EnvConfig
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import DecisionTracker, decision_tracker
+from hpamdp.env.registration import SOURCE_SETTINGS
 from hpamdp.messages import as_code
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.renamed import no_member
@@ -34,9 +35,6 @@ from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env, make_evaluation, option_length
 from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
-
-# Settings that say which environment it is.
-_SOURCES = ("id", "entry_point", "kwargs")
 
 
 class _Asked(Settings):
@@ -111,8 +109,8 @@ class Agent:
             greedy: whether to take the best action. Otherwise the agent explores as in training.
 
         Raises:
-            ValueError: an argument is wrong, the agent chooses by rewards, which no argument tells, the batch has
-                another size than the last one, or the running episode is longer than the problem allows, so that a
+            ValueError: an argument is wrong; the agent chooses by rewards, which `act` does not get; an agent that
+                holds an option or memory gets a batch of another size; or an episode exceeds the problem's limit, so a
                 `reset` is missing.
 
         Example:
@@ -148,9 +146,9 @@ class Agent:
         Args:
             starts: which of a batch begin, bool `[N]`, such as `terminated | truncated`. If None, all of them.
             next_step: whether the vector restarts them in its next step, as in the mode `NextStep`, the default of
-                `gymnasium.make_vec`. There the next `act` still sees the last observation of the old episode, and its
-                action is ignored, so the new episode begins with the `act` after it.
-                `make_gymnasium` makes vectors that restart in the same step.
+                `gymnasium.make_vec`. The next `act` then still sees the old episode's last observation, and its action
+                is ignored. The new episode begins with the `act` after it. `make_gymnasium` makes vectors that restart
+                in the same step.
 
         Raises:
             ValueError: the mask does not fit the batch.
@@ -222,8 +220,9 @@ class Agent:
         """Play episodes greedily and return their means.
 
         Args:
-            env: another problem, as for `hpamdp.train`, with the same sizes. If it has the class of the agent's own,
-                it takes over those of its settings that `env` does not give. If None, the agent's own.
+            env: another problem, as for `hpamdp.train`, with the same sizes. If None, the agent's own. If it has the
+                same name and class as the agent's own problem, settings that `env` does not give are taken from that
+                one, except `id`, `entry_point` and `kwargs`.
             episodes: number of episodes.
             seed: of the episodes. If None, that of the agent's own evaluations, so 100 episodes are their first 100.
             per_episode: whether to return arrays with one entry for each episode instead of means.
@@ -280,7 +279,7 @@ class Agent:
             own = self._config.env
             if other.env.cls is own.cls and other.env.name == own.name:
                 given = {each.partition("=")[0].removeprefix("env.") for each in words}
-                kept = {name: value for name, value in own.settings.items() if name not in (*given, *_SOURCES)}
+                kept = {name: value for name, value in own.settings.items() if name not in (*given, *SOURCE_SETTINGS)}
                 other = other.with_problem(replace(other.env, settings={**other.env.settings, **kept}))
         return self._fitting(other.env)
 
@@ -306,7 +305,7 @@ class Agent:
         The file holds the networks and the settings, not the replay buffer. To continue training, train with a folder.
 
         Raises:
-            ConfigError: the path is none.
+            ConfigError: `path` is not a path.
             OSError: the file cannot be written.
         """
         checkpoint.save_policy(path_argument("save", path), self._agent, self._env, self._progress)
@@ -314,19 +313,28 @@ class Agent:
     def export(self, path: str | Path) -> None:
         """Write the greedy policy to an ONNX file, which runs without torch; an existing file is replaced.
 
-        The inputs are `observation`, float32 `[N, observation_dim]`, the masks `action_mask` and `option_mask` if the
-        problem has them, and, if the agent chooses options, `held_option`, int64 `[N]`, and `is_decision`, bool `[N]`.
-        If the agent also chooses their lengths, `held_length`, int64 `[N]`, follows.
-        The outputs are `discrete`, int64 `[N]`, or `[N, num_components]` if there are several components, `parameters`,
-        float32 `[N, num_parameters]`, `option`, int64 `[N]`, and `option_length`, int64 `[N]`.
+        The inputs are:
+
+        - `observation`, float32 `[N, observation_dim]`;
+        - the masks `action_mask` and `option_mask`, if the problem has them;
+        - if the agent chooses options, `held_option`, int64 `[N]`, and `is_decision`, bool `[N]`;
+        - if the agent also chooses their lengths, `held_length`, int64 `[N]`.
+
+        The outputs are:
+
+        - `discrete`, int64 `[N]`, or `[N, num_components]` if there are several components;
+        - `parameters`, float32 `[N, num_parameters]`;
+        - if the agent chooses options, `option`, int64 `[N]`;
+        - if the agent also chooses their lengths, `option_length`, int64 `[N]`.
+
         Observations or parameters that float32 cannot hold are float64.
         The file scales observations as the agent does. Its properties name the actions and hold the parameters' bounds.
         They also give the numbers of the environment's first discrete actions and of its first option. The file counts
         both from 0.
 
         Raises:
-            ConfigError: the path is none, the agent has no greedy policy that can be exported, or `hpamdp[onnx]` is not
-                installed.
+            ConfigError: `path` is not a path, the agent has no greedy policy that can be exported, or `hpamdp[onnx]` is
+                not installed.
             OSError: the file cannot be written.
 
         Example:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -68,7 +69,8 @@ def path_argument(name: str, value: Any) -> Path:
     """
     if not isinstance(value, str | Path) or not str(value) or "\0" in str(value):
         raise ConfigError(f"{name}={as_code(value)}: must be a path")
-    return Path(value).expanduser()
+    path = Path(os.path.expanduser(value))  # before `Path` drops "./", after which "./~" would mean the home directory
+    return path.absolute() if str(path).startswith("~") else path  # so that nobody expands it later
 
 
 def flag(name: str, value: Any) -> None:

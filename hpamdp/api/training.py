@@ -32,6 +32,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching
 from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.env.errors import closed_on_error
+from hpamdp.env.registration import NAMING_SETTINGS
 from hpamdp.messages import as_code, reason_of, say, warn
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
@@ -63,13 +64,19 @@ def train(
 ) -> Agent:
     """Train an agent, as `hpamdp SETTING=VALUE ...` does, and return it.
 
-    Ctrl-C ends training after the current batch. Then the agent with what it has learned so far is returned. Trainings
-    in several threads at once share torch's random numbers. A warning says that no seed repeats them.
+    Ctrl-C ends training after the current batch. Then the agent with what it has learned so far is returned. If several
+    trainings run at once in threads, they share torch's random numbers. No seed then reproduces them, and a warning
+    says so.
 
     Args:
-        env: the problem: the name of a choice of `env`; a Gymnasium id; a function or a class that returns a Gymnasium
-            environment; such an environment, which is copied and itself stays as it is; a `PAMDPEnv` or its class; or
-            a dict of `name` and settings. If None, the default of the command line.
+        env: the problem. If None, the default of the command line. Otherwise one of these:
+
+            - the name of a choice of `env`;
+            - a Gymnasium id;
+            - a function or a class that returns a Gymnasium environment;
+            - such an environment, which is copied and itself stays as it is;
+            - a `PAMDPEnv` or its class;
+            - a dict of `name` and settings.
         folder: folder of the run, as on the command line, created if it is missing. If None, nothing is written.
         callbacks: called during training; see `hpamdp.Callback`.
         config_dirs: folders of yaml files of your own, beside those of the package.
@@ -102,7 +109,7 @@ def train(
         settings = {**settings, "resume": None}
     saved, words = _words_of(settings, arguments, searching(config_dirs))
     with _torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
-        stack.enter_context(_counted())
+        stack.enter_context(_warned_if_concurrent())
         with composed([*saved, *words]) as cfg:
             config, source = resolve(cfg, words, arguments.objects)
             if output_dir is None:
@@ -181,7 +188,7 @@ def _checked_callbacks(given: Any) -> list[Callback]:
     """Return the callbacks as a list; a single one counts as a list of one.
 
     Raises:
-        ConfigError: it is none, or holds something else.
+        ConfigError: it is not a list or tuple of callbacks.
     """
     callbacks = [given] if isinstance(given, Callback) else given
     if not isinstance(callbacks, list | tuple):
@@ -194,7 +201,7 @@ _running = threading.Lock()  # held while a training of this process runs
 
 
 @contextmanager
-def _counted() -> Iterator[None]:
+def _warned_if_concurrent() -> Iterator[None]:
     """Warn if another training runs in this process."""
     is_first = _running.acquire(blocking=False)
     if not is_first:
@@ -325,8 +332,7 @@ def _check_problem(file: Path, words: Sequence[str]) -> None:
         ConfigError: the problem is unknown.
     """
     saved = checkpoint.progress_of(file)["config"].get("env")
-    sources = ("id", "entry_point")
-    is_named = any(each.startswith(f"env.{name}=") for each in words for name in sources)
-    is_generic = isinstance(saved, Mapping) and {*sources} <= saved.keys()
-    if is_generic and not is_named and all(saved[name] is None for name in sources):
+    is_named = any(each.startswith(f"env.{name}=") for each in words for name in NAMING_SETTINGS)
+    is_generic = isinstance(saved, Mapping) and {*NAMING_SETTINGS} <= saved.keys()
+    if is_generic and not is_named and all(saved[name] is None for name in NAMING_SETTINGS):
         raise ConfigError(f"load: {file}: the agent was trained on an object from Python; pass it again as env")

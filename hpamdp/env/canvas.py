@@ -37,7 +37,7 @@ class Canvas:
 
     @classmethod
     def for_shapes(cls, size: int) -> Canvas:
-        """Return an empty canvas for shapes. Its method `smoothed` returns a picture of `size` px."""
+        """Return an empty canvas for shapes. `smoothed` then returns a canvas of `size` px for the labels."""
         return cls(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
 
     def smoothed(self, earlier: Image.Image | None = None) -> Canvas:

@@ -66,16 +66,16 @@ def random_discrete(
     return torch.stack(drawn, -1)
 
 
-def with_fixed(unit_parameters: Tensor, is_fixed: Tensor | None) -> Tensor:
-    """Return parameters `[*B, num_parameters]` in [-1, 1] with 0 where the state leaves a single value.
+def zero_fixed(values: Tensor, is_fixed: Tensor | None) -> Tensor:
+    """Return values `[*B, num_parameters]`, set to 0 where the state leaves a parameter a single value.
 
-    They are stored as 0, so critics have seen no other number there.
+    Such parameters are stored as 0, so critics have seen no other number.
 
     Args:
-        unit_parameters: the parameters.
+        values: one for each parameter, such as the parameters in [-1, 1] or their log densities.
         is_fixed: see `PAMDPSpecs.is_fixed`. If None, no parameter is.
     """
-    return unit_parameters if is_fixed is None else unit_parameters.masked_fill(is_fixed, 0.0)
+    return values if is_fixed is None else values.masked_fill(is_fixed, 0.0)
 
 
 def allowed_or_first(choice: Tensor, mask: Tensor) -> Tensor:

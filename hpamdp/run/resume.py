@@ -21,6 +21,7 @@ from hpamdp.config.outside_jobs import searched, searching
 from hpamdp.config.saved import choices_of, read_saved, upgraded
 from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.registration import SOURCE_SETTINGS
 from hpamdp.messages import warn
 from hpamdp.renamed import with_new_names
 from hpamdp.run import checkpoint, compatibility
@@ -72,6 +73,8 @@ def resolve(
     compatibility.check_effects(run.mode, changes)
     changed = map(setting_of, changes)
     values |= {name: _plain_value(cfg, name) for name in changed if not name.startswith("hydra")}
+    if objects and "env" not in values:  # the object takes the place of the saved run's environment
+        values |= {f"env.{name}": None for name in SOURCE_SETTINGS if f"env.{name}" not in values}
     names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
     try:
         resolved = read_saved(saved, values, names, trust=run.trust, file=file, place_of=place_of)

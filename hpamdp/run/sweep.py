@@ -34,7 +34,8 @@ from hpamdp.run_files import ERROR_NAME, saved_summary
 from hpamdp.shell import path_setting
 
 _MISTAKE, _INTERRUPTED = 2, 130
-_PATIENCE_S = 30.0
+_PATIENCE_S = 30.0  # for the running batch, after the sweep's process was killed
+_LOCK_PATIENCE_S = 2 * _PATIENCE_S  # for jobs of a killed sweep, which still save
 # States of a job. The first one holds until the job ends.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
 _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
@@ -105,12 +106,12 @@ def _job_config(
 def _job_folder() -> Path:
     """Return the current job's folder, and write the folder and the job's number into Hydra's settings."""
     hydra: Any = HydraConfig.get()
-    whole = hydra._get_root()  # the folder's name is resolved in it
+    root = hydra._get_root()  # the folder's name is resolved in it
     number = hydra.job.num + hydra.sweep.first_job
-    for settings in (whole.hydra, hydra):
+    for settings in (root.hydra, hydra):
         with read_write(settings):
             settings.job.num = number
-    folder = Path(os.path.abspath(Path(hydra.sweep.dir, str(whole.hydra.sweep.job_subdir))))
+    folder = Path(os.path.abspath(Path(hydra.sweep.dir, str(root.hydra.sweep.job_subdir))))
     with read_write(hydra):
         hydra.runtime.output_dir = str(folder)
     return folder
@@ -183,7 +184,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     records.write(job)
     say(f"Job {job.number}: {job.overrides}")
     try:
-        with locked(folder, _PATIENCE_S), exits_explained():
+        with locked(folder, _LOCK_PATIENCE_S), exits_explained():
             job.state, job.score, job.reason = _go_on(cfg, overrides, folder)
     except ConfigError as error:
         job.state, job.reason = _REFUSED, one_line(str(error))
@@ -230,15 +231,19 @@ def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str
 @functools.cache  # once a process, which may run several jobs
 def _stop_with_parent() -> None:
     """Save and stop this process if its parent is killed, which joblib does not do."""
-    parent = os.getppid()
+    threading.Thread(target=_watch, args=(os.getppid(),), daemon=True).start()
 
-    def watch() -> None:
-        while True:
-            time.sleep(1.0)
-            if os.getppid() != parent:
-                os.kill(os.getpid(), signal.SIGTERM)  # training saves on the first, and nothing survives the second
 
-    threading.Thread(target=watch, daemon=True).start()
+def _watch(parent: int) -> None:
+    """Send signals to this process once it has another parent.
+
+    On the first signal, training saves after the running batch. Later ones stop it at once.
+    """
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    while True:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(_PATIENCE_S)
 
 
 def has_begun(start: str) -> bool:
@@ -247,7 +252,9 @@ def has_begun(start: str) -> bool:
 
 
 def report(start: str, error: BaseException | None = None) -> int:
-    """Print a tally of the jobs and, on stderr, a line for each failed job; return the exit code.
+    """Report on the sweep and return the exit code.
+
+    Prints and writes the means over seeds, prints a tally, and warns of each failed job.
 
     Args:
         start: name of this start of the sweep.
@@ -267,14 +274,15 @@ def report(start: str, error: BaseException | None = None) -> int:
         _report_seeds(sweep_dir, jobs)
     _print_tally(jobs)
     for job in failed:
-        told = Path(job.folder, ERROR_NAME)
-        warn(f"{job.overrides}: {job.reason} ({_shown(told if os.path.exists(told) else told.parent)})")
+        error_file = Path(job.folder, ERROR_NAME)
+        place = error_file if os.path.exists(error_file) else error_file.parent
+        warn(f"{job.overrides}: {job.reason} ({_shown(place)})")
     if is_stopped or (error is not None and len(failed) < len(jobs)):
         if not is_stopped:
             with replacing(sweep_dir / ERROR_NAME) as partial:
                 partial.write_text("".join(traceback.format_exception(error)))
             reason = one_line("".join(traceback.format_exception_only(error)))
-            warn(f"The sweep broke off: {reason} ({_shown(sweep_dir / 'error.txt')})")
+            warn(f"The sweep broke off: {reason} ({_shown(sweep_dir / ERROR_NAME)})")
         say(f"To go on: the same command with {path_setting('hydra.sweep.dir', _shown(sweep_dir))}")
         return _INTERRUPTED if is_stopped else 1
     if not failed:
@@ -310,7 +318,8 @@ def _report_seeds(sweep_dir: Path, jobs: Sequence[Job]) -> None:
 
 def _print_tally(jobs: list[Job]) -> None:
     counts = Counter(job.state for job in jobs)
-    say(f"{len(jobs)} jobs: {'; '.join(f'{count} {state}' for state, count in counts.items())}")
+    tally = "; ".join(f"{count} {state}" for state, count in counts.items())
+    say(f"{len(jobs)} job{'' if len(jobs) == 1 else 's'}: {tally}")
     scored = [(job.score, job) for job in jobs if job.score is not None]
     if len(scored) > 1:
         score, best = max(scored, key=lambda entry: entry[0])

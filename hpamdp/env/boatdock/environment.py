@@ -1,7 +1,8 @@
 """The boat-docking task as a batched TorchRL environment: the key-press PAMDP with the controller choice as a leaf.
 
 Source: *A Benchmark for Hierarchical Parameterized Action Markov Decision Process*, with constants measured on its
-human data. What a user gives and reads are screen px; the state inside is px from the harbour's centre.
+human data. Layouts given to `reset` and `pixels` observations are in screen px. The state, `position` and `describe`
+are in px from the harbour's centre.
 """
 
 from __future__ import annotations
@@ -53,8 +54,8 @@ class BoatDockEnv(BatchedEnv[BoatState]):
 
     Action leaves:
     - `("action", "discrete")` int64 `[N]` in {0, 1, 2}: the key to press;
-    - `("action", "parameters")` float32 `[N, 3]`: how long to press each key, seconds in [0, 2], of which only the
-      pressed key's counts; values outside are clipped, NaN and infinite ones refused;
+    - `("action", "parameters")` float32 `[N, 3]`: seconds in [0, 2] to press each key. Only the pressed key's value
+      counts. Values outside are clipped; NaN and infinite values are refused.
     - with `controller="choose"`, `option` int64 `[N]` (0 incongruent, 1 congruent, or the number in `boats`): read at
       an episode's first press and held until its end; with a `switch_cost`, read at every press.
 
@@ -181,7 +182,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
 
     @property
     def symmetries(self) -> Symmetries:
-        """The turns and mirrors of the plane that permute the directions of a controller or swap controllers.
+        """The rotations and reflections of the plane that permute the directions of a controller or swap controllers.
 
         Six maps keep each of the two controllers. Six more swap it for the other one, whose directions are opposite. A
         random key map is not observed, so only maps remain that permute the keys of both key maps alike. If motor noise
@@ -211,7 +212,10 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         )
 
     def _orders(self, num_controllers: int) -> list[tuple[int, ...]]:
-        """Return which controllers the controllers may become under a map: only those of equal noise, none if many."""
+        """Return the permutations of the controllers that a map may cause.
+
+        Only controllers of equal noise swap. With more than `_MOST_SWAPPED`, none do.
+        """
         same = tuple(range(num_controllers))
         orders = list(itertools.permutations(same)) if num_controllers <= _MOST_SWAPPED else [same]
         noise = self.rules.motor_noise
@@ -399,7 +403,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
 
 
 def _figures_of(recording: str, controller: str) -> dict[str, float]:
-    """Return the means of a recording, of the episodes with this controller where it is fixed."""
+    """Return a recording's mean results. If the controller is fixed, only its episodes count."""
     from hpamdp.env.boatdock.play import episodes  # only recordings need it
 
     of_controller = controller if controller in harbour.CONTROLLERS else None

@@ -46,8 +46,8 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
 
     Action leaves:
     - `("action", "discrete")` int64 `[N]` in {0, 1, 2}: the key to press;
-    - `("action", "parameters")` float32 `[N, 3]`: how long to press each key, seconds in [`shortest_press`, 2], of
-      which only the pressed key's counts; values outside are clipped, NaN and infinite ones refused;
+    - `("action", "parameters")` float32 `[N, 3]`: seconds in [`shortest_press`, 2] to press each key. Only the pressed
+      key's value counts. Values outside are clipped; NaN and infinite values are refused.
     - with `boats=2`, `option` int64 `[N]`: the boat, 0 or 1, read at a trip's first press and held until its end.
 
     What the keys do is not observed. The observation shows what the last press did, see
@@ -114,7 +114,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
 
     @property
     def training_begins_elsewhere(self) -> bool:
-        """Whether evaluations have boats of which training has none."""
+        """Whether training has a fixed fleet while evaluation draws boats outside of it."""
         return self.options.fleet_size is not None and self.options.scored_boats == "new"
 
     def kernel_settings(self) -> Sequence[float]:
@@ -187,7 +187,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         return next(drawn), next(drawn)
 
     @property
-    def geometry(self) -> PlaneGeometry | None:
+    def geometry(self) -> PlaneGeometry:
         """The places and displacements, and what reveals where the keys of each boat push.
 
         A mirrored boat is as likely as the boat itself, so the mirror holds for all families. Every press begins at

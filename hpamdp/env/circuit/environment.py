@@ -90,14 +90,20 @@ class CircuitOptions(Settings):
     begin_episodes: Annotated[int, Field(ge=0, le=2**30), OnlyWith("begin", "known")] = 0
     """Episodes of an environment after which training circuits may lack one gate more; at first they lack the last one.
 
-    A quarter of them may lack any number of gates at any time. If 0, all may.
+    From the start, a random quarter of the episodes may lack any number of gates. If 0, all episodes may.
     """
     begin_gates: Annotated[int, Field(ge=1, le=100), OnlyWith("begin", "near_target")] = 6
-    """The most random gates. Their number is uniform between 0, which begins without gates, and this one."""
+    """Largest number of random gates. The number is uniform from 0 to this.
+
+    If the number is 0, the episode begins with an empty circuit, not at the target.
+    """
     observe_depth: bool = False
     """Whether the observation ends in the depth of each wire, as a fraction of the limit."""
     max_steps: PositiveInt | None = None
-    """Actions after which a circuit is finished. If None, 2 n times the limit of depth, which no circuit reaches."""
+    """Actions after which a circuit is finished. If None, twice the number of wires times the depth limit.
+
+    No circuit reaches that.
+    """
 
     @property
     def has_known_circuits(self) -> bool:
@@ -275,7 +281,10 @@ class CircuitEnv(BatchedEnv[CircuitState]):
         }
 
     def describe(self) -> dict[str, Tensor]:
-        """Return the best possible score of each native set, `optimum` `[N, S]`, which takes milliseconds a target."""
+        """Return `optimum` `[N, S]`, the best possible score in each native set, or nothing with the published gates.
+
+        It takes milliseconds per target.
+        """
         if not self.design.is_native:
             return {}
         return {"optimum": torch.from_numpy(best_scores(self.state, self.design))}
@@ -382,7 +391,7 @@ def _target(options: CircuitOptions) -> Tensor | None:
     """Return the target of all episodes; None if each has its own."""
     if options.target_number is None:
         return rules.fixed_target(options.task)
-    # No run's episodes have this key, whatever its seed: they are those of the stream of evaluation.
+    # The key is of the evaluation stream, so no training episode has this target, whatever its seed.
     number = torch.tensor([options.target_number], dtype=torch.int32)
     key = counter_rng.rng_key(counter_rng.seed_tensor(0), counter_rng.EVALUATION, torch.zeros_like(number), number)
     return rules.random_target(key, TASK_OF[options.task])[0]

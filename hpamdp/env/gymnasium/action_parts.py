@@ -141,6 +141,8 @@ class Choice(Part):
             return
         numbers = as_numbers(given)
         if numbers is None or numbers.shape != mask.shape:
+            if self._form.is_one_of and not _are_masks(given, len(mask)):
+                raise MisfitError(given, f"{len(mask)} numbers, 0 or 1, or a tuple of {len(mask)} masks")
             given = self._divided(given)[0]
         if given is not None:
             _write_mask(given, mask)
@@ -155,11 +157,10 @@ class Choice(Part):
                 raise MisfitError(given, "a dict")
             first, second = form.names
             rest = {name: value for name, value in given.items() if name != first}
-            if form.is_flat:
-                return given.get(first), rest
-            if not rest.keys() <= {second}:
-                raise MisfitError(given, f"a dict with names of {list(form.names)}")
-            return given.get(first), rest.get(second)
+            names = [first, *(form.part_names or ())] if form.is_flat else [first, second]
+            if not given.keys() <= {*names}:
+                raise MisfitError(given, f"a dict with names of {names}")
+            return given.get(first), rest if form.is_flat else rest.get(second)
         length = 1 + len(form.parts) if form.is_flat else 2
         if not isinstance(given, tuple | list) or len(given) != length:
             raise MisfitError(given, f"a tuple of {length} parts")
@@ -392,6 +393,12 @@ def _write_mask(given: Any, mask: np.ndarray) -> None:
     if numbers is None or numbers.shape != mask.shape or ((numbers != 0) & (numbers != 1)).any():
         raise MisfitError(given, f"{len(mask)} numbers, 0 or 1")
     mask[:] = numbers != 0
+
+
+def _are_masks(given: Any, num: int) -> bool:
+    """Return whether these are masks of the `num` parts of a `OneOf`, each None or in the structure of its part."""
+    is_divided = isinstance(given, tuple | list) and len(given) == num
+    return is_divided and not any(isinstance(each, str) or np.isscalar(each) for each in given)
 
 
 def _leaves_of(given: Any, shape: tuple[int, ...]) -> list[Any]:

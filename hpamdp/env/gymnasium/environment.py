@@ -30,9 +30,9 @@ from hpamdp.env.gymnasium.masks import MaskSource, as_leaf
 from hpamdp.env.gymnasium.parameter_bounds import agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics, Scaling
-from hpamdp.env.registration import register
+from hpamdp.env.registration import NAMING_SETTINGS, SOURCE_SETTINGS, register
 from hpamdp.env.rng_streams import folded
-from hpamdp.messages import warn
+from hpamdp.messages import as_code, warn
 from hpamdp.observation_entries import observation_dtype
 from hpamdp.pickling import why_unsendable
 from hpamdp.settings import PositiveFraction, SettingError, Settings
@@ -123,7 +123,8 @@ class GymnasiumEnv(PAMDPEnv):
 
     Args:
         num_envs: number of copies.
-        make: class or function that returns a new copy. If None, `id` or `entry_point` names it.
+        make: class or function that returns a new copy. If None, `id` or `entry_point` names it; otherwise both must be
+            None.
         options: the settings; None for the defaults.
         device: of the tensors.
         seed: of the episodes, see above.
@@ -138,7 +139,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     Options: ClassVar[type[Settings]] = GymnasiumOptions
     result_keys = (_SUCCESS,)
-    guarded_settings: ClassVar[tuple[str, ...]] = ("id", "entry_point", "kwargs")
+    guarded_settings: ClassVar[tuple[str, ...]] = SOURCE_SETTINGS
 
     def __init__(
         self,
@@ -154,6 +155,10 @@ class GymnasiumEnv(PAMDPEnv):
     ) -> None:
         self._flattens_pictures = flatten_pictures
         options = self.options = GymnasiumOptions.of(options, settings)
+        for name in NAMING_SETTINGS:
+            value = getattr(options, name)
+            if make is not None and value is not None:
+                raise SettingError(f"GymnasiumEnv: make={as_code(make)} and env.{name}={value}: give only one of them")
         # Not a check of the model: the command that resumes a run need not repeat them.
         if make is None and (options.id is None) == (options.entry_point is None):
             given = "neither is" if options.id is None else "both are"

@@ -44,7 +44,7 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.masks import masked_logits, random_discrete, with_fixed
+from hpamdp.policies.masks import masked_logits, random_discrete, zero_fixed
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.hybrid_actor import HeadOptions, HybridActor, ScaleOptions
@@ -323,7 +323,7 @@ class HSAC(ReplayLearner):
         discrete_weight, parameter_weight = self.temperatures()
         distribution: HybridDistribution = self.actor(state, allowed)
         unit_parameters, log_density = distribution.sample_squashed()
-        unit_parameters, log_density = with_fixed(unit_parameters, is_fixed), with_fixed(log_density, is_fixed)
+        unit_parameters, log_density = zero_fixed(unit_parameters, is_fixed), zero_fixed(log_density, is_fixed)
         log_probs = distribution.discrete_log_probs
         # Of each discrete action's own parameters together, `[B, num_discrete]`.
         own_log_density = distribution.sum_of_own(log_density)
@@ -350,7 +350,7 @@ class HSAC(ReplayLearner):
         discrete_log_prob, parameter_log_prob = (
             components.total(each) for each in self.log_probs(distribution, discrete, raw, fixed)
         )
-        q = critics.of_discrete(repeated, discrete, with_fixed(raw.tanh(), fixed)).amin(0)
+        q = critics.of_discrete(repeated, discrete, zero_fixed(raw.tanh(), fixed)).amin(0)
         value = q - discrete_weight * discrete_log_prob - parameter_weight * parameter_log_prob
         each = value.detach().unflatten(0, (-1, num))
         baseline = (each.sum(-1, keepdim=True) - each) / (num - 1)
@@ -410,7 +410,7 @@ class HSAC(ReplayLearner):
         log_probs, densities = self.log_probs(distribution, discrete, raw, fixed)
         own_log_prob, later_log_prob = log_probs[:, number], log_probs[:, number + 1 :].detach().sum(-1)
         discrete_log_prob, parameter_log_prob = own_log_prob + later_log_prob, densities[:, number:].sum(-1)
-        q = self.critics.of_discrete(state, discrete, with_fixed(raw.tanh(), fixed)).amin(0)
+        q = self.critics.of_discrete(state, discrete, zero_fixed(raw.tanh(), fixed)).amin(0)
         value = q - discrete_weight * discrete_log_prob - parameter_weight * parameter_log_prob
         excesses = self.excesses(discrete_log_prob, parameter_log_prob, discrete, mask, fixed)
         value, discrete_excess, parameter_excess = (
@@ -431,7 +431,7 @@ class HSAC(ReplayLearner):
         """
         standardised = (raw - distribution.mean) / distribution.log_scale.exp()
         log_density = gaussian_log_density(standardised, distribution.log_scale) - log_slope_of_tanh(raw)
-        of_discrete = distribution.sum_of_own(with_fixed(log_density, is_fixed))
+        of_discrete = distribution.sum_of_own(zero_fixed(log_density, is_fixed))
         of_choice = self.specs.components.of_choice
         return of_choice(distribution.discrete_log_probs, discrete), of_choice(of_discrete, discrete)
 

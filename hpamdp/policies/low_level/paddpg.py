@@ -34,7 +34,7 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.components import Components
 from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.masks import masked_values, with_fixed
+from hpamdp.policies.masks import masked_values, zero_fixed
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions, TwinCriticOptions
 from hpamdp.policies.shared.exploration import EpsilonOptions, linear_schedule, with_exploring_noise
 from hpamdp.policies.shared.networks import (
@@ -103,7 +103,7 @@ class PADDPGActor(nn.Module):
         if not self.specs.has_integers and is_fixed is None:
             return output
         scores, parameters = output.tensor_split([self.num_discrete], -1)
-        return torch.cat([scores, with_fixed(self.specs.in_cells(parameters), is_fixed)], -1)
+        return torch.cat([scores, zero_fixed(self.specs.in_cells(parameters), is_fixed)], -1)
 
 
 def with_lowest_scores(output: Tensor, allowed: Tensor | None) -> Tensor:

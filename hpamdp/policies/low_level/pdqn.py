@@ -53,7 +53,7 @@ from typing_extensions import Self
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import ActionFeature, option_ends, step_discounts
-from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete, with_fixed
+from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete, zero_fixed
 from hpamdp.policies.shared.actor_critic import set_learning_rates
 from hpamdp.policies.shared.actor_search import (
     SearchingActorOptions,
@@ -222,7 +222,7 @@ class PDQNPolicy(TensorDictModuleBase):
         observation = td.get(keys.OBSERVATION)
         # An export keeps the size of a batch open, which `len` would fix.
         is_fixed = self.specs.is_fixed(observation.reshape(-1, observation.shape[-1]))
-        unit_parameters = with_fixed(self.actor(state), is_fixed)
+        unit_parameters = zero_fixed(self.actor(state), is_fixed)
         if is_greedy() and len(self.variations) > 0:
             discrete, unit_parameters = self._best_variation(state, unit_parameters, allowed, is_fixed)
         else:
@@ -263,7 +263,7 @@ class PDQNPolicy(TensorDictModuleBase):
 
         def best_of(some_states: Tensor, some_parameters: Tensor, *fixed: Tensor) -> tuple[Tensor, Tensor]:
             candidates = with_variations(some_parameters, self.variations)
-            candidates = with_fixed(candidates, fixed[0].unsqueeze(-2) if fixed else None)
+            candidates = zero_fixed(candidates, fixed[0].unsqueeze(-2) if fixed else None)
             return best_of_candidates(self.critics, some_states, candidates)
 
         fixed = () if is_fixed is None else (is_fixed,)
@@ -368,7 +368,7 @@ class PDQN(ReplayLearner):
         state = self.target_perception(observation, memory, has_seen=has_seen)
         clip = self.options.target_smoothing_clip
         unit_parameters = with_clipped_noise(self.target_actor(state), smoothing, clip)
-        unit_parameters = with_fixed(unit_parameters, self.specs.is_fixed(observation))
+        unit_parameters = zero_fixed(unit_parameters, self.specs.is_fixed(observation))
         q = self.target_critics(state, unit_parameters).amin(0)
         choosing_q = q
         if self.options.double_q:
@@ -387,7 +387,7 @@ class PDQN(ReplayLearner):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return minus the sum of the allowed discrete actions' values; only the actor gets its gradient."""
         raw = self.actor.raw(state)
-        q = self.critics(state, with_fixed(self.actor.bounded(raw), is_fixed)).amin(0)
+        q = self.critics(state, zero_fixed(self.actor.bounded(raw), is_fixed)).amin(0)
         value = (q if allowed is None else q * allowed).sum(-1)
         loss = searching_actor_loss(self.options, value, raw, partial(self._search, state, raw, q, allowed, is_fixed))
         return loss, {"actor": -value.mean()}
@@ -411,7 +411,7 @@ class PDQN(ReplayLearner):
         shape = len(state), self.options.search_samples, self.specs.num_parameters
         with torch.no_grad():
             candidates = 2.0 * torch.rand(shape, device=state.device, dtype=torch.float32) - 1.0
-            candidates = with_fixed(candidates, None if is_fixed is None else is_fixed.unsqueeze(-2))
+            candidates = zero_fixed(candidates, None if is_fixed is None else is_fixed.unsqueeze(-2))
             best_value, best_index = best_of_candidates(self.critics, state, candidates)
             best_parameters = candidates.gather(1, best_index[:, self.owner].unsqueeze(1)).squeeze(1)
             gain = (best_value - q).clamp(min=0.0)

@@ -32,7 +32,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.masks import allowed_rows, masked_logits, with_fixed
+from hpamdp.policies.masks import allowed_rows, masked_logits, zero_fixed
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, SmoothedTargetOptions, TargetRateOptions
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
@@ -116,7 +116,7 @@ class TD3BCPolicy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
-        unit_parameters = with_fixed(self.actor(state), self.specs.is_fixed(state))
+        unit_parameters = zero_fixed(self.actor(state), self.specs.is_fixed(state))
         q = self.critics(state, unit_parameters).amin(0)
         discrete = q.masked_fill(self.is_refused(state, allowed_rows(self.specs, td)), -torch.inf).argmax(-1)
         if not is_greedy():
@@ -186,7 +186,7 @@ class TD3BC(ReplayLearner):
     def actor_loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls towards higher values and towards the data."""
         state = sample["state"]
-        unit_parameters = with_fixed(self.actor(state), self.fixed(sample))
+        unit_parameters = zero_fixed(self.actor(state), self.fixed(sample))
         with torch.no_grad():
             frequency = masked_logits(self.behaviour(state), allowed).softmax(-1)
         q = (self.critics(state, unit_parameters).amin(0) * frequency).sum(-1)
@@ -204,7 +204,7 @@ class TD3BC(ReplayLearner):
         """
         clip = self.options.target_smoothing_clip
         unit_parameters = with_clipped_noise(self.target_actor(observation), smoothing, clip)
-        unit_parameters = with_fixed(unit_parameters, self.specs.is_fixed(observation))
+        unit_parameters = zero_fixed(unit_parameters, self.specs.is_fixed(observation))
         q = self.target_critics(observation, unit_parameters).amin(0)
         is_refused = self.policy.is_refused(observation, self.specs.allowed(observation, action_mask))
         return q.masked_fill(is_refused, -torch.inf).amax(-1)

@@ -53,7 +53,8 @@ class ReplayOptions(BufferOptions):
     updates_per_step: PositiveFloat = 0.25
     """Updates for each step that the learner collects."""
     augment: Literal["auto"] | bool = False
-    """Map each sampled transition by a random symmetry that the problem declares. `auto` does so if there is any."""
+    """Map each sampled transition by a random symmetry that the problem declares. `auto` does so if there is any and
+    the learner has no memory."""
     gamma: PositiveFraction = 0.99
     """Discount of a step."""
     reward_scale: PositiveFloat = 1.0
@@ -121,7 +122,9 @@ class ReplayLearner(Learner):
         self.options = options
         self.stores_own_parameters = self.stores_own_parameters and specs.components.is_single
         remembers = isinstance(options, MemoryOptions) and options.memory != "none"
-        augment = specs.symmetries is not None and not remembers if options.augment == "auto" else options.augment
+        augment = options.augment
+        if augment == "auto":
+            augment = specs.symmetries is not None and not remembers
         self.symmetry = RandomSymmetry(specs, device) if augment else None
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
@@ -187,7 +190,7 @@ class ReplayLearner(Learner):
         return {**scalars, "updates": self.updates.item()}
 
     def with_bonus(self, sample: TensorDictBase, bonus: Bonus) -> TensorDictBase:
-        """Return a sample whose rewards include the bonus for the next states, as new as they are now."""
+        """Return a sample whose rewards include the bonus of the next states, computed with the current novelty."""
         assert bonus.of is not None
         more = self.options.reward_scale * bonus.weight * bonus.of(sample["next_state"])
         return sample.set("reward", sample["reward"] + more)
@@ -231,14 +234,18 @@ class ReplayLearner(Learner):
 
     def steps_to_update(self) -> dict[str, int]:
         """Return the length of the warm-up and the number of steps for one update."""
-        needed = {"warmup_steps": self.options.warmup_steps}
-        if self.options.updates_per_step > 0.0:
-            needed["updates_per_step"] = first_multiple(self.options.updates_per_step)
-        return needed
+        options = self.options
+        return {
+            "warmup_steps": options.warmup_steps,
+            "updates_per_step": first_multiple(options.updates_per_step),
+        }
 
     def num_updates(self, steps: int) -> int:
-        """Return the updates for this many steps, the warm-up included."""
-        return int(self.options.updates_per_step * max(0, steps - self.options.warmup_steps))
+        """Return the number of updates within this many steps, the first of which are the warm-up."""
+        updating = steps - self.options.warmup_steps
+        if updating <= 0:
+            return 0
+        return int(self.options.updates_per_step * (steps if self.catches_up else updating))
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Add the transitions in `mask` bool `[*B, T]` of a batch `[*B, T]` to the buffer."""
@@ -298,8 +305,8 @@ class ReplayLearner(Learner):
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return what is stored of a batch `[*B, T]`, with scaled rewards.
 
-        `unit` holds the parameters, mapped from their bounds to [-1, 1]. `discount` is 0 if the step terminated, else
-        the one of `step_discounts`.
+        `unit` holds the parameters, mapped from their bounds to [-1, 1]. `discount` is 0 if the step terminated;
+        otherwise it is the discount from `step_discounts`.
         """
         goes_on = (~batch["next", keys.TERMINATED]).float()
         rows = TensorDict(

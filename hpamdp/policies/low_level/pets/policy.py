@@ -42,7 +42,9 @@ class PETSPolicyOptions(SequenceSearchOptions, ParameterNoiseOptions, PETSModelO
     """Settings of a `PETSPolicy`."""
 
     posterior_sampling: Literal["auto"] | bool = "auto"
-    """Let exploring environments follow the plans of one member each until their episode ends; else of all members.
+    """Let each exploring environment follow the plans of one member until its episode or option ends.
+
+    If False, plans use all members. With a bonus for new states, plans always use all members.
 
     So environments try what members disagree on. `auto` does if the problem declares a geometry that makes its discrete
     actions alike. Elsewhere a single member knows too little for its plans to lead anywhere.
@@ -52,13 +54,13 @@ class PETSPolicyOptions(SequenceSearchOptions, ParameterNoiseOptions, PETSModelO
     caution: NonNegativeFloat = 0.0
     """Standard deviations of the members' returns that greedy plans subtract from the mean.
 
-    It avoids plans that only an error of some members makes look good, where a slip ends the episode.
+    It avoids plans that look good only because some members err. This helps where one mistake ends the episode.
     """
     hypotheses: NonNegativeInt = 8
-    """Sampled sets of directions under which plans begin while the problem has not revealed where all actions point.
+    """Number of sampled sets of directions to plan under while some actions' directions are unknown.
 
-    So plans count what an action shows. 0: plan with a guess. They also guess if there are more sequences of
-    horizon + 1 discrete actions than max_sequences.
+    Plans then value what an action reveals. If 0, or if there are more than `max_sequences` sequences of horizon + 1
+    discrete actions, plans use a single guess.
     """
     parameter_noise: NonNegativeFloat = 0.05
     """Standard deviation of the exploring noise on the parameters, in units where their bounds are [-1, 1]."""
@@ -70,7 +72,9 @@ class PETSPolicyOptions(SequenceSearchOptions, ParameterNoiseOptions, PETSModelO
 
 
 class PETSPolicy(PlanningPolicy):
-    """The first action of a plan; exploring, of one with the member that the environment follows in this episode.
+    """Take the first action of a plan.
+
+    When exploring with posterior sampling, plan with the one member that the environment follows.
 
     Acts uniformly at random until the stored steps differ in their rewards or in whether they terminate: before, all
     plans have the same value.
@@ -235,8 +239,8 @@ class PETSPolicy(PlanningPolicy):
     def _plan(self, state: Tensor, allowed: Tensor | None, shows: Tensor | None, *, is_mean: bool) -> PlannedAction:
         """Plan from states `[E, N, M, F]`: N plans by the mean of all members, or one for each member's state.
 
-        In a plan by the mean, single members choose the sequences that are refined, which takes a fraction of the time,
-        unless new states are rewarded.
+        A plan by the mean lets single members choose the sequences to refine, which is several times faster. If new
+        states are rewarded, all members choose.
         `allowed` is bool `[N, horizon, J]`, or `[E, N, horizon, J]`; `shows` is bool `[N, J]`, or `[E, N, J]`.
         """
         search = self.search if shows is None or self.contingent is None else self.contingent.search
