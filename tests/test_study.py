@@ -523,6 +523,16 @@ def test_a_study_states_which_settings_of_a_problem_its_runs_may_have(tmp_path, 
     assert len(gathered([tmp_path], list, settings={"office.tiles": None}, env=("office",))) == 3
 
 
+def test_a_study_of_evaluations_takes_them_without_metrics(tmp_path, capsys):
+    leave_run(tmp_path / "eval")
+    (tmp_path / "eval/config.yaml").write_text("mode: eval\nlow: {}\nenv: {keymap: 1}\n")
+    (tmp_path / "eval/metrics.csv").unlink()
+    assert len(gathered([tmp_path], list, modes=("train", "eval"), env=("boatdock",))) == 1
+    with pytest.raises(SystemExit, match=r"no finished runs of this study; nothing was written"):
+        gathered([tmp_path], list, env=("boatdock",))
+    assert "mode=eval, but runs of this study have train; left out" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["learners", "table1", "few_steps", "robustness"])
 def test_studies_of_boats_leave_out_runs_with_another_keymap(name, tmp_path, monkeypatch, capsys):
     module, folder = study(name), tmp_path / "runs/keymap"
