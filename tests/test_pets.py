@@ -724,3 +724,8 @@ def test_it_learns_a_two_step_problem_within_some_hundred_steps():
         _, after, _ = play(fresh(100))
         _, _, ends = play(after)
     assert ends.float().mean() > 0.8, "random agents end within two steps in 2 of 100"
+
+
+def test_the_first_updates_make_up_for_the_warm_up_in_the_number_of_updates_too():
+    learner = make(warmup_steps=64, updates_per_step=2.0)
+    assert [learner.num_updates(steps) for steps in (63, 64, 100)] == [0, 128, 200]

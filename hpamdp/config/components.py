@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, PydanticUserError, create_model
 
 from hpamdp.complaints import as_json
 from hpamdp.config.errors import ConfigError, validated
-from hpamdp.config.stand_ins import check_readable
+from hpamdp.config.stand_ins import check_works_with_stand_ins
 from hpamdp.memory import is_about_memory
 from hpamdp.messages import first_line
 from hpamdp.settings import SettingError, Settings
@@ -225,14 +225,14 @@ def load_class(dotted: str) -> type:
 
     Raises:
         ConfigError: there is no such class.
-        RealImportsNeededError: see `check_readable`.
+        RealImportsNeededError: see `check_works_with_stand_ins`.
     """
     if dotted in _passed:
         return _passed[dotted]
     module_name, _, name = dotted.rpartition(".")
     if not module_name or not all(part.isidentifier() for part in dotted.split(".")):
         raise ConfigError(f"{dotted}: must be a class, as package.module.Class")
-    check_readable(dotted)
+    check_works_with_stand_ins(dotted)
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:

@@ -1,8 +1,8 @@
 """Import the classes of this package in a fraction of a second, with stand-ins for libraries that take seconds.
 
-Settings models and attributes of classes suffice to refuse a wrong setting, but their files also import torch. Inside
-`quick_imports`, stand-ins replace torch and other slow libraries. The files can then be imported, but their code cannot
-run. After the block, all modules with stand-ins are gone.
+A wrong setting can be refused from the settings models and class attributes alone. But the files that define them also
+import torch. Inside `quick_imports`, stand-ins replace torch and other slow libraries. The files can then be imported,
+but their code cannot run. After the block, all modules with stand-ins are gone.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ class RealImportsNeededError(Exception):
     """Raised if a class of another package is needed where stand-ins replace the slow libraries."""
 
 
-def is_readable(dotted: str) -> bool:
+def works_with_stand_ins(dotted: str) -> bool:
     """Return whether a class may be imported with stand-ins: only this package is written for them."""
     return dotted.partition(".")[0] == _PACKAGE
 
 
-def check_readable(dotted: str) -> None:
+def check_works_with_stand_ins(dotted: str) -> None:
     """Refuse to import another package's class with stand-ins.
 
     Raises:
         RealImportsNeededError: the class needs the real libraries.
     """
-    if not is_readable(dotted) and any(isinstance(finder, _Finder) for finder in sys.meta_path):
+    if not works_with_stand_ins(dotted) and any(isinstance(finder, _Finder) for finder in sys.meta_path):
         raise RealImportsNeededError(dotted)
 
 

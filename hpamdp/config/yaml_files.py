@@ -23,7 +23,7 @@ from hpamdp.config.components import (
 )
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RunConfig
-from hpamdp.config.stand_ins import is_readable, quick_imports
+from hpamdp.config.stand_ins import quick_imports, works_with_stand_ins
 
 _MOST_VALUES, _MOST_LEVELS = 100_000, 50
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -60,7 +60,7 @@ def _defaults(config_path: str, cfg: DictConfig) -> dict[str, Any]:
     if not isinstance(target, Node) or not isinstance(target._value(), str):
         return {}
     try:
-        with quick_imports() if is_readable(target._value()) else nullcontext():
+        with quick_imports() if works_with_stand_ins(target._value()) else nullcontext():
             return defaults_of(settings_model(load_class(target._value()), SUPPLIED_ARGUMENTS.get(group, ())))
     except ConfigError:  # which the check of the config raises again, with the name of the file
         return {}

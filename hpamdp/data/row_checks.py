@@ -92,7 +92,7 @@ def check_transitions(rows: TensorDict) -> None:
 
 
 def check_returns(rows: TensorDict) -> None:
-    """Check that the rewards of each episode of transitions `[N]` add up to a number.
+    """Check that each episode's return is finite, given transitions `[N]`.
 
     Raises:
         DataError: a sum is too large.
@@ -161,16 +161,17 @@ def _check_form(what: str, rows: TensorDict, required: dict[_Key, tuple[torch.dt
     if missing:
         raise DataError(f"{what} lack {', '.join(map(_dotted, missing))}")
     optional = {name: form for name, form in _OPTIONAL.items() if name in present}
-    for name, (dtype, rest) in {**optional, **required}.items():
+    for name, (dtype, expected) in {**optional, **required}.items():
         value = rows.get(name)
         if not isinstance(value, Tensor) or value.layout != torch.strided:
             raise DataError(f"{what}' {_dotted(name)} is of class {type(value).__name__}, but must be a tensor")
         shape = tuple(value.shape[1:])
         if name == keys.DISCRETE and len(shape) == 1:  # an action of several components
-            rest = (None,)
-        fits = len(shape) == len(rest) and all(size in (None, own) for size, own in zip(rest, shape, strict=True))
+            expected = (None,)
+        pairs = zip(expected, shape, strict=True)
+        fits = len(shape) == len(expected) and all(size in (None, own) for size, own in pairs)
         if value.dtype != dtype or not fits:
-            wanted = ", ".join(["N", *("D" if size is None else str(size) for size in rest)])
+            wanted = ", ".join(["N", *("D" if size is None else str(size) for size in expected)])
             found = ", ".join(["N", *map(str, shape)])
             raise DataError(
                 f"{what}' {_dotted(name)} is {_named(value.dtype)} [{found}], but must be {_named(dtype)} [{wanted}]"
@@ -266,8 +267,8 @@ def _action_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
     if components.is_single:
         yield _Rule(keys.DISCRETE, _is_below(discrete, specs.num_discrete), f"0 to {specs.num_discrete - 1}")
     else:
-        most = [f"0 to {size - 1}" for size in components.sizes]
-        yield _Rule(keys.DISCRETE, (discrete >= 0) & (discrete < discrete.new_tensor(components.sizes)), most)
+        ranges = [f"0 to {size - 1}" for size in components.sizes]
+        yield _Rule(keys.DISCRETE, (discrete >= 0) & (discrete < discrete.new_tensor(components.sizes)), ranges)
     parameters = rows.get(keys.PARAMETERS)
     low, high = parameters.new_tensor(specs.parameter_low), parameters.new_tensor(specs.parameter_high)
     is_own = components.is_chosen(discrete).index_select(-1, specs.parameter_owner.to(discrete.device))
@@ -305,9 +306,9 @@ def _option_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
         allowed = of_options[option].gather(-1, specs.components.places(rows.get(keys.DISCRETE)))
         yield _Rule(keys.DISCRETE, allowed, "an action of the row's option")
     if specs.has_option_mask and keys.OPTION_MASK in rows.keys():
-        is_free = rows.get(keys.OPTION_MASK).gather(-1, option.unsqueeze(-1))
-        is_decision = rows.get(keys.IS_DECISION, torch.ones_like(is_free))
-        yield _Rule(keys.OPTION, is_free | ~is_decision, f"allowed by the row's {keys.OPTION_MASK}")
+        is_allowed = rows.get(keys.OPTION_MASK).gather(-1, option.unsqueeze(-1))
+        is_decision = rows.get(keys.IS_DECISION, torch.ones_like(is_allowed))
+        yield _Rule(keys.OPTION, is_allowed | ~is_decision, f"allowed by the row's {keys.OPTION_MASK}")
 
 
 def _is_below(numbers: Tensor, count: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Temporal abstraction: which steps are decisions, and what each option earned from its decision to its end."""
+"""Temporal abstraction: which steps are decisions, and the return of each option from its decision to its end."""
 
 from __future__ import annotations
 

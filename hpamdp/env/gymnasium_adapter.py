@@ -193,9 +193,9 @@ class GymnasiumVectorAdapter(VectorEnv):
     Args:
         problem: the environments with NumPy in and out.
         num_envs: how many they are.
-        autoreset_mode: when finished episodes start again: in the next step (which ignores their actions), in the same
-            step (the last observations and infos are `infos["final_obs"]` and `infos["final_info"]`), or only by
-            `reset`.
+        autoreset_mode: when finished episodes start again. With `NextStep` they do in the next step, which ignores
+            their actions. With `SameStep` they do in the same step; the last observations and infos are
+            `infos["final_obs"]` and `infos["final_info"]`. With `Disabled` they do only by `reset`.
 
     `reset` takes one integer seed for all environments; the episodes of environment i depend only on the seed and i,
     not on `num_envs`. The option `reset_mask` (bool `[N]`) of `reset` resets only these environments.

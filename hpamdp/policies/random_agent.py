@@ -22,8 +22,8 @@ def random_agent(specs: PAMDPSpecs, device: torch.device, option_lengths: Sequen
         device: where the agent acts.
         option_lengths: the lengths of options, if they are chosen.
     """
-    high = specs.with_option_lengths(option_lengths) if option_lengths else specs
-    selector = Uniform(high) if specs.num_options > 0 else None
+    selector_specs = specs.with_option_lengths(option_lengths) if option_lengths else specs
+    selector = Uniform(selector_specs) if specs.num_options > 0 else None
     is_shared = specs.option_actions is not None
     learner = Random(specs.with_option_observed() if is_shared else specs)
     return HierarchicalAgent(selector, [learner], specs, is_shared, option_lengths=option_lengths).to(device)

@@ -100,7 +100,7 @@ def find(path: str | Path, where: str) -> Path:
     Raises:
         ConfigError: there is no checkpoint.
     """
-    path = Path(os.path.expanduser(path))  # `Path` drops "./", which makes a name of ~
+    path = Path(os.path.expanduser(path))  # before `Path` drops "./", after which "./~" would mean the home directory
     if not os.path.exists(path) and str(path) in agent_names():
         path = agents_dir() / path
     is_folder = os.path.isdir(path)  # `Path.is_dir` would fail for some texts
@@ -234,7 +234,7 @@ def progress_of(file: Path) -> dict[str, Any]:
 
 
 def num_numbers(file: Path) -> int:
-    """Return how many floating-point numbers the agent in a file has, as the file describes it.
+    """Return the number of floating-point entries that the file declares for its agent.
 
     Raises:
         ConfigError: the file is damaged or not a checkpoint of this program.

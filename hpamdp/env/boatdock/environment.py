@@ -63,8 +63,8 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         num_envs: number of environments.
         options: the settings; None for the defaults.
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
-            `[N, num_options]`).
-        human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
+            `[N, num_options]`, or `[N, 1]` if the agent does not choose the controller).
+        human: also write how often people choose each controller under `human` (`option` `[N, 2]`).
         device: of the tensors.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
         first_env: number of the first environment, if other processes have those before it.

@@ -76,9 +76,9 @@ class BoatDockVector(GymnasiumVectorAdapter):
         num_envs: number of environments.
         options: the settings; None for the defaults.
         action_format: `dict` or `tuple`; see `hpamdp.env.boatdock.numpy_boats`.
-        autoreset_mode: when finished environments start again: in the next step (which ignores their actions), in the
-            same step (the last observations and infos are `infos["final_obs"]` and `infos["final_info"]`), or only by
-            `reset`.
+        autoreset_mode: when finished environments start again. With `NextStep` they do in the next step, which ignores
+            their actions. With `SameStep` they do in the same step; the last observations and infos are
+            `infos["final_obs"]` and `infos["final_info"]`. With `Disabled` they do only by `reset`.
         device: as in BoatDockEnv.
         settings: single settings by name, in place of those in `options`.
 

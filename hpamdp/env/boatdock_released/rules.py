@@ -136,22 +136,22 @@ def reach(seconds: Tensor) -> Tensor:
     return 10.0 * _TICK * ticks.square() * (10.0 - 0.6667 * ticks)
 
 
-def press(state: ReleasedState, direction: Tensor, duration: Tensor, max_steps: int) -> tuple[ReleasedState, Tensor]:
+def press(state: ReleasedState, direction: Tensor, parameter: Tensor, max_steps: int) -> tuple[ReleasedState, Tensor]:
     """Return the states after a press, and the rewards `[N]`.
 
     Args:
         state: states before the press.
         direction: unit direction of the key, `[N, 2]`.
-        duration: the parameter u in [-1, 1], float32 `[N]`. The press takes 2.5 (u + 1) seconds.
+        parameter: u in [-1, 1], float32 `[N]`. The press takes 2.5 (u + 1) seconds.
         max_steps: steps after which an episode is truncated.
     """
     # As released, the duration is rounded in float32 and in this order, whatever the dtype of the state.
-    seconds = ((duration + 1.0) / 2.0 * 5.0).to(state.fuel)
+    seconds = ((parameter + 1.0) / 2.0 * 5.0).to(state.fuel)
     distance = reach(seconds)
     dir_x, dir_y = direction.unbind(-1)
     x = (state.x.clamp(LOW[0], HIGH[0]) + dir_x * distance).clamp(LOW[0], HIGH[0])
     y = (state.y.clamp(LOW[1], HIGH[1]) + dir_y * distance).clamp(LOW[1], HIGH[1])
-    fuel = state.fuel - duration.to(state.fuel)
+    fuel = state.fuel - parameter.to(state.fuel)  # as released: the parameter, not the seconds, is subtracted
     steps = state.steps + 1
 
     is_docked = (x - state.goal_x.clamp(LOW[0], HIGH[0])).abs() <= DOCK

@@ -5,8 +5,8 @@ target and form, `_ascend` finds the best angles by coordinate ascent from sever
 a sinusoid, so each step goes to its maximum at once (Nakanishi, Fujii and Todo 2020, arXiv:1903.12166; Ostaszewski,
 Grant and Benedetti 2021, arXiv:1905.09692).
 
-One entangling gate suffices for a fidelity of 1: with rotations before it it makes the state's Schmidt coefficients,
-and rotations after it do the rest. That takes CX and six SX, or XX and five rotations. No circuit that costs more can
+One entangling gate suffices for a fidelity of 1. Rotations before the gate set the Schmidt coefficients, and rotations
+after it do the rest. That takes CX and six SX, or XX and five rotations. No circuit that costs more can
 be best.
 """
 
@@ -58,7 +58,8 @@ def forms(gate_set: tuple[Gate, ...]) -> tuple[tuple[int, ...], ...]:
     found: set[tuple[int, ...]] = set()
     for entangling in itertools.count():
         left = int((most - entangling * two_cost) / one_cost + 1e-6)
-        if left < 0 or (entangling > 1 and left < entangling - 1):
+        # With fewer rotations than gaps between entangling gates, two of these would follow each other directly.
+        if left < max(0, entangling - 1):
             break
         found.update(make(entangling, left))
     return tuple(sorted(found, key=lambda form: (_cost(form, gate_set), form)))
@@ -121,15 +122,15 @@ def best(targets: np.ndarray, gate_set: tuple[Gate, ...]) -> Plans:
     numbers = np.full((len(listed), longest), -1, np.int64)
     for row, form in zip(numbers, listed, strict=True):
         row[: len(form)] = form
-    what = np.array([[gate.kind, gate.flipped, gate.control] for gate in gate_set], np.int64)
+    operations = np.array([[gate.kind, gate.flipped, gate.control] for gate in gate_set], np.int64)
     fixed = np.array([math.nan if gate.angle is None else gate.angle for gate in gate_set])
     costs = np.array([_cost(form, gate_set) for form in listed])
     starts = np.random.default_rng(0).uniform(-math.pi, math.pi, (_STARTS, longest))
     score, form_of, angles = np.full(num, -np.inf), np.zeros(num, np.int64), np.zeros((num, longest))
     found = score, form_of, angles
-    _search(np.ascontiguousarray(targets, np.complex128), numbers, what, fixed, costs, starts, found)
+    _search(np.ascontiguousarray(targets, np.complex128), numbers, operations, fixed, costs, starts, found)
     chosen = numbers[form_of]
-    is_kept = (chosen >= 0) & ((np.abs(angles) > _TRIFLE) | (what[chosen, 0] == _FLIP))
+    is_kept = (chosen >= 0) & ((np.abs(angles) > _TRIFLE) | (operations[chosen, 0] == _FLIP))
     order = np.argsort(~is_kept, axis=1, kind="stable")
     stop = np.full((num, 1), len(gate_set) - 1)
     kept = np.where(is_kept, chosen, len(gate_set) - 1)
@@ -142,7 +143,14 @@ def best(targets: np.ndarray, gate_set: tuple[Gate, ...]) -> Plans:
 
 @part
 def _apply(state: Any, kind: Any, flipped: Any, control: Any, angle: Any, after: Any) -> None:
-    """Write the state after a gate into `after`, complex `[4]`: `gates.Gate`."""
+    """Write the state after a gate into `after`.
+
+    Args:
+        state: the state before the gate, complex `[4]`.
+        kind, flipped, control: see `gates.Gate`.
+        angle: the gate's angle, rad.
+        after: room for the state after the gate, complex `[4]`; not `state` itself.
+    """
     cosine, sine = math.cos(0.5 * angle), math.sin(0.5 * angle)
     for i in range(_NUM):
         other = state[i ^ flipped]
@@ -180,10 +188,18 @@ def _best_angle(before: Any, after: Any, kind: Any, flipped: Any) -> Any:
 
 
 @part
-def _ascend(target: Any, form: Any, length: Any, what: Any, fixed: Any, angles: Any, wanted: Any, states: Any) -> Any:
+def _ascend(
+    target: Any, form: Any, length: Any, operations: Any, fixed: Any, angles: Any, wanted: Any, states: Any
+) -> Any:
     """Improve the angles of a form in place, and return the fidelity.
 
     Args:
+        target: the state to reach, complex `[4]`.
+        form: numbers of the gates in the set, `[L]`, of which the first `length` count.
+        length: number of gates of the form.
+        operations: kind, flipped and control of each gate of the set, `[G, 3]`; see `gates.Gate`.
+        fixed: the angle of each gate of the set, `[G]`; NaN where it is free.
+        angles: the angles of the form's gates, `[L]`, changed in place.
         wanted: room for what the states after each gate should be, complex `[L + 1, 4]`.
         states: room for two states, complex `[2, 4]`.
     """
@@ -191,12 +207,12 @@ def _ascend(target: Any, form: Any, length: Any, what: Any, fixed: Any, angles: 
     for _ in range(_MOST_SWEEPS):
         wanted[length] = target
         for place in range(length - 1, -1, -1):
-            kind, flipped, control = what[form[place]]
+            kind, flipped, control = operations[form[place]]
             _apply(wanted[place + 1], kind, flipped, control, -angles[place], wanted[place])
         states[0] = 0.0
         states[0, 0] = 1.0
         for place in range(length):
-            kind, flipped, control = what[form[place]]
+            kind, flipped, control = operations[form[place]]
             now, after = place % 2, 1 - place % 2
             if math.isnan(fixed[form[place]]):
                 angles[place] = _best_angle(states[now], wanted[place + 1], kind, flipped)
@@ -212,9 +228,9 @@ def _ascend(target: Any, form: Any, length: Any, what: Any, fixed: Any, angles: 
 
 
 @kernel
-def _search(targets: Any, forms: Any, what: Any, fixed: Any, costs: Any, starts: Any, found: Any) -> None:
+def _search(targets: Any, forms: Any, operations: Any, fixed: Any, costs: Any, starts: Any, found: Any) -> None:
     """Find for each target the best score, the number of its form and the angles, and write them into `found`."""
-    scores, best, best_angles = found
+    scores, best_forms, best_angles = found
     longest = forms.shape[1]
     wanted = np.zeros((longest + 1, _NUM), np.complex128)
     states = np.zeros((2, _NUM), np.complex128)
@@ -230,8 +246,8 @@ def _search(targets: Any, forms: Any, what: Any, fixed: Any, costs: Any, starts:
                 for place in range(length):
                     given = fixed[forms[number, place]]
                     angles[place] = starts[start, place] if math.isnan(given) else given
-                fidelity = _ascend(targets[row], forms[number], length, what, fixed, angles, wanted, states)
+                fidelity = _ascend(targets[row], forms[number], length, operations, fixed, angles, wanted, states)
                 if fidelity - costs[number] > scores[row]:
-                    scores[row], best[row] = fidelity - costs[number], number
+                    scores[row], best_forms[row] = fidelity - costs[number], number
                     best_angles[row, :length] = angles[:length]
                     best_angles[row, length:] = 0.0

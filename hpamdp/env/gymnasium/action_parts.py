@@ -16,7 +16,7 @@ from gymnasium import spaces
 from hpamdp.env.gymnasium.parameter_trees import NotAcceptedError, ParameterTree, by_row
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers
 
-# Lower and upper bounds of the space's own parameters, narrower than those of the space, float64 `[M, size]` each.
+# Lower and upper bounds in the current state, in the space's own numbers, float64 `[M, size]` each.
 Bounds = tuple[np.ndarray, np.ndarray]
 
 
@@ -197,7 +197,7 @@ class PlainChoices(Part):
         """Do nothing: there are no parameters."""
 
     def fill_mask(self, given: Any, mask: np.ndarray) -> None:
-        """Write the mask: an array for each number, in tuples. A `MultiBinary` has one array of 0, 1 or 2 (both)."""
+        """Write the mask: a tuple with one array for each number. A `MultiBinary` has one array of 0, 1 or 2 (both)."""
         if given is None:
             return
         if isinstance(self._space, spaces.Discrete):
@@ -417,7 +417,7 @@ def _slices(sizes: Sequence[int]) -> list[slice]:
 
 
 def _in_order(names: list[str]) -> list[str]:
-    """Return names that all end in different numbers in the order of these; any other names in the order given."""
+    """Sort names by the numbers they end in, if all end in different numbers. Otherwise keep their order."""
     endings = [re.search(r"\d+$", str(name)) for name in names]
     numbers = [int(ending.group()) for ending in endings if ending is not None]
     if len(set(numbers)) < len(names):

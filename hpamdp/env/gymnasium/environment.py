@@ -41,7 +41,7 @@ _CPU = torch.device("cpu")
 _SUCCESS = "success"
 _SEED = "seed"
 _PICTURE = "picture"
-_LARGEST = 320  # px from edge to edge of a picture that is kept for a film
+_LARGEST_PICTURE = 320  # px from edge to edge of a picture that is kept for a film
 # Separate streams of seeds for training and for the fixed episodes of evaluation.
 _TRAINING, _FIXED = 0, 1
 
@@ -112,11 +112,12 @@ class GymnasiumEnv(PAMDPEnv):
 
     `hpamdp.env.gymnasium.action_spaces` and `hpamdp.env.gymnasium.observation_spaces` tell which spaces are accepted
     and how they are converted. Parameters outside their bounds, those of the space and those of the current state, are
-    clipped; those of the chosen actions must be finite. Bounds of the current state are also observed: the observation
-    ends in all lower and all upper bounds, scaled so that the bounds of the space are -1 and 1.
-    A space with an option in it, see there, leaves its choice to the agent; the environment may name its options in an
-    attribute `option_names`. The leaf `success` bool `[N]` is `is_success` or `success` in the info of a step, False if
-    it has neither.
+    clipped; those of the chosen actions must be finite.
+
+    Bounds of the current state are also observed. The observation ends with all lower, then all upper bounds, scaled so
+    that the space's bounds are -1 and 1. If the action space contains an option, the agent chooses it. The environment
+    may name its options in an attribute `option_names`. The leaf `success` bool `[N]` is `is_success` or `success` in
+    the info of a step, False if it has neither.
 
     A copy's first reset is seeded from `seed` and the copy's number, later resets are not seeded. `reset` also takes
     the seeds to use: a tensordict with `seed` int `[N]`.
@@ -199,7 +200,7 @@ class GymnasiumEnv(PAMDPEnv):
             torch.Size((num_envs, *self.components.shape)),
             torch.Size((num_envs, num_parameters)),
         )
-        self._largest = np.array(self.components.sizes) - 1
+        self._last_choices = np.array(self.components.sizes) - 1
         self._observation = np.zeros((num_envs, self._copies.layout.dim), np.float32)
         self._is_over = np.zeros(num_envs, bool)
         self._rows = [*range(num_envs)]
@@ -223,16 +224,16 @@ class GymnasiumEnv(PAMDPEnv):
     def _reading(self) -> Reading:
         given = self.options
         return Reading(
-            given.max_steps,
-            given.action_form,
-            None if given.parameter_dims is None else tuple(given.parameter_dims),
-            given.option_key,
-            given.action_mask,
-            given.pair_mask,
-            given.parameter_bounds,
-            None if given.observation_keys is None else tuple(given.observation_keys),
-            given.out_of_bounds,
-            self._flattens_pictures,
+            max_steps=given.max_steps,
+            action_form=given.action_form,
+            parameter_dims=None if given.parameter_dims is None else tuple(given.parameter_dims),
+            option_key=given.option_key,
+            action_mask=given.action_mask,
+            pair_mask=given.pair_mask,
+            parameter_bounds=given.parameter_bounds,
+            observation_keys=None if given.observation_keys is None else tuple(given.observation_keys),
+            out_of_bounds=given.out_of_bounds,
+            flattens_pictures=self._flattens_pictures,
         )
 
     @property
@@ -469,8 +470,8 @@ class GymnasiumEnv(PAMDPEnv):
             numbers = chosen.tolist()
             exists = min(numbers) >= 0 and max(numbers) < len(self.parameter_dims)
         else:
-            exists = bool(((chosen >= 0) & (chosen <= self._largest)).all())
-        # Finite numbers have a finite sum of squares, or else the full check passes them.
+            exists = bool(((chosen >= 0) & (chosen <= self._last_choices)).all())
+        # If the sum of squares is finite, so are the numbers. If not, the full check decides.
         if not (math.isfinite(np.vdot(values, values)) and exists):
             check_action_values(discrete, parameters, self.parameter_dims, components=self.components)
         return chosen, values
@@ -498,14 +499,11 @@ class GymnasiumEnv(PAMDPEnv):
     def _read(self, reward: np.ndarray | None = None) -> TensorDict:
         """Return the last results, with the rewards `[N]` if they are those of a step."""
         results = self._copies.results
-        # A new array of flags, so that the next step does not change what was returned.
-        flags = results.flags != 0.0
-        if flags.any():
-            if not self._reports_success and flags[3].any():
-                self._reports_success = True
-            np.logical_or(flags[0], flags[1], out=flags[3])
-        self._is_over[:] = flags[3]
-        columns = flags[..., None]
+        # The comparison makes a new array, so that the next step does not change what was returned.
+        terminated, truncated, success, has_success = results.flags != 0.0
+        self._reports_success = self._reports_success or bool(has_success.any())
+        done = terminated | truncated
+        self._is_over[:] = done
         observation = self._observation
         bounds = {}
         if results.bounds is not None:
@@ -514,10 +512,10 @@ class GymnasiumEnv(PAMDPEnv):
             bounds = {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
         leaves = {
             keys.OBSERVATION: torch.from_numpy(joined(observation, self._copies.pixels)),
-            _SUCCESS: torch.from_numpy(flags[2]),
-            keys.TERMINATED: torch.from_numpy(columns[0]),
-            keys.TRUNCATED: torch.from_numpy(columns[1]),
-            keys.DONE: torch.from_numpy(columns[3]),
+            _SUCCESS: torch.from_numpy(success),
+            keys.TERMINATED: torch.from_numpy(terminated[:, None]),
+            keys.TRUNCATED: torch.from_numpy(truncated[:, None]),
+            keys.DONE: torch.from_numpy(done[:, None]),
         }
         for name, mask in results.masks.items():
             leaves[name] = as_leaf(name, torch.from_numpy(mask != 0.0), len(self.parameter_dims))
@@ -533,9 +531,9 @@ class GymnasiumEnv(PAMDPEnv):
 
 
 def _fitted(picture: np.ndarray) -> np.ndarray:
-    """Return a picture with at most `_LARGEST` px from edge to edge."""
+    """Return a picture with at most `_LARGEST_PICTURE` px from edge to edge."""
     image = Image.fromarray(picture)
-    image.thumbnail((_LARGEST, _LARGEST))
+    image.thumbnail((_LARGEST_PICTURE, _LARGEST_PICTURE))
     return np.array(image)
 
 

@@ -1,4 +1,4 @@
-"""Pictures of the office: its walls, the three places, and the way that the agent made."""
+"""Pictures of the office: its walls, the three places, and the path that the agent took."""
 
 from __future__ import annotations
 

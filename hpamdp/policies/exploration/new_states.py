@@ -1,4 +1,4 @@
-"""What explorations share that reward new states, whatever says how new a state is."""
+"""The base class of explorations that reward new states."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from hpamdp.settings import SettingError
 
 
 class NoveltyPolicy(TensorDictModuleBase):
-    """A learner's policy, whose plans ask a module how new states are: so the module reaches collector processes."""
+    """A learner's policy together with the network that its plans use to score novelty.
+
+    As a submodule, the network is copied to collector processes.
+    """
 
     def __init__(self, policy: TensorDictModuleBase, network: nn.Module) -> None:
         super().__init__()

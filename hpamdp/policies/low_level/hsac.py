@@ -15,13 +15,13 @@ Differs from the source:
 - The actor and the temperatures may be updated less often than the critics, as in TD3 (arXiv 1802.09477).
 - If an action has several components, the expectation over all discrete actions would be a sum over all combinations.
   The soft value is then the mean of `component_samples` sampled actions, and the critics value the action as a whole.
-  The discrete heads get a policy gradient with the other samples' mean as its baseline (Kool, van Hoof and Welling
-  2019, *Buy 4 REINFORCE Samples, Get a Baseline for Free!*), the parameters a gradient through the critics.
-- With `autoregressive` each component's choice is a step of its own, whose state holds the choices before it (Metz et
-  al. 2017, *Discrete Sequential Prediction of Continuous Actions for Deep RL*, arXiv 1705.05035). So the heads learn in
-  states from the replay buffer: after choices that were executed, also after those that the policy no longer makes.
-  Otherwise the first component would settle before the later ones have learned what best follows its other choices.
-  The expectation over a component's own choices is exact.
+  The discrete heads get a policy gradient, whose baseline is the mean of the other samples (Kool, van Hoof and Welling
+  2019, *Buy 4 REINFORCE Samples, Get a Baseline for Free!*). The parameters get a gradient through the critics.
+- With `autoregressive`, each component's choice is a step of its own (Metz et al. 2017, *Discrete Sequential Prediction
+  of Continuous Actions for Deep RL*, arXiv 1705.05035). Its state includes the earlier components' choices. These come
+  from the replay buffer, so heads also learn after choices that the policy no longer makes. Without that, the first
+  component would settle too early: the later ones would not yet know what best follows its other choices. The
+  expectation over a component's own choices is exact.
 
 TorchRL's SACLoss does not fit: it sums the log-probabilities of all action leaves under one temperature. Its
 DiscreteSACLoss has no parameters, and the expectation over discrete actions here also weighs their log-densities.
@@ -151,7 +151,10 @@ class HSACActor(nn.Module):
 
 
 class HSACPolicy(TensorDictModuleBase):
-    """Samples the action, uniformly during the warm-up; greedy: the most probable one with the squashed means."""
+    """Sample from the actor, or uniformly during the warm-up.
+
+    If greedy, take the most probable discrete action with its squashed means.
+    """
 
     is_random: Tensor
 
@@ -367,9 +370,9 @@ class HSAC(ReplayLearner):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the same as `soft_value` for an autoregressive actor whose components take turns.
 
-        In every n-th state it is the turn of the same one of the n components. The components before it keep what was
-        executed there. The expectation over its own choices is exact, and the later components are sampled. So the
-        value is that of going on from there, and each discrete head gets the gradient of its turns.
+        The batch is split among the n components: state i is the turn of component i mod n. The components before it
+        keep what was executed there. The expectation over its own choices is exact, and the later components are
+        sampled. So the value is that of going on from there, and each discrete head gets the gradient of its turns.
 
         Args:
             state: as for `soft_value`.
@@ -379,7 +382,8 @@ class HSAC(ReplayLearner):
             unit: its parameters, `[B, num_parameters]`.
 
         Returns:
-            The values `[B]`, in the order of the turns, and the entropies where the first component has its turn.
+            The values `[B]`, in the order of the turns, and both entropies minus their targets, from the states of the
+            first component alone.
         """
         num = len(self.specs.components.sizes)
 

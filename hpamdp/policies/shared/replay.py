@@ -242,10 +242,10 @@ class ReplayLearner(Learner):
 
     def num_updates(self, steps: int) -> int:
         """Return the number of updates within this many steps, the first of which are the warm-up."""
-        updating = steps - self.options.warmup_steps
-        if updating <= 0:
+        warmup = self.options.warmup_steps
+        if steps < warmup:
             return 0
-        return int(self.options.updates_per_step * (steps if self.catches_up else updating))
+        return int(self.options.updates_per_step * (steps if self.catches_up else steps - warmup))
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Add the transitions in `mask` bool `[*B, T]` of a batch `[*B, T]` to the buffer."""

@@ -117,7 +117,7 @@ def _connect(address: str | None, num_workers: int) -> None:
     os.environ.setdefault("RAY_worker_niceness", "0")
     # Its C++ part prints a line a second while it waits for a cluster.
     os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")
-    # A local Ray takes `num_cpus` as given; with fewer CPUs than actors some actors would wait for ever.
+    # A local Ray takes `num_cpus` as given; with fewer CPUs than actors some actors would wait forever.
     init: dict[str, Any] = {"address": "local", "num_cpus": num_workers, "include_dashboard": False}
     if address is not None:
         check_answers(address)
