@@ -25,16 +25,17 @@ from omegaconf import DictConfig, open_dict, read_write
 
 from hpamdp.config.compose import job_overrides
 from hpamdp.config.errors import ConfigError
-from hpamdp.files import remove_link, replacing
+from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.messages import one_line, reason_of, say, warn
-from hpamdp.run.folder import check_no_link, is_about_folder, locked
+from hpamdp.run.folder import check_no_link, has_foreign_error, is_about_folder, locked, remove_error, write_error
 from hpamdp.run.search import go_on
 from hpamdp.run.stopping import exits_explained, pass_on_signal
-from hpamdp.run_files import ERROR_NAME, saved_summary
+from hpamdp.run_files import ERROR_NAME, MAX_TEXT_BYTES, saved_summary
 from hpamdp.shell import path_setting
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
+_HYDRA_NAME = "multirun.yaml"  # which Hydra writes into the sweep's folder
 # States of a job. The first one holds until the job ends.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
 _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
@@ -52,10 +53,9 @@ class SweepDir(Callback):
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Remember the sweep's folder, and leave the folders of the jobs to `run_job`."""
         _check_output_subdir(config)
-        SweepDir.path = Path(config.hydra.sweep.dir).absolute()
-        with suppress(OSError):  # Hydra fails for the same reason
-            remove_link(SweepDir.path / "multirun.yaml")  # which Hydra writes
+        SweepDir.path = Path(os.path.abspath(config.hydra.sweep.dir))
         try:
+            _check_sweep_dir(SweepDir.path)
             first_job = go_on(config)
         except ConfigError as error:
             warn(str(error))
@@ -66,6 +66,32 @@ class SweepDir(Callback):
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
         _compose_jobs_without_folders(hydra.config_loader, first_job)
+
+
+def _check_sweep_dir(folder: Path) -> None:
+    """Refuse the working directory, and a folder whose `multirun.yaml` Hydra would replace but has not written.
+
+    Raises:
+        ConfigError: the folder is refused.
+    """
+    if os.path.realpath(folder) == os.path.realpath(os.curdir):
+        raise ConfigError(
+            "hydra.sweep.dir: the working directory; give a folder of the sweep's own, or leave hydra.sweep.dir out"
+        )
+    file = folder / _HYDRA_NAME
+    if not os.path.lexists(file):
+        return
+    try:
+        is_hydras = read_regular(file, MAX_TEXT_BYTES).startswith(b"hydra:\n")
+    except OSError:
+        is_hydras = False
+    if not is_hydras:
+        raise ConfigError(
+            f"{_shown(folder)}: holds {_HYDRA_NAME}, which no sweep has written and a sweep would replace; take "
+            "another hydra.sweep.dir"
+        )
+    with suppress(OSError):  # Hydra fails for the same reason
+        remove_link(file)
 
 
 def _check_output_subdir(config: DictConfig) -> None:
@@ -193,8 +219,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
         job.state, job.reason = _FAILED, one_line("".join(traceback.format_exception_only(error)))
         if isinstance(error, OSError) and is_about_folder(error, folder):
             job.reason = f"its folder cannot be made or written to: {reason_of(error)}"
-        with suppress(OSError), replacing(folder / ERROR_NAME) as partial:
-            partial.write_text(traceback.format_exc())
+        write_error(folder, error)
     records.write(job)
     if job.state != _FINISHED:
         say(f"Job {job.number}: {job.state}{f': {job.reason}' if job.reason else ''}")
@@ -215,7 +240,7 @@ def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str
     done, source = rest_of(wanted, folder)
     if done is not None:
         return _SKIPPED, done, ""
-    (folder / ERROR_NAME).unlink(missing_ok=True)
+    remove_error(folder)
     if source is not None:
         say(f"Going on from {source}")
     reasons: list[str] = []
@@ -267,14 +292,14 @@ def report(start: str, error: BaseException | None = None) -> int:
         _report_seeds(sweep_dir, jobs)
     _print_tally(jobs)
     for job in failed:
-        told = Path(job.folder, ERROR_NAME)
-        warn(f"{job.overrides}: {job.reason} ({_shown(told if os.path.exists(told) else told.parent)})")
+        folder = Path(job.folder)
+        is_told = os.path.exists(folder / ERROR_NAME) and not has_foreign_error(folder)
+        warn(f"{job.overrides}: {job.reason} ({_shown(folder / ERROR_NAME if is_told else folder)})")
     if is_stopped or (error is not None and len(failed) < len(jobs)):
         if not is_stopped:
-            with replacing(sweep_dir / ERROR_NAME) as partial:
-                partial.write_text("".join(traceback.format_exception(error)))
+            told = sweep_dir / ERROR_NAME if write_error(sweep_dir, error) else sweep_dir
             reason = one_line("".join(traceback.format_exception_only(error)))
-            warn(f"The sweep broke off: {reason} ({_shown(sweep_dir / 'error.txt')})")
+            warn(f"The sweep broke off: {reason} ({_shown(told)})")
         say(f"To go on: the same command with {path_setting('hydra.sweep.dir', _shown(sweep_dir))}")
         return _INTERRUPTED if is_stopped else 1
     if not failed:
