@@ -184,6 +184,15 @@ def test_a_folder_of_experiments_stands_for_a_sweep_over_all_in_it(command, jobs
     assert line.is_multirun and seeds == "seed=0,4" and experiments.count(",") == 9
 
 
+def test_a_glob_stands_for_a_sweep_over_the_choices_that_match(command, jobs, tmp_path):
+    (tmp_path / "mine/low").mkdir(parents=True)
+    (tmp_path / "mine/low/hmine.yaml").write_text((CONF / "low/hppo.yaml").read_text())
+    line = completed(parse(["-m", "--config-dir", str(tmp_path / "mine"), "low=glob([hm*,h*o],exclude=x)"], CONF), CONF)
+    assert line.words == ["low=hmine,hppo"]
+    code, out, err = command("-m", "low=glob(random)", "high=glob([uniform,fixed])")
+    assert (code, err) == (0, "") and "Job 1: low=random high=uniform\n" in out and len(jobs) == 2
+
+
 def test_a_sweep_over_experiments_with_folders_of_their_own_is_refused_until_one_is_given(command, jobs, tmp_path):
     words = ["-m", "experiment=few_steps,domains/moving", "low=random"]
     code, _, err = command(*words)

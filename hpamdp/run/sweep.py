@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import os
 import signal
 import sys
@@ -20,10 +21,12 @@ from typing import Any, ClassVar
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, open_dict, read_write
 
-from hpamdp.config.compose import job_overrides
+from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.messages import one_line, reason_of, say, warn
@@ -35,6 +38,11 @@ from hpamdp.shell import path_setting
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
+# Settings of Hydra that only a sweep reads, and those that only a single run reads.
+_OF_SWEEPS = ("hydra.sweep.", "hydra.sweeper.", "hydra.launcher.", "hydra/sweeper", "hydra/launcher")
+_OF_RUNS = ("hydra.run.",)
+_BASIC_SWEEPER = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
+_MOST_JOBS = 100_000
 _HYDRA_NAME = "multirun.yaml"  # which Hydra writes into the sweep's folder
 # States of a job. The first one holds until the job ends.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
@@ -47,15 +55,18 @@ class SweepDir(Callback):
     path: ClassVar[Path | None] = None
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Refuse files of Hydra in the run's folder."""
+        """Refuse files of Hydra in the run's folder, and settings of sweeps."""
         _check_output_subdir(config)
+        _check_effects(config, _OF_SWEEPS, "has no effect on a single run; add --multirun, or give hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Remember the sweep's folder, and leave the folders of the jobs to `run_job`."""
         _check_output_subdir(config)
+        _check_effects(config, _OF_RUNS, "has no effect on a sweep; give hydra.sweep.dir")
         SweepDir.path = Path(os.path.abspath(config.hydra.sweep.dir))
         try:
             _check_sweep_dir(SweepDir.path)
+            _check_number(config)
             first_job = go_on(config)
         except ConfigError as error:
             warn(str(error))
@@ -66,6 +77,42 @@ class SweepDir(Callback):
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
         _compose_jobs_without_folders(hydra.config_loader, first_job)
+
+
+def _check_effects(config: DictConfig, settings: tuple[str, ...], effect: str) -> None:
+    """Exit if the command line gives some of these settings of Hydra, which have no effect here."""
+    for word in config.hydra.overrides.hydra:
+        if setting_of(word).startswith(settings):
+            warn(one_line(f"{word}: {effect}"))
+            sys.exit(_MISTAKE)
+
+
+def _check_number(config: DictConfig) -> None:
+    """Refuse a sweep of so many jobs that Hydra, which lists all of them first, would run out of memory.
+
+    Raises:
+        ConfigError: there are too many jobs.
+    """
+    sweeper = config.hydra.sweeper
+    if sweeper._target_ != _BASIC_SWEEPER:  # others draw values from a range
+        return
+    words = {name: f"{name}={values}" for name, values in (sweeper.params or {}).items()}
+    words |= {setting_of(word): word for word in config.hydra.overrides.task}
+    swept = [each for each in OverridesParser.create().parse_overrides([*words.values()]) if each.is_discrete_sweep()]
+    if math.prod(map(_num_values, swept)) > _MOST_JOBS:
+        given = " ".join(each.input_line or "" for each in swept if _num_values(each) > 1)
+        raise ConfigError(f"{given}: more than {_MOST_JOBS:,} jobs; give fewer values")
+
+
+def _num_values(swept: Override) -> float:
+    values = swept.value()
+    if not isinstance(values, RangeSweep):
+        return len(values.list) if isinstance(values, ChoiceSweep) else 1
+    assert values.start is not None and values.stop is not None
+    length = float(values.stop) - float(values.start)
+    if math.isnan(length) or values.step == 0:
+        return 1  # which Hydra refuses
+    return max(0.0, length / values.step)
 
 
 def _check_sweep_dir(folder: Path) -> None:
