@@ -106,6 +106,12 @@ MISTAKES = [
         ["experiment=few_steps", "hydra.mode=RUN", "hydra.sweep.dir=x"],
         "hydra.sweep.dir=x: has no effect on a single run; add --multirun",
     ),
+    (["resume=auto"], "resume=auto: goes on with the run in a folder, so give hydra.run.dir"),
+    (["-m", "resume=auto"], "resume=auto: goes on with the run in a folder, so give hydra.sweep.dir"),
+    (
+        ["resume=auto", "hydra.run.dir=out/${now:%H-%M}"],
+        "resume=auto: goes on with the run in a folder, so give hydra.run.dir",
+    ),
     (["-m", "low=glob(x*)"], "low=glob(x*): matches no choice; conf/low has bc, "),
     (["-m", "experiment=glob(domains/*)"], "experiment=glob(domains/*): matches no choice; conf/experiment has "),
     (["-m", "seed=glob(*)"], "seed=glob(*): glob is for a group, as in low=glob(h*); list the values"),

@@ -165,6 +165,14 @@ def test_a_sweep_started_again_does_what_is_left(command, jobs):
     assert command(*words[:1], "seed=0,3,4", words[2])[0] == 0 and not jobs
 
 
+def test_a_sweep_goes_on_by_itself_so_resume_auto_changes_nothing(command, jobs):
+    words = ["-m", "seed=0,3", "hydra.sweep.dir=sweep"]
+    command(*words)
+    jobs.clear()
+    code, _, err = command(*words, "resume=auto")
+    assert (code, err) == (0, "") and [seed for seed, _ in jobs] == [3]
+
+
 def test_a_sweep_over_experiments_of_one_study_lies_in_its_folder_and_is_told_at_the_end(command, jobs, tmp_path):
     words = ["-m", "experiment=domains/moving,domains/sliding", "low=random", "seed=0,4"]
     code, out, err = command(*words)

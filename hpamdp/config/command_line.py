@@ -174,18 +174,21 @@ def _check_groups(line: CommandLine, conf: Path) -> None:
             raise ConfigError(f"{override.input_line}: a run has a list of callbacks; write callbacks=[NAME, ...]")
         if override.is_add() and override.key_or_group in GROUPS:
             raise ConfigError(f"{override.input_line}: {override.key_or_group} is always chosen; leave out the +")
-        folder = conf / override.key_or_group
-        if override.value_type == ValueType.GLOB_CHOICE_SWEEP and not os.path.isdir(folder):
+        _check_choice(override, conf / override.key_or_group)
+
+
+def _check_choice(override: Override, folder: Path) -> None:
+    is_group = os.path.isdir(folder)  # unlike `Path.is_dir` for any text
+    if override.value_type == ValueType.GLOB_CHOICE_SWEEP:  # it finds choices alone
+        if not is_group:
             raise ConfigError(f"{override.input_line}: glob is for a group, as in low=glob(h*); list the values")
-        if not os.path.isdir(folder) or override.is_delete():  # unlike `Path.is_dir` for any text
-            continue
-        if override.value_type == ValueType.GLOB_CHOICE_SWEEP:  # it finds choices alone
-            continue
-        values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
-        if not all(_is_choice(value) for value in values):
-            given = str(override.value())
-            wrong = no_such("choice", given, choices_in(folder), where=f"conf/{folder.name}")
-            raise ConfigError(f"{override.input_line}: {wrong}")
+        return
+    if not is_group or override.is_delete():
+        return
+    values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
+    if not all(_is_choice(value) for value in values):
+        wrong = no_such("choice", str(override.value()), choices_in(folder), where=f"conf/{folder.name}")
+        raise ConfigError(f"{override.input_line}: {wrong}")
 
 
 def _is_choice(value: object) -> bool:

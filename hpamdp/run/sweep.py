@@ -24,10 +24,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError
+from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.messages import one_line, reason_of, say, warn
 from hpamdp.run.folder import check_no_link, has_foreign_error, is_about_folder, locked, remove_error, write_error
@@ -58,11 +59,13 @@ class SweepDir(Callback):
         """Refuse files of Hydra in the run's folder, and settings of sweeps."""
         _check_output_subdir(config)
         _check_effects(config, _OF_SWEEPS, "has no effect on a single run; add --multirun, or give hydra.run.dir")
+        _check_fixed(config, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Remember the sweep's folder, and leave the folders of the jobs to `run_job`."""
         _check_output_subdir(config)
         _check_effects(config, _OF_RUNS, "has no effect on a sweep; give hydra.sweep.dir")
+        _check_fixed(config, "hydra.sweep.dir")
         SweepDir.path = Path(os.path.abspath(config.hydra.sweep.dir))
         try:
             _check_sweep_dir(SweepDir.path)
@@ -85,6 +88,14 @@ def _check_effects(config: DictConfig, settings: tuple[str, ...], effect: str) -
         if setting_of(word).startswith(settings):
             warn(one_line(f"{word}: {effect}"))
             sys.exit(_MISTAKE)
+
+
+def _check_fixed(config: DictConfig, name: str) -> None:
+    """Exit if `resume=auto` would never find the run again, because each start makes a folder of its own."""
+    folder = OmegaConf.select(config, name.rpartition(".")[0])._get_node("dir")._value()
+    if config.resume == RESUME_AUTO and "${now:" in str(folder):
+        warn(f"resume=auto: goes on with the run in a folder, so give {name}")
+        sys.exit(_MISTAKE)
 
 
 def _check_number(config: DictConfig) -> None:
@@ -283,6 +294,8 @@ def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str
     from hpamdp.run.continuation import rest_of
     from hpamdp.run.resume import resolve
 
+    if cfg.resume == RESUME_AUTO:  # as every sweep does
+        cfg.resume = None
     wanted, _ = resolve(cfg, overrides)
     done, source = rest_of(wanted, folder)
     if done is not None:
