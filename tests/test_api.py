@@ -1122,3 +1122,21 @@ def test_a_method_of_another_library_names_ours(name, ours, platform_agent):
 
 def test_make_takes_what_train_takes():
     assert hpamdp.make(lambda: Reach(), num_envs=2, max_steps=5).num_envs == 2
+
+
+def test_an_experiment_that_is_a_sweep_is_refused_until_each_swept_setting_has_a_value():
+    tiny = {"high": None, **TINY, "low": "random"}
+    complaint = (
+        "experiment=few_steps: a sweep over seed, env.controller, for the command line; to train one agent, give"
+    )
+    with pytest.raises(hpamdp.ConfigError, match=complaint):
+        hpamdp.train(experiment="few_steps", **tiny)
+    with pytest.raises(hpamdp.ConfigError, match=r"a sweep over env\.controller, .* give it a value"):
+        hpamdp.train(experiment="few_steps", seed=3, **tiny)
+    hpamdp.train(experiment="few_steps", seed=3, controller="congruent", **tiny)
+
+
+def test_a_folder_of_experiments_is_named_with_what_is_in_it():
+    complaint = "experiment=domains: a folder; choose one of domains/catch_point, domains/goal, "
+    with pytest.raises(hpamdp.ConfigError, match=complaint):
+        hpamdp.train(experiment="domains", low="random")

@@ -18,12 +18,12 @@ from test_metrics import without_login  # noqa: F401  (a fixture)
 from hpamdp.config.errors import ConfigError
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
-from hpamdp.run.folder import locked, moved_aside
+from hpamdp.run.folder import locked, moved_aside, write_error
 from hpamdp.run.loggers import TensorboardLogger, WandbLogger
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 from hpamdp.run.trainer import Trainer
-from hpamdp.run_files import CONFIG_NAME
+from hpamdp.run_files import CONFIG_NAME, ERROR_NAME
 
 TINY = ["num_envs=8", "steps_per_batch=4", "total_frames=128", "log_every=32", "eval.layouts=4", "eval.every=0"]
 TINY += ["high=ucb", "low=random"]
@@ -130,6 +130,27 @@ def test_files_that_no_run_has_written_are_never_replaced(tmp_path):
         with pytest.raises(ConfigError, match=r"holds config\.yaml, which no run has written"):
             start(tmp_path, word)
     assert contents(tmp_path) == {CONFIG_NAME: b"title: my site\n"}
+
+
+def test_an_error_file_that_no_sweep_has_written_is_never_removed(tmp_path):
+    (tmp_path / ERROR_NAME).write_text("my own errors\n")
+    for word in ("overwrite=false", "overwrite=true"):
+        with pytest.raises(ConfigError, match=r"holds error\.txt, which no run has written"):
+            start(tmp_path, word)
+    (tmp_path / ERROR_NAME).unlink()
+    start(tmp_path)
+    (tmp_path / ERROR_NAME).write_text("my own errors\n")
+    start(tmp_path, "overwrite=true")
+    assert (tmp_path / ERROR_NAME).read_text() == "my own errors\n", "in the folder of a run, too"
+
+
+def test_an_error_file_that_a_sweep_has_written_goes_with_the_run(tmp_path):
+    try:
+        raise ValueError("a bug")
+    except ValueError as error:
+        assert write_error(tmp_path, error)
+    start(tmp_path)
+    assert not (tmp_path / ERROR_NAME).exists()
 
 
 def test_a_resumed_run_in_the_folder_of_another_replaces_it_as_a_whole(tmp_path):

@@ -233,6 +233,41 @@ def test_damaged_and_hostile_runs_cost_a_line_each(tmp_path, capsys):
     report.write(tmp_path / "to")
 
 
+@pytest.mark.parametrize("seed", ["1.0", "'1'", "true", "null", "[1]"])
+def test_a_run_whose_seed_is_no_whole_number_is_left_out(tmp_path, capsys, seed):
+    leave_run(tmp_path / "a", seed=1)
+    leave_run(tmp_path / "b", seed=2)
+    text = (tmp_path / "b/config.yaml").read_text()
+    (tmp_path / "b/config.yaml").write_text(text.replace("seed: 2\n", f"seed: {seed}\n"))
+    assert [row["seeds"] for row in hpamdp.report(tmp_path)] == [1]
+    err = capsys.readouterr().err
+    assert err.startswith(f"{tmp_path}/b: config.yaml has seed=") and err.count("\n") == 1
+    assert err.endswith(", which is no whole number, left out\n")
+
+
+def test_a_run_whose_summary_contradicts_its_config_or_itself_is_left_out(tmp_path, capsys):
+    leave_run(tmp_path / "a", seed=1)
+    leave_run(tmp_path / "b", seed=2, summary={"seed": 5})
+    leave_run(tmp_path / "c", seed=3, summary={"seed": True})
+    leave_run(tmp_path / "d", seed=4, summary={"finished": "no"})
+    assert [(row["seeds"], row["unfinished"]) for row in hpamdp.report(tmp_path)] == [(1, 0)]
+    assert capsys.readouterr().err.splitlines() == [
+        f"{tmp_path}/b: config.yaml has seed=2, but summary.json has seed=5, left out",
+        f"{tmp_path}/c: config.yaml has seed=3, but summary.json has seed=true, left out",
+        f'{tmp_path}/d: summary.json has finished="no", which is neither true nor false, left out',
+    ]
+
+
+def test_the_texts_of_a_table_are_no_formulas_and_have_no_control_characters(tmp_path):
+    names = ["=SUM(A1)", "+1", "-1", "@a", "a\x1b[31m\nb", "c"]
+    for seed, name in enumerate(names):
+        leave_run(tmp_path / "runs" / name, seed=seed, scores=(-float(seed),))
+    hpamdp.report(tmp_path / "runs", to=tmp_path / "runs")
+    rows = read_table(tmp_path / "runs")
+    assert {row["folder"] for row in rows} == {"'=SUM(A1)", "'+1", "'-1", "'@a", r"a\x1b[31m\nb", "c"}
+    assert "-5.0" in {row["eval/score"] for row in rows}, "numbers stay"
+
+
 def test_metrics_with_very_many_columns_are_read_in_linear_time(tmp_path):
     leave_run(tmp_path / "run")
     columns = ",".join(map(str, range(30_000)))
@@ -262,6 +297,8 @@ def test_the_command_prints_the_table_and_writes_only_where_it_is_told_to(comman
     ("words", "mistake"),
     [
         (["nowhere"], "nowhere: there is no such folder\n"),
+        ([""], "argument FOLDER: must be a path, not an empty text; see "),
+        (["run", "--to", ""], "argument --to: must be a path, not an empty text; see "),
         (["empty"], "empty: no run in there\n"),
         (
             ["run", "--metric", "eval/x"],

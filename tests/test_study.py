@@ -73,6 +73,13 @@ def test_a_folder_without_runs_is_named(tmp_path, capsys):
     assert capsys.readouterr().err == f"{tmp_path}: has no runs\n"
 
 
+def test_an_empty_path_is_not_the_working_directory(tmp_path, monkeypatch):
+    leave_run(tmp_path / "a")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="an empty path; name the folders of the runs"):
+        finished(["a", ""])
+
+
 def test_finished_runs_are_found_at_any_depth_and_unfinished_ones_left_out(tmp_path):
     leave_run(tmp_path / "b/deep/er", seed=1)
     leave_run(tmp_path / "a", seed=2)

@@ -107,10 +107,40 @@ def test_a_report_of_the_users_own_stays(command, jobs, tmp_path):
     assert (tmp_path / "sweep/report.csv").read_text() == "mine"
 
 
-def test_a_sweep_around_the_working_directory_reports_its_own_jobs_alone(command, jobs, tmp_path):
+def test_a_file_in_place_of_hydras_own_stays_and_the_sweep_is_refused(command, jobs, tmp_path):
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep/multirun.yaml").write_text("mine")
+    code, _, err = command("-m", "seed=0,4", "hydra.sweep.dir=sweep")
+    assert (code, err) == (
+        2,
+        "sweep: holds multirun.yaml, which no sweep has written and a sweep would replace; take another "
+        "hydra.sweep.dir\n",
+    )
+    assert not jobs and [file.read_text() for file in (tmp_path / "sweep").iterdir()] == ["mine"]
+
+
+def test_the_working_directory_is_no_folder_of_a_sweep(command, jobs, tmp_path):
+    for folder in (".", tmp_path):
+        code, _, err = command("-m", "seed=0,4", f"hydra.sweep.dir={folder}")
+        assert code == 2 and err.startswith("hydra.sweep.dir: the working directory; ") and err.count("\n") == 1
+    assert not jobs and not list(tmp_path.iterdir())
+
+
+def test_a_sweep_around_the_working_directory_reports_its_own_jobs_alone(command, jobs, tmp_path, monkeypatch):
     command("-m", "seed=0,4", "hydra.sweep.dir=elsewhere")
-    _, out, _ = command("-m", "seed=8", "hydra.sweep.dir=.")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    _, out, _ = command("-m", "seed=8", "hydra.sweep.dir=..")
     assert "score: of one seed, so without a deviation" in out
+
+
+def test_an_error_file_of_the_users_own_stays_in_the_folder_of_a_job(command, jobs, tmp_path):
+    for number in range(2):
+        (tmp_path / f"sweep/{number}").mkdir(parents=True)
+        (tmp_path / f"sweep/{number}/error.txt").write_text("mine")
+    code, _, err = command("-m", "seed=0,2", "hydra.sweep.dir=sweep")
+    assert code == 1 and err == "seed=2: ZeroDivisionError: a bug (sweep/1)\n"
+    assert {(tmp_path / f"sweep/{number}/error.txt").read_text() for number in range(2)} == {"mine"}
 
 
 def test_a_sweep_that_was_stopped_has_no_table_yet(command, jobs, tmp_path):
@@ -136,6 +166,14 @@ def test_a_sweep_started_again_does_what_is_left(command, jobs):
     assert command(*words[:1], "seed=0,3,4", words[2])[0] == 0 and not jobs
 
 
+def test_a_sweep_goes_on_by_itself_so_resume_auto_changes_nothing(command, jobs):
+    words = ["-m", "seed=0,3", "hydra.sweep.dir=sweep"]
+    command(*words)
+    jobs.clear()
+    code, _, err = command(*words, "resume=auto")
+    assert (code, err) == (0, "") and [seed for seed, _ in jobs] == [3]
+
+
 def test_a_sweep_over_experiments_of_one_study_lies_in_its_folder_and_is_told_at_the_end(command, jobs, tmp_path):
     words = ["-m", "experiment=domains/moving,domains/sliding", "low=random", "seed=0,4"]
     code, out, err = command(*words)
@@ -153,6 +191,15 @@ def test_a_folder_of_experiments_stands_for_a_sweep_over_all_in_it(command, jobs
     line = completed(parse(["--multirun", "experiment=domains", "seed=0,4"], CONF), CONF)
     experiments, seeds = line.words[-2:]
     assert line.is_multirun and seeds == "seed=0,4" and experiments.count(",") == 9
+
+
+def test_a_glob_stands_for_a_sweep_over_the_choices_that_match(command, jobs, tmp_path):
+    (tmp_path / "mine/low").mkdir(parents=True)
+    (tmp_path / "mine/low/hmine.yaml").write_text((CONF / "low/hppo.yaml").read_text())
+    line = completed(parse(["-m", "--config-dir", str(tmp_path / "mine"), "low=glob([hm*,h*o],exclude=x)"], CONF), CONF)
+    assert line.words == ["low=hmine,hppo"]
+    code, out, err = command("-m", "low=glob(random)", "high=glob([uniform,fixed])")
+    assert (code, err) == (0, "") and "Job 1: low=random high=uniform\n" in out and len(jobs) == 2
 
 
 def test_a_sweep_over_experiments_with_folders_of_their_own_is_refused_until_one_is_given(command, jobs, tmp_path):

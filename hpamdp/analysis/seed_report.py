@@ -32,6 +32,7 @@ from hpamdp.metrics_file import EVALUATION
 DEFAULT_METRIC = "eval/score"
 TABLE_NAME, FIGURE_NAME = "report.csv", "report.png"
 _BEGINNING = b"configuration,folder,seed,state,"  # of a table
+_FORMULA = ("=", "+", "-", "@")  # how a formula of a spreadsheet begins
 # Of more configurations than this with one seed each, such as the trials of a search, only the highest are shown.
 _MANY, _MOST_TRIALS = 20, 10
 _LEAST_FOR_INTERVAL = 5  # seeds
@@ -123,7 +124,7 @@ class Report:
         folder.mkdir(parents=True, exist_ok=True)
         with (
             replacing(table) as partial,
-            partial.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,
+            partial.open("w", encoding="utf-8", newline="") as file,
         ):
             rows = self._run_rows(folder)
             writer = csv.DictWriter(file, rows[0])
@@ -141,11 +142,11 @@ class Report:
     def _run_rows(self, folder: Path) -> list[dict[str, Any]]:
         return [
             {
-                "configuration": each.name,
-                "folder": os.path.relpath(run.folder, folder),
+                "configuration": _as_cell(each.name),
+                "folder": _as_cell(os.path.relpath(run.folder, folder)),
                 "seed": run.seed,
                 "state": run.state,
-                self.metric: run.value,
+                _as_cell(self.metric): run.value,
                 **{name: run.effort(name) for name in ("frames", "wall_s", "cpu_s")},
             }
             for each in self.configurations
@@ -182,6 +183,15 @@ def _is_of_a_report(path: Path) -> bool:
     except OSError:
         return False
     return beginning.startswith(_BEGINNING) if path.name == TABLE_NAME else SOFTWARE.encode() in beginning
+
+
+def _as_cell(text: str) -> str:
+    """Return a text for a table, with escapes for control characters.
+
+    An apostrophe comes first if a spreadsheet would take the text for a formula.
+    """
+    shown = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+    return f"'{shown}" if shown.startswith(_FORMULA) else shown
 
 
 def _row(configuration: Configuration) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hpamdp.analysis.study import run_folders
+from hpamdp.analysis.study import fault_of, run_folders
 from hpamdp.messages import one_line, reason_of, warn
 from hpamdp.metrics_file import EVALUATION, read_curve
 from hpamdp.run_files import (
@@ -97,7 +97,7 @@ class Configuration:
     @property
     def name(self) -> str:
         """The settings as words of a command line."""
-        return " ".join(f"{name}={value}" for name, value in self.settings.items()) or "all runs"
+        return one_line(" ".join(f"{name}={value}" for name, value in self.settings.items())) or "all runs"
 
     @property
     def scored(self) -> list[SeedRun]:
@@ -154,6 +154,10 @@ def _read(folder: Path, metric: str) -> SeedRun | None:
         return None
     if not summary and not {"mode", _SEED, "env", "low"} <= config.keys():
         return None  # a config of another program
+    fault = fault_of(summary, config)
+    if fault is not None:
+        warn(one_line(f"{folder}: {fault}, left out"))
+        return None
     columns, points = _read_points(folder / METRICS_NAME, metric)
     if summary.get(FINISHED):
         state = FINISHED

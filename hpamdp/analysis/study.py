@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy import stats
 
+from hpamdp.complaints import as_json
 from hpamdp.config.compose import choosing, compose, plain_groups
 from hpamdp.config.errors import MissingChoiceError
 from hpamdp.files import replacing
@@ -68,7 +69,13 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
     """Return the finished runs under the folders, sorted by name, and warn about all other runs.
 
     Links to folders are followed. A run that is found twice counts once.
+
+    Raises:
+        SystemExit: a path is empty, which would stand for the working directory.
     """
+    folders = [*folders]
+    if "" in folders:
+        raise SystemExit("an empty path; name the folders of the runs")
     runs, seen = [], set[str]()
     found: list[Path] = []
     for given in folders:
@@ -81,11 +88,33 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
         summary, config = saved_summary(folder), saved_config(folder)
         if not summary or not config:
             warn(f"{folder}: {CONFIG_NAME if summary else SUMMARY_NAME} is missing or damaged, left out")
+        elif fault := fault_of(summary, config):
+            warn(one_line(f"{folder}: {fault}, left out"))
         elif summary.get("finished"):
             runs.append(Run(folder, summary, config))
         else:
             warn(f"{folder}: was stopped, left out")
     return runs
+
+
+def fault_of(summary: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
+    """Return why the seed of a run, or whether it is finished, is not known, or None.
+
+    Args:
+        summary: the run's `summary.json`; empty if there is none.
+        config: its `config.yaml`.
+    """
+    if "seed" in config:
+        seed = config["seed"]
+        told = summary.get("seed", seed)
+        if type(seed) is not int:
+            return f"{CONFIG_NAME} has seed={as_json(seed)}, which is no whole number"
+        if type(told) is not int or told != seed:
+            return f"{CONFIG_NAME} has seed={seed}, but {SUMMARY_NAME} has seed={as_json(told)}"
+    is_finished = summary.get("finished", False)
+    if not isinstance(is_finished, bool):
+        return f"{SUMMARY_NAME} has finished={as_json(is_finished)}, which is neither true nor false"
+    return None
 
 
 def gathered(

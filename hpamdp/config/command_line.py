@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, QuotedString
+from hydra.core.override_parser.types import Glob, Override, QuotedString, ValueType
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -173,14 +174,21 @@ def _check_groups(line: CommandLine, conf: Path) -> None:
             raise ConfigError(f"{override.input_line}: a run has a list of callbacks; write callbacks=[NAME, ...]")
         if override.is_add() and override.key_or_group in GROUPS:
             raise ConfigError(f"{override.input_line}: {override.key_or_group} is always chosen; leave out the +")
-        folder = conf / override.key_or_group
-        if not os.path.isdir(folder) or override.is_delete():  # unlike `Path.is_dir` for any text
-            continue
-        values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
-        if not all(_is_choice(value) for value in values):
-            given = str(override.value())
-            wrong = no_such("choice", given, choices_in(folder), where=f"conf/{folder.name}")
-            raise ConfigError(f"{override.input_line}: {wrong}")
+        _check_choice(override, conf / override.key_or_group)
+
+
+def _check_choice(override: Override, folder: Path) -> None:
+    is_group = os.path.isdir(folder)  # unlike `Path.is_dir` for any text
+    if override.value_type == ValueType.GLOB_CHOICE_SWEEP:  # it finds choices alone
+        if not is_group:
+            raise ConfigError(f"{override.input_line}: glob is for a group, as in low=glob(h*); list the values")
+        return
+    if not is_group or override.is_delete():
+        return
+    values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
+    if not all(_is_choice(value) for value in values):
+        wrong = no_such("choice", str(override.value()), choices_in(folder), where=f"conf/{folder.name}")
+        raise ConfigError(f"{override.input_line}: {wrong}")
 
 
 def _is_choice(value: object) -> bool:
@@ -206,13 +214,13 @@ def choices_in(folder: Path) -> list[str]:
 
 
 def completed(line: CommandLine, conf: Path) -> CommandLine:
-    """Add what the words stand for: a saved run's choices, a folder's experiments and their sweep's folder.
+    """Add what the words stand for: a saved run's choices, a folder's experiments, globs and the sweep's folder.
 
     Raises:
-        ConfigError: there is no such run, or the experiments of a sweep have different folders.
+        ConfigError: there is no such run, a glob matches nothing, or the experiments of a sweep have different folders.
     """
     line = line.with_words(_saved_words(line))
-    line = _with_experiments_of_a_folder(line, conf)
+    line = _with_globs_written_out(_with_experiments_of_a_folder(line, conf), conf)
     return line.with_words(_sweep_folder(line, conf))
 
 
@@ -243,6 +251,30 @@ def _with_experiments_of_a_folder(line: CommandLine, conf: Path) -> CommandLine:
     experiments = ",".join(f"{folder.name}/{file.stem}" for file in sorted(folder.glob("*.yaml")))
     words = [f"experiment={experiments}" if override is chosen else override.input_line for override in line.overrides]
     return CommandLine({**line.flags, "multirun": True}, _parsed([word or "" for word in words]))
+
+
+def _with_globs_written_out(line: CommandLine, conf: Path) -> CommandLine:
+    """Write `GROUP=glob(...)` out as a sweep over the choices that Hydra finds.
+
+    Raises:
+        ConfigError: a glob matches no choice.
+    """
+    words = line.words
+    globs = [i for i, each in enumerate(line.overrides) if each.value_type == ValueType.GLOB_CHOICE_SWEEP]
+    if not line.is_multirun or not globs:
+        return line
+    with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        for i in globs:
+            override = line.overrides[i]
+            group, pattern = override.key_or_group, override.value()
+            assert isinstance(pattern, Glob)
+            names = loader.get_group_options(group, config_name="config", overrides=line.search_path)
+            found = pattern.filter(names)
+            if not found:
+                raise ConfigError(f"{words[i]}: matches no choice; conf/{group} has {', '.join(names)}")
+            words[i] = f"{override.get_key_element()}={','.join(found)}"
+    return CommandLine(line.flags, _parsed(words))
 
 
 def _sweep_folder(line: CommandLine, conf: Path) -> list[str]:

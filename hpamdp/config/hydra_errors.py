@@ -60,6 +60,9 @@ def _missing_choice(file: str, there: Sequence[str], conf: Path) -> str:
         return f"{group}={name}: no such choice; there is {', '.join(sorted({*there, *_EXTRAS[group]}))}"
     if not group.startswith("hydra"):  # a folder of a group may be part of the choice
         group, _, name = file.partition("/")
+    if os.path.isdir(conf / group / name):
+        inside = [each for each in choices_in(conf / group) if each.startswith(f"{name}/")]
+        return f"{group}={name}: a folder; choose one of {', '.join(inside)}"
     return f"{group}={name}: {no_such('choice', name, {*there, *choices_in(conf / group)}, where=f'conf/{group}')}"
 
 

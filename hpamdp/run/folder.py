@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -46,6 +47,8 @@ _OTHERS = (
     TENSORBOARD_NAME,
     WANDB_NAME,
 )
+# In the first line of each `error.txt` that is written here.
+_TRACEBACK = b"Traceback (most recent call last):"
 # Folder of an earlier run while a new one starts in its place.
 _ASIDE_NAME = ".replaced"
 
@@ -101,6 +104,8 @@ def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
     is_of_a_run = marks or {"mode", "seed", "env", "low"} <= saved_config(folder).keys() or _aside(folder).exists()
     if not is_of_a_run:
         foreign = [path.name for path in written_by_a_run(folder) if path.name != ERROR_NAME]
+        if has_foreign_error(folder):
+            foreign.append(ERROR_NAME)
         if foreign:
             raise ConfigError(
                 f"{folder}: holds {', '.join(foreign)}, which no run has written and a run would replace; take another "
@@ -177,6 +182,37 @@ def is_about_folder(error: OSError, folder: Path) -> bool:
     return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
+def write_error(folder: Path, error: BaseException) -> bool:
+    """Write an error's traceback into the folder of a run or a sweep, and return whether that was possible.
+
+    A file of that name that somebody else has written stays.
+    """
+    if has_foreign_error(folder):
+        return False
+    with suppress(OSError), replacing(folder / ERROR_NAME) as partial:
+        partial.write_text("".join(traceback.format_exception(error)))
+        return True
+    return False
+
+
+def remove_error(folder: Path) -> None:
+    """Remove the file that `write_error` wrote, if there is one."""
+    if not has_foreign_error(folder):
+        (folder / ERROR_NAME).unlink(missing_ok=True)
+
+
+def has_foreign_error(folder: Path) -> bool:
+    """Return whether the folder has an `error.txt` that `write_error` has not written."""
+    file = folder / ERROR_NAME
+    if not os.path.lexists(file):
+        return False
+    try:
+        beginning, _, _ = read_regular(file, MAX_TEXT_BYTES, follow_links=False).partition(b"\n")
+    except OSError:
+        return True
+    return _TRACEBACK not in beginning
+
+
 def written_by_a_run(folder: Path) -> list[Path]:
     """Return the paths that a run has written into its folder, first the files that mark a run."""
     names = [*_MARKS, *_OTHERS]
@@ -184,7 +220,8 @@ def written_by_a_run(folder: Path) -> list[Path]:
         listed = read_regular(folder / FIGURES_NAME, MAX_TEXT_BYTES).decode().splitlines()
         names += [name for name in listed if Path(name).name == name and not (folder / name).is_dir()]
     paths = [folder / name for name in (*names, FIGURES_NAME, CONFIG_NAME)]
-    return [path for path in dict.fromkeys(paths) if path.exists() or path.is_symlink()]
+    found = [path for path in dict.fromkeys(paths) if path.exists() or path.is_symlink()]
+    return [path for path in found if path.name != ERROR_NAME or not has_foreign_error(folder)]
 
 
 def _aside(folder: Path) -> Path:

@@ -19,6 +19,12 @@ Compare runs by their means over seeds.
 """
 
 
+def _path(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("must be a path, not an empty text")
+    return Path(text)
+
+
 def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     """Print the table, write the files if they are asked for, and return the exit code.
 
@@ -26,9 +32,9 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
         ConfigError: a folder has no runs, no run has the metric, or a file cannot be written.
     """
     parser.description = _DESCRIPTION
-    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="a run, or a folder of runs")
+    parser.add_argument("folders", nargs="+", type=_path, metavar="FOLDER", help="a run, or a folder of runs")
     parser.add_argument("--metric", default=DEFAULT_METRIC, help=f"a column of metrics.csv ({DEFAULT_METRIC})")
-    parser.add_argument("--to", type=Path, metavar="FOLDER", help="where to write report.csv and report.png")
+    parser.add_argument("--to", type=_path, metavar="FOLDER", help="where to write report.csv and report.png")
     options = parser.parse_intermixed_args(words)
     report = report_on(options.folders, options.metric)
     say(report.table())

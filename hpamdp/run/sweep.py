@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import os
 import signal
 import sys
@@ -20,22 +21,31 @@ from typing import Any, ClassVar
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from hpamdp.config.compose import job_overrides
+from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError
-from hpamdp.files import remove_link, replacing
+from hpamdp.config.schema import RESUME_AUTO
+from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.messages import one_line, reason_of, say, warn
-from hpamdp.run.folder import check_no_link, is_about_folder, locked
+from hpamdp.run.folder import check_no_link, has_foreign_error, is_about_folder, locked, remove_error, write_error
 from hpamdp.run.search import go_on
 from hpamdp.run.stopping import exits_explained, pass_on_signal
-from hpamdp.run_files import ERROR_NAME, saved_summary
+from hpamdp.run_files import ERROR_NAME, MAX_TEXT_BYTES, saved_summary
 from hpamdp.shell import path_setting
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0  # for the running batch, after the sweep's process was killed
 _LOCK_PATIENCE_S = 2 * _PATIENCE_S  # for jobs of a killed sweep, which still save
+# Settings of Hydra that only a sweep reads, and those that only a single run reads.
+_OF_SWEEPS = ("hydra.sweep.", "hydra.sweeper.", "hydra.launcher.", "hydra/sweeper", "hydra/launcher")
+_OF_RUNS = ("hydra.run.",)
+_BASIC_SWEEPER = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
+_MOST_JOBS = 100_000
+_HYDRA_NAME = "multirun.yaml"  # which Hydra writes into the sweep's folder
 # States of a job. The first one holds until the job ends.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
 _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
@@ -47,16 +57,20 @@ class SweepDir(Callback):
     path: ClassVar[Path | None] = None
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Refuse files of Hydra in the run's folder."""
+        """Refuse files of Hydra in the run's folder, and settings of sweeps."""
         _check_output_subdir(config)
+        _check_effects(config, _OF_SWEEPS, "has no effect on a single run; add --multirun, or give hydra.run.dir")
+        _check_fixed(config, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Remember the sweep's folder, and leave the folders of the jobs to `run_job`."""
         _check_output_subdir(config)
-        SweepDir.path = Path(config.hydra.sweep.dir).absolute()
-        with suppress(OSError):  # Hydra fails for the same reason
-            remove_link(SweepDir.path / "multirun.yaml")  # which Hydra writes
+        _check_effects(config, _OF_RUNS, "has no effect on a sweep; give hydra.sweep.dir")
+        _check_fixed(config, "hydra.sweep.dir")
+        SweepDir.path = Path(os.path.abspath(config.hydra.sweep.dir))
         try:
+            _check_sweep_dir(SweepDir.path)
+            _check_number(config)
             first_job = go_on(config)
         except ConfigError as error:
             warn(str(error))
@@ -67,6 +81,76 @@ class SweepDir(Callback):
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
         _compose_jobs_without_folders(hydra.config_loader, first_job)
+
+
+def _check_effects(config: DictConfig, settings: tuple[str, ...], effect: str) -> None:
+    """Exit if the command line gives some of these settings of Hydra, which have no effect here."""
+    for word in config.hydra.overrides.hydra:
+        if setting_of(word).startswith(settings):
+            warn(one_line(f"{word}: {effect}"))
+            sys.exit(_MISTAKE)
+
+
+def _check_fixed(config: DictConfig, name: str) -> None:
+    """Exit if `resume=auto` would never find the run again, because each start makes a folder of its own."""
+    folder = OmegaConf.select(config, name.rpartition(".")[0])._get_node("dir")._value()
+    if config.resume == RESUME_AUTO and "${now:" in str(folder):
+        warn(f"resume=auto: goes on with the run in a folder, so give {name}")
+        sys.exit(_MISTAKE)
+
+
+def _check_number(config: DictConfig) -> None:
+    """Refuse a sweep of so many jobs that Hydra, which lists all of them first, would run out of memory.
+
+    Raises:
+        ConfigError: there are too many jobs.
+    """
+    sweeper = config.hydra.sweeper
+    if sweeper._target_ != _BASIC_SWEEPER:  # others draw values from a range
+        return
+    words = {name: f"{name}={values}" for name, values in (sweeper.params or {}).items()}
+    words |= {setting_of(word): word for word in config.hydra.overrides.task}
+    swept = [each for each in OverridesParser.create().parse_overrides([*words.values()]) if each.is_discrete_sweep()]
+    if math.prod(map(_num_values, swept)) > _MOST_JOBS:
+        given = " ".join(each.input_line or "" for each in swept if _num_values(each) > 1)
+        raise ConfigError(f"{given}: more than {_MOST_JOBS:,} jobs; give fewer values")
+
+
+def _num_values(swept: Override) -> float:
+    values = swept.value()
+    if not isinstance(values, RangeSweep):
+        return len(values.list) if isinstance(values, ChoiceSweep) else 1
+    assert values.start is not None and values.stop is not None
+    length = float(values.stop) - float(values.start)
+    if math.isnan(length) or values.step == 0:
+        return 1  # which Hydra refuses
+    return max(0.0, length / values.step)
+
+
+def _check_sweep_dir(folder: Path) -> None:
+    """Refuse the working directory, and a folder whose `multirun.yaml` Hydra would replace but has not written.
+
+    Raises:
+        ConfigError: the folder is refused.
+    """
+    if os.path.realpath(folder) == os.path.realpath(os.curdir):
+        raise ConfigError(
+            "hydra.sweep.dir: the working directory; give a folder of the sweep's own, or leave hydra.sweep.dir out"
+        )
+    file = folder / _HYDRA_NAME
+    if not os.path.lexists(file):
+        return
+    try:
+        is_hydras = read_regular(file, MAX_TEXT_BYTES).startswith(b"hydra:\n")
+    except OSError:
+        is_hydras = False
+    if not is_hydras:
+        raise ConfigError(
+            f"{_shown(folder)}: holds {_HYDRA_NAME}, which no sweep has written and a sweep would replace; take "
+            "another hydra.sweep.dir"
+        )
+    with suppress(OSError):  # Hydra fails for the same reason
+        remove_link(file)
 
 
 def _check_output_subdir(config: DictConfig) -> None:
@@ -194,8 +278,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
         job.state, job.reason = _FAILED, one_line("".join(traceback.format_exception_only(error)))
         if isinstance(error, OSError) and is_about_folder(error, folder):
             job.reason = f"its folder cannot be made or written to: {reason_of(error)}"
-        with suppress(OSError), replacing(folder / ERROR_NAME) as partial:
-            partial.write_text(traceback.format_exc())
+        write_error(folder, error)
     records.write(job)
     if job.state != _FINISHED:
         say(f"Job {job.number}: {job.state}{f': {job.reason}' if job.reason else ''}")
@@ -212,11 +295,13 @@ def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str
     from hpamdp.run.continuation import rest_of
     from hpamdp.run.resume import resolve
 
+    if cfg.resume == RESUME_AUTO:  # as every sweep does
+        cfg.resume = None
     wanted, _ = resolve(cfg, overrides)
     done, source = rest_of(wanted, folder)
     if done is not None:
         return _SKIPPED, done, ""
-    (folder / ERROR_NAME).unlink(missing_ok=True)
+    remove_error(folder)
     if source is not None:
         say(f"Going on from {source}")
     reasons: list[str] = []
@@ -274,15 +359,14 @@ def report(start: str, error: BaseException | None = None) -> int:
         _report_seeds(sweep_dir, jobs)
     _print_tally(jobs)
     for job in failed:
-        error_file = Path(job.folder, ERROR_NAME)
-        place = error_file if os.path.exists(error_file) else error_file.parent
-        warn(f"{job.overrides}: {job.reason} ({_shown(place)})")
+        folder = Path(job.folder)
+        is_told = os.path.exists(folder / ERROR_NAME) and not has_foreign_error(folder)
+        warn(f"{job.overrides}: {job.reason} ({_shown(folder / ERROR_NAME if is_told else folder)})")
     if is_stopped or (error is not None and len(failed) < len(jobs)):
-        if not is_stopped:
-            with replacing(sweep_dir / ERROR_NAME) as partial:
-                partial.write_text("".join(traceback.format_exception(error)))
+        if error is not None and not is_stopped:
+            told = sweep_dir / ERROR_NAME if write_error(sweep_dir, error) else sweep_dir
             reason = one_line("".join(traceback.format_exception_only(error)))
-            warn(f"The sweep broke off: {reason} ({_shown(sweep_dir / ERROR_NAME)})")
+            warn(f"The sweep broke off: {reason} ({_shown(told)})")
         say(f"To go on: the same command with {path_setting('hydra.sweep.dir', _shown(sweep_dir))}")
         return _INTERRUPTED if is_stopped else 1
     if not failed:
