@@ -14,6 +14,7 @@ import pytest
 import torch
 from conftest import compose_config, make_config
 from hydra.core.hydra_config import HydraConfig
+from test_folders import kill_at
 from toy_callbacks import Faulty
 
 from hpamdp.config.errors import ConfigError
@@ -365,6 +366,43 @@ def test_a_resumed_run_counts_on_and_knows_its_best_agent(where, tmp_path, monke
     kept, again_kept = map(tensors_in, best)
     assert all(torch.equal(value, again_kept[name]) for name, value in kept.items())
     assert len({checkpoint.progress_of(file)["last_score"] for file in best}) == 1
+
+
+@pytest.mark.parametrize("where", ["own", "new"])
+def test_a_killed_run_keeps_a_best_agent_from_after_its_checkpoint(where, scores, tmp_path):
+    words = [*PLATFORM, "total_frames=192", "save_best=true", "checkpoint_every=64"]
+    scores += [0.0, 1.0, 2.0, 9.0]
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemError):
+        kill_at(patch, 128)
+        run(compose_config(words), tmp_path / "killed", words)
+    assert checkpoint.progress_of(tmp_path / "killed/checkpoint.zip")["frames"] == 64
+    kept = tensors_in(tmp_path / "killed/best.pt")
+    scores += [0.0, 3.0, 4.0, 5.0, 6.0]  # of random actions first; the episodes of the resumed run may be other ones
+    folder = tmp_path / ("killed" if where == "own" else "resumed")
+    again = [f"resume={tmp_path / 'killed'}"]
+    assert run(compose_config(again), folder, again) == 0
+    best = checkpoint.progress_of(folder / "best.pt")
+    assert (best["frames"], best["last_score"]) == (96, 9.0)
+    assert all(torch.equal(value, kept[name]) for name, value in tensors_in(folder / "best.pt").items())
+
+
+def test_a_best_agent_is_known_to_a_run_whose_checkpoint_had_no_callback(scores, tmp_path):
+    scores += [0.0, 9.0, 0.0, 0.0]  # the last one is that of the summary
+    words = [*PLATFORM, "total_frames=64"]
+    assert run(compose_config([*words, "save_best=true"]), tmp_path, words) == 0
+    for length, is_kept in ((96, "false"), (128, "true")):
+        scores += [0.0, 1.0, 1.0]
+        again = [f"resume={tmp_path}", f"total_frames={length}", f"save_best={is_kept}"]
+        assert run(compose_config(again), tmp_path, again) == 0
+    assert checkpoint.progress_of(tmp_path / "best.pt")["last_score"] == 9.0
+
+
+def test_a_best_agent_that_cannot_be_read_is_told_in_one_line(tmp_path, capsys):
+    assert start(tmp_path, "save_best=true", "total_frames=64") == 0
+    (tmp_path / "best.pt").write_text("no agent")
+    words = [f"resume={tmp_path}", "total_frames=96"]
+    assert run(compose_config(words), tmp_path, words) == 1
+    assert f"BestAgent: {tmp_path / 'best.pt'}: damaged" in capsys.readouterr().err
 
 
 def test_a_run_that_a_callback_ended_is_finished(tmp_path, capsys):

@@ -331,11 +331,11 @@ class InProcess:
 class Mortal(WorkerCollection):
     """A collection whose workers live in this process, and die if a test says so."""
 
-    def __init__(self, folder, max_restarts, *overrides):
+    def __init__(self, folder, max_restarts, *overrides, frames=0, **settings):
         config = make_config([*SMALL, "high=ucb", *overrides])
         self.parts = assemble(config)
         self.shards = []
-        super().__init__(config, self.parts, 0, num_workers=2, max_restarts=max_restarts)
+        super().__init__(config, self.parts, frames, num_workers=2, max_restarts=max_restarts, **settings)
 
     def _start(self, shard):
         self.shards.append(shard)
@@ -395,6 +395,65 @@ def test_the_death_after_the_last_restart_ends_the_run_with_the_last_known_state
         with pytest.raises(WorkerDiedError, match=r"worker 1 of 2 died \(murder\)$"):
             collection.next()
         assert collection.state() is state
+
+
+def fail_in_a_batch(collection, monkeypatch):
+    """Have a batch fail at its second step."""
+    step, numbers = BoatDockEnv._step, itertools.count()
+
+    def failing(self, td):
+        if next(numbers):
+            raise ProblemError("broken")
+        return step(self, td)
+
+    with monkeypatch.context() as patch, pytest.raises(ProblemError, match="broken"):
+        patch.setattr(BoatDockEnv, "_step", failing)
+        collection.next()
+
+
+def test_an_error_in_a_batch_leaves_the_state_before_that_batch(tmp_path, monkeypatch):
+    _, collection = make(tmp_path)
+    for _ in range(3):
+        collection.next()
+    before = copy.deepcopy(collection.state())
+    fail_in_a_batch(collection, monkeypatch)
+    _, resumed = make(tmp_path)
+    resumed.set_state(collection.state())
+    assert torch.equal(resumed.next()["observation"][:, 0], before["root"]["observation"])
+
+
+def test_an_error_in_workers_that_never_told_their_state_costs_only_the_episodes(tmp_path, monkeypatch):
+    with closing(Mortal(tmp_path, 0)) as collection:
+        first = collection.next()["observation"][:, 0].clone()
+        fail_in_a_batch(collection, monkeypatch)
+        state = collection.state()
+    config = make_config([*SMALL, "high=ucb"])
+    single = config.collector.build(config=config, parts=assemble(config), frames=32)
+    with closing(Mortal(tmp_path, 0, frames=32)) as workers:
+        for resumed in (single, workers):
+            resumed.set_state(state)
+            assert (resumed.next()["observation"][:, 0] != first).any(-1).all()
+
+
+def test_an_error_in_workers_keeps_the_present_scale_of_observations(tmp_path):
+    words = ["env=gymnasium", "env.id=CartPole-v1", "env.observation_scaling=running", "high=none"]
+    with closing(Mortal(tmp_path, 0, *words)) as collection:
+        collection.next()
+        collection.have_die(1)
+        with pytest.raises(WorkerDiedError):
+            collection.next()
+        present = collection.parts.env.env_state()
+        assert_same_state(present, collection.state()["env"])
+        assert {int(count) for name, count in present.items() if "count" in name} == {8 * 5}
+
+
+def test_a_batch_that_was_learned_from_is_not_in_the_last_known_state(tmp_path):
+    with closing(Mortal(tmp_path, 0, ahead=True)) as collection:
+        collection.next()
+        assert "coming" in collection.state()
+        collection.have_die(1)  # in the batch after the one that is coming
+        collection.next()
+        assert "coming" not in collection.state()
 
 
 class ArrayMemoryError(MemoryError):

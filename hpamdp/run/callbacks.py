@@ -89,16 +89,17 @@ class BestAgent(Callback):
         self._kept: tuple[dict[str, Any], dict[str, Tensor]] | None = None  # the networks, the observations' scale
 
     def on_start(self, trainer: Trainer) -> None:
-        """Take over the best agent of the resumed run."""
+        """Take over the best agent of the resumed run, which a killed run may have saved after its checkpoint."""
         if trainer.resumed_from is None:
             self.best_score = None
-        if trainer.resumed_from is None or self.best_score is None:
             return
         file = trainer.resumed_from / BEST_NAME
         if not file.is_file():
-            warn(f"{file}: not there, so the best agent is only kept from here on")
+            if self.best_score is not None:
+                warn(f"{file}: not there, so the best agent is only kept from here on")
             self.best_score = None
             return
+        self.best_score = trainer.score_in(file)
         self._file = file
         if trainer.output_dir is not None and trainer.output_dir.resolve() != trainer.resumed_from.resolve():
             self._file = trainer.output_dir / BEST_NAME

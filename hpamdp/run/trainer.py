@@ -367,6 +367,15 @@ class Trainer:
         saved.set_statistics(self.parts.env.base_env)
         self.recorder.forget_evaluation()
 
+    def score_in(self, file: Path) -> float | None:
+        """Return the score of the last evaluation before such a file was written; None if there was none.
+
+        Raises:
+            ConfigError: the file is damaged or not a checkpoint of this program.
+        """
+        score: float | None = checkpoint.progress_of(file)["last_score"]
+        return score
+
     def keep_for_inspection(self) -> str:
         """Save the current agent beside the last good checkpoint, and return a message about both files."""
         if self.output_dir is None:

@@ -26,8 +26,10 @@ class SingleCollection(Collection):
     def __init__(self, config: Config, parts: AssembledRun, frames: int = 0) -> None:
         self._parts = parts
         self.env = parts.env
-        if frames > 0 and not self.env.keeps_episodes:  # otherwise the run's first episodes would come again
-            self.env.set_seed(random_seeds(config.run.seed, 0, frames)[1], static_seed=True)
+        # Of new episodes in a resumed run; the run's own seed would begin with its first episodes again.
+        self._fresh_seed = None if frames == 0 else random_seeds(config.run.seed, 0, frames)[1]
+        if self._fresh_seed is not None and not self.env.keeps_episodes:
+            self.env.set_seed(self._fresh_seed, static_seed=True)
         selector = parts.agent.selector
         pending = None if selector is None else selector.pending.clone()
         with acting(ExplorationType.RANDOM):
@@ -45,9 +47,11 @@ class SingleCollection(Collection):
             selector.pending.copy_(pending)  # TorchRL has just tried the policy, which made no real decisions
         self._batches = iter(self._collector)
         self._is_idle = True
+        self._before: dict[str, Any] = {}  # the state before the batch that is being collected
 
     def next(self) -> TensorDictBase:
         """Collect a batch."""
+        self._before = self.state()
         self._is_idle = False
         with acting(ExplorationType.RANDOM):
             batch = next(self._batches)
@@ -57,11 +61,10 @@ class SingleCollection(Collection):
     def state(self) -> dict[str, Any]:
         """Return the environments' state and the root of the next step.
 
-        An error in the middle of a batch closes TorchRL's collector, so there are no episodes to continue. Then the
-        state holds only the rest, such as the scale of observations.
+        After an error in the middle of a batch it is the state before that batch, from which nothing was learned.
         """
         if not self._is_idle:
-            return {"env": {} if self.env.keeps_episodes else self.env.env_state()}
+            return self._before
         state: dict[str, Any] = {"env": {name: column.clone() for name, column in self.env.env_state().items()}}
         if self.env.keeps_episodes:
             state["root"] = self._collector._carrier.exclude("collector").clone().to_dict()
@@ -78,9 +81,12 @@ class SingleCollection(Collection):
             self.env.set_env_state(saved.env)
             if not self.env.keeps_episodes:  # the saved statistics scale their first observations, too
                 self._collector._carrier.update(self.env.reset())
+        root = self._collector._carrier
         if saved.root is not None and self.env.keeps_episodes:
-            root = self._collector._carrier
             root.update(TensorDict(saved.root, batch_size=root.batch_size))
+        elif self.env.keeps_episodes and self._fresh_seed is not None:
+            self.env.set_seed(self._fresh_seed, static_seed=True)
+            root.update(self.env.reset())
 
     def close(self) -> None:
         """Stop collecting; the environment stays open."""

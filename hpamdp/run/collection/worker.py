@@ -109,6 +109,11 @@ class ShardCollector(Collector):
         self.env.base_env.set_statistics(statistics)
         self._carrier.update(self.env.reset())
 
+    def begin_seeded(self, seed: int) -> None:
+        """Begin the first episodes of another seed."""
+        self.env.set_seed(seed, static_seed=True)
+        self._carrier.update(self.env.reset())
+
     def collect(self, policy: bytes, statistics: Mapping[str, Tensor]) -> Collected:
         """Load the packed policy and the environments' common `statistics`, and collect a batch.
 

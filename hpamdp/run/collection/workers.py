@@ -85,7 +85,7 @@ class WorkerCollection(Collection):
         self._keeps_episodes = parts.env.keeps_episodes
         self._num_envs = config.run.num_envs
         self._size = config.run.num_envs // num_workers
-        self._state: dict[str, Any] = {"env": parts.env.env_state()}
+        self._state: dict[str, Any] = {"env": {}}  # the last known one; it has no episodes before the first
         self._is_idle = False
         self.workers: list[Any] = [None] * num_workers  # TorchRL's collector of each
         self._batches: list[TensorDictBase | None] = [None] * num_workers  # the memory that each writes to
@@ -227,6 +227,8 @@ class WorkerCollection(Collection):
                 self._problem.add_statistics(new)
             self._new_statistics[number] = {}
         self._coming = self._begin(policy) if self.options.ahead else []
+        if "coming" in self._state:  # this was it, which a resumed run must not learn from again
+            self._state = {name: value for name, value in self._state.items() if name != "coming"}
         self._is_idle = True
         return batch.to(self._device)
 
@@ -252,15 +254,17 @@ class WorkerCollection(Collection):
     def state(self) -> dict[str, Any]:
         """Return the concatenated states of the workers. If a worker fails, return the last known states.
 
+        Without known states, a resumed run begins new episodes. The scale of observations is always the present one.
+
         `generators` holds the state of each worker's random generator. `coming` holds the next batch to return, if it
         has been collected.
         """
         if not self._is_idle or any(part.exception() for part in self._coming):
-            return self._state
+            return self._last_known()
         try:
             states = self._on_all(lambda number: self._on(number, self._state_of))
         except CollectionError:  # the next batch will raise it again
-            return self._state
+            return self._last_known()
         state: dict[str, Any] = {"generators": [each["generator"] for each in states]}
         for name in states[0].keys() & {"env", "root"}:
             state[name] = _side_by_side([each[name] for each in states])
@@ -270,6 +274,9 @@ class WorkerCollection(Collection):
             state["coming"] = self._finished().to_dict()
         self._state = state
         return self._state
+
+    def _last_known(self) -> dict[str, Any]:
+        return self._state if self._keeps_episodes else {**self._state, "env": self._problem.env_state()}
 
     def _state_of(self, worker: Any) -> dict[str, Any]:
         state = {"generator": call_worker(worker, "policy.generator_state")}
@@ -293,6 +300,8 @@ class WorkerCollection(Collection):
                     call_worker(worker, "env.set_env_state", _sliced(saved.env, first, self._size))
                 elif saved.env:
                     call_worker(worker, "begin_episodes", saved.env)
+                elif self._keeps_episodes and self._frames > 0:  # not the run's first episodes again
+                    call_worker(worker, "begin_seeded", random_seeds(self._config.run.seed, first, self._frames)[1])
                 if saved.root is not None and self._keeps_episodes:
                     call_worker(worker, "_carrier.update", _sliced(saved.root, first, self._size))
                 if len(saved.generators) == len(self.workers):
