@@ -112,6 +112,14 @@ MISTAKES = [
         ["resume=auto", "hydra.run.dir=out/${now:%H-%M}"],
         "resume=auto: goes on with the run in a folder, so give hydra.run.dir",
     ),
+    (
+        ["experiment=domains", "env=platform", "low=hppo", "high=none"],
+        "env=platform: experiment=domains/catch_point chooses env=catch_point itself; leave env=platform out",
+    ),
+    (
+        ["-m", "experiment=domains/moving,platform", "env=goal,hard_goal"],
+        "env=goal,hard_goal: experiment=domains/moving chooses env=moving itself; leave env=goal,hard_goal out",
+    ),
     (["-m", "low=glob(x*)"], "low=glob(x*): matches no choice; conf/low has bc, "),
     (["-m", "experiment=glob(domains/*)"], "experiment=glob(domains/*): matches no choice; conf/experiment has "),
     (["-m", "seed=glob(*)"], "seed=glob(*): glob is for a group, as in low=glob(h*); list the values"),

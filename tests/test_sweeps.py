@@ -193,6 +193,11 @@ def test_a_folder_of_experiments_stands_for_a_sweep_over_all_in_it(command, jobs
     assert line.is_multirun and seeds == "seed=0,4" and experiments.count(",") == 9
 
 
+def test_the_problem_that_all_experiments_of_a_folder_choose_may_be_given():
+    line = completed(parse(["experiment=circuits", "env=circuit", "low=random"], CONF), CONF)
+    assert line.is_multirun and "env=circuit" in line.words
+
+
 def test_a_glob_stands_for_a_sweep_over_the_choices_that_match(command, jobs, tmp_path):
     (tmp_path / "mine/low").mkdir(parents=True)
     (tmp_path / "mine/low/hmine.yaml").write_text((CONF / "low/hppo.yaml").read_text())

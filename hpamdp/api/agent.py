@@ -33,6 +33,7 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.renamed import no_member
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env, make_evaluation, option_length
+from hpamdp.run.capacity import check_number
 from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
 
@@ -244,6 +245,10 @@ class Agent:
         asked = {"episodes": episodes, "seed": seed}
         numbers = {name: int(value) if isinstance(value, np.integer) else value for name, value in asked.items()}
         checked = validated(_Asked, numbers, "", "argument", "hpamdp.Agent.evaluate")
+        device = self._env.device
+        check_number(
+            f"episodes={checked.episodes}", checked.episodes, device, lambda: make_env(config, 1, device, seed=0)
+        )
         numbers_of_evaluation = config.run.eval.model_copy(update={"layouts": checked.episodes, "seed": checked.seed})
         evaluation = make_evaluation(config.with_run(eval=numbers_of_evaluation, film=False), self._env)
         try:

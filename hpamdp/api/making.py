@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -18,8 +19,10 @@ from hpamdp.config.outside_jobs import composed, word
 from hpamdp.config.schema import Device, usable_device
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
+from hpamdp.memory import is_about_memory
 from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run.assemble import grouped
+from hpamdp.run.capacity import check_number
 from hpamdp.run.compatibility import lack_of, settings_without_effect
 from hpamdp.settings import SettingError, Settings
 
@@ -69,7 +72,9 @@ def make(name: Any, num_envs: int | None = None, *, device: Any = "cpu", seed: i
         lack = lack_of(need, config)
         if lack is not None:
             raise ConfigError(f"{need}=True: {lack}")
-    env = config.env.build(num_envs=sizes.num_envs, device=config.run.resolve_device(), seed=sizes.seed, **needs)
+    build = partial(config.env.build, device=config.run.resolve_device(), seed=sizes.seed, **needs)
+    check_number(f"num_envs={num_envs}", sizes.num_envs, config.run.resolve_device(), lambda: build(num_envs=1))
+    env = build(num_envs=sizes.num_envs)
     return grouped(env, config)
 
 
@@ -119,6 +124,10 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         if complaint is None:
             raise
         raise ConfigError(f"{env_id}: {complaint}") from error
+    except (RuntimeError, MemoryError) as error:
+        if num_envs is None or not is_about_memory(error):
+            raise
+        raise ConfigError(f"num_envs={num_envs}: takes more memory than there is") from error
 
 
 def _complaint(error: Exception, env_id: str) -> str | None:

@@ -217,10 +217,12 @@ def completed(line: CommandLine, conf: Path) -> CommandLine:
     """Add what the words stand for: a saved run's choices, a folder's experiments, globs and the sweep's folder.
 
     Raises:
-        ConfigError: there is no such run, a glob matches nothing, or the experiments of a sweep have different folders.
+        ConfigError: there is no such run, a glob matches nothing, the experiments of a sweep have different folders, or
+            they have problems of their own beside a given one.
     """
     line = line.with_words(_saved_words(line))
     line = _with_globs_written_out(_with_experiments_of_a_folder(line, conf), conf)
+    _check_one_problem(line, conf)
     return line.with_words(_sweep_folder(line, conf))
 
 
@@ -275,6 +277,32 @@ def _with_globs_written_out(line: CommandLine, conf: Path) -> CommandLine:
                 raise ConfigError(f"{words[i]}: matches no choice; conf/{group} has {', '.join(names)}")
             words[i] = f"{override.get_key_element()}={','.join(found)}"
     return CommandLine(line.flags, _parsed(words))
+
+
+def _check_one_problem(line: CommandLine, conf: Path) -> None:
+    """Refuse a problem beside a sweep over experiments that choose other ones, whose folders it would share.
+
+    Raises:
+        ConfigError: the problem is refused.
+    """
+    given = line.given()
+    experiments, env = given.get("experiment"), given.get("env")
+    if experiments is None or env is None or not (line.is_multirun and experiments.is_discrete_sweep()):
+        return
+    allowed = {word.partition("=")[2] for word in written_out(env)}
+    try:
+        with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+            allowed.add(_problem_of(line.search_path))  # the default, which experiments of any problem have
+            own = {choice: _problem_of([choice, *line.search_path]) for choice in written_out(experiments)}
+    except (HydraException, OmegaConfBaseException):
+        return  # which Hydra will report
+    for choice, problem in own.items():
+        if problem not in allowed:
+            raise ConfigError(f"{env.input_line}: {choice} chooses env={problem} itself; leave {env.input_line} out")
+
+
+def _problem_of(words: Sequence[str]) -> str:
+    return hydra.compose("config", [*words], return_hydra_config=True).hydra.runtime.choices.env
 
 
 def _sweep_folder(line: CommandLine, conf: Path) -> list[str]:

@@ -122,7 +122,8 @@ class Component:
         except Exception as error:
             if not is_about_memory(error):
                 raise
-            raise ConfigError(f"{self.largest_sizes()}: takes more memory than there is") from error
+            num_envs = f"num_envs={context['num_envs']}, " if "num_envs" in supplied else ""
+            raise ConfigError(f"{num_envs}{self.largest_sizes()}: takes more memory than there is") from error
 
     def build_for_entry(self, entry: Any) -> Any:
         """Build an encoder for an entry of the observation; as `build`."""

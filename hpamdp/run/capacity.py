@@ -48,15 +48,35 @@ def check_run(run: RunConfig, device: torch.device, build_one: Callable[[], PAMD
     num_steps = 0 if run.mode != "train" else run.num_envs * run.steps_per_batch
     if max(run.num_envs, num_steps, run.eval.layouts) < _MANY:
         return
-    with closing(build_one()) as one:
-        step = one.fake_tensordict().bytes()
-        path = 0 if one.position is None else 8 * one.max_steps
+    step, path = _bytes_of_one(build_one)
     needs = {
         f"num_envs={run.num_envs}": run.num_envs * step,
         f"num_envs={run.num_envs}, steps_per_batch={run.steps_per_batch}": num_steps * step,
         f"eval.layouts={run.eval.layouts}": run.eval.layouts * (step + path),
     }
     _check_memory(needs, device)
+
+
+def check_number(argument: str, num: int, device: torch.device, build_one: Callable[[], PAMDPEnv]) -> None:
+    """Refuse more environments than there is memory for, before any of them is built.
+
+    Args:
+        argument: the argument that gives the number, as `name=value`.
+        num: number of environments, one for each episode of an evaluation.
+        device: device of the tensors.
+        build_one: builds a single environment; called only if the number is large.
+
+    Raises:
+        ConfigError: memory does not suffice; the message names the least number of bytes.
+    """
+    if num >= _MANY:
+        _check_memory({argument: num * _bytes_of_one(build_one)[0]}, device, "takes")
+
+
+def _bytes_of_one(build_one: Callable[[], PAMDPEnv]) -> tuple[int, int]:
+    """Return the bytes of a step in one environment, and of the path that an evaluation records there."""
+    with closing(build_one()) as one:
+        return one.fake_tensordict().bytes(), 0 if one.position is None else 8 * one.max_steps
 
 
 def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component], device: torch.device) -> None:
@@ -105,7 +125,7 @@ def _bytes_remembered(component: Component, specs: PAMDPSpecs) -> int:
     return 0
 
 
-def _check_memory(needs: Mapping[str, int], device: torch.device) -> None:
+def _check_memory(needs: Mapping[str, int], device: torch.device, takes: str = "the run takes") -> None:
     """Refuse settings that together need more bytes than there are; the error names the largest one."""
     if not needs:
         return
@@ -113,7 +133,7 @@ def _check_memory(needs: Mapping[str, int], device: torch.device) -> None:
     setting = max(needs, key=needs.__getitem__)
     if sum(needs.values()) > available:
         raise ConfigError(
-            f"{setting}: the run takes at least {in_gigabytes(sum(needs.values()))} of memory, and there are "
+            f"{setting}: {takes} at least {in_gigabytes(sum(needs.values()))} of memory, and there are "
             f"{in_gigabytes(available)}"
         )
 
