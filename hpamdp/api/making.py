@@ -121,15 +121,11 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         if env_id.startswith("hpamdp/"):
             own = _restarting_in_same_step(env_id, own)
         return gymnasium.make_vec(env_id, num_envs=checked.num_envs, **own)
-    except (gymnasium.error.Error, ValueError, ModuleNotFoundError, TypeError) as error:
-        complaint = _complaint(error, env_id)
+    except (gymnasium.error.Error, ValueError, ModuleNotFoundError, TypeError, RuntimeError, MemoryError) as error:
+        complaint = _complaint(error, env_id, num_envs)
         if complaint is None:
             raise
         raise ConfigError(f"{env_id}: {complaint}") from error
-    except (RuntimeError, MemoryError) as error:
-        if num_envs is None or not is_about_memory(error):
-            raise
-        raise ConfigError(f"num_envs={num_envs}: takes more memory than there is") from error
 
 
 def _restarting_in_same_step(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -142,8 +138,10 @@ def _restarting_in_same_step(env_id: str, settings: Mapping[str, Any]) -> dict[s
     return {**settings, "vector_kwargs": of_vector}
 
 
-def _complaint(error: Exception, env_id: str) -> str | None:
+def _complaint(error: Exception, env_id: str, num_envs: int | None) -> str | None:
     """Return what a user gave wrong, in one line; None for other errors, whose traceback says more."""
+    if is_about_memory(error) and num_envs is not None:
+        return f"num_envs={num_envs}: takes more memory than there is"
     if isinstance(error, TypeError):
         wrong_class = re.match(r"options: must be \w+, not \w+", str(error))
         if wrong_class is not None:
