@@ -13,8 +13,6 @@ from typing import Any
 
 import torch
 import torchrl
-from hydra.types import RunMode
-from omegaconf import DictConfig
 from torchrl.checkpoint import GlobalRNGState
 
 from hpamdp.api.agent import Agent
@@ -30,9 +28,9 @@ from hpamdp.api.arguments import (
 )
 from hpamdp.complaints import no_such
 from hpamdp.config.components import TARGET
-from hpamdp.config.compose import setting_of, settings_in
+from hpamdp.config.compose import setting_of
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.outside_jobs import composed, searching
+from hpamdp.config.outside_jobs import check_no_sweep, composed, searching
 from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.env.errors import closed_on_error
 from hpamdp.messages import as_code, reason_of, say, warn
@@ -110,7 +108,7 @@ def train(
     with _torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
         stack.enter_context(_counted())
         with composed([*saved, *words]) as cfg:
-            _check_no_sweep(cfg, words)
+            check_no_sweep(cfg, words)
             config, source = resolve(cfg, words, arguments.objects)
             if output_dir is None:
                 _check_no_files(config, words)
@@ -227,23 +225,6 @@ def _own_folder(folder: Path) -> Iterator[None]:
         with suppress(OSError):  # at the first folder that is not empty
             for each in missing:
                 each.rmdir()
-
-
-def _check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
-    """Refuse an experiment that is a sweep, unless words give every swept setting a value.
-
-    Raises:
-        ConfigError: the message names the swept settings.
-    """
-    given = {name for each in words for name in settings_in(each)}
-    swept = [name for name in cfg.hydra.sweeper.get("params") or {} if name not in given]
-    if cfg.hydra.mode == RunMode.MULTIRUN and swept:
-        chosen = cfg.hydra.runtime.choices
-        sweep = next((f"{group}={chosen[group]}" for group in ("experiment", "search") if chosen.get(group)), "train")
-        raise ConfigError(
-            f"{sweep}: a sweep over {', '.join(swept)}, for the command line; to train one agent, give "
-            f"{'it a value' if len(swept) == 1 else 'each of them a value'}"
-        )
 
 
 def _rest_of(config: Config, folder: Path) -> Rest:

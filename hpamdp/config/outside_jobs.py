@@ -16,6 +16,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import QuotedString
 from hydra.errors import HydraException, OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -30,7 +31,7 @@ from hpamdp.config.components import (
     name_of_passed,
     settings_model,
 )
-from hpamdp.config.compose import conf_dir, is_name
+from hpamdp.config.compose import conf_dir, is_name, settings_in
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import explained, not_understood
 from hpamdp.messages import as_code
@@ -150,6 +151,23 @@ def check_given_once(words: Sequence[str]) -> None:
             shorter = min(len(name), len(earlier))
             if name[:shorter] == earlier[:shorter]:
                 raise ConfigError(given_twice(".".join(name[:shorter]), first, value))
+
+
+def check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
+    """Refuse an experiment that is a sweep, unless words give every swept setting a value.
+
+    Raises:
+        ConfigError: the message names the swept settings.
+    """
+    given = {name for each in words for name in settings_in(each)}
+    swept = [name for name in cfg.hydra.sweeper.get("params") or {} if name not in given]
+    if cfg.hydra.mode == RunMode.MULTIRUN and swept:
+        chosen = cfg.hydra.runtime.choices
+        sweep = next((f"{group}={chosen[group]}" for group in ("experiment", "search") if chosen.get(group)), "train")
+        raise ConfigError(
+            f"{sweep}: a sweep over {', '.join(swept)}, for the command line; to train one agent, give "
+            f"{'it a value' if len(swept) == 1 else 'each of them a value'}"
+        )
 
 
 def _single_values(name: tuple[str, ...], value: Any) -> Iterator[tuple[tuple[str, ...], Any]]:

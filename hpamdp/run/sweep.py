@@ -356,7 +356,7 @@ def report(start: str, error: BaseException | None = None) -> int:
         is_told = os.path.exists(folder / ERROR_NAME) and not has_foreign_error(folder)
         warn(f"{job.overrides}: {job.reason} ({_shown(folder / ERROR_NAME if is_told else folder)})")
     if is_stopped or (error is not None and len(failed) < len(jobs)):
-        if not is_stopped:
+        if error is not None and not is_stopped:
             told = sweep_dir / ERROR_NAME if write_error(sweep_dir, error) else sweep_dir
             reason = one_line("".join(traceback.format_exception_only(error)))
             warn(f"The sweep broke off: {reason} ({_shown(told)})")
