@@ -1147,5 +1147,5 @@ def test_more_episodes_or_environments_than_fit_into_memory_are_named(platform_a
         platform_agent.evaluate(episodes=10**15)
     with pytest.raises(hpamdp.ConfigError, match=r"^num_envs=1000000000000: takes at least .* of memory, and there "):
         hpamdp.make("platform", num_envs=10**12)
-    with pytest.raises(hpamdp.ConfigError, match=r"^num_envs=1000000000000: takes more memory "):
+    with pytest.raises(hpamdp.ConfigError, match="num_envs=1000000000000: takes more memory "):
         hpamdp.make_gymnasium("hpamdp/Platform-v0", num_envs=10**12)

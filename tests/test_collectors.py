@@ -743,3 +743,22 @@ def test_two_workers_learn_as_well_as_one_process(tmp_path):
         scores[collector] = float(rows[-1].split(",")[rows[0].split(",").index("eval/score")])
     assert min(scores.values()) > 2.8
     assert scores["multi"] == pytest.approx(scores["single"], abs=0.25)
+
+
+@pytest.mark.slow
+def test_a_script_without_its_guard_is_told_of_it_in_the_last_line(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import hpamdp\n"
+        "hpamdp.train('platform', low='random', high=None, total_frames=128, num_envs=4, steps_per_batch=32,\n"
+        "             progress=False, collector='multi', **{'eval.layouts': 2})\n"
+    )
+    done = subprocess.run([sys.executable, script], cwd=CONF.parent, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].endswith(
+        f'died (as it started: workers import {script} again, so put what it runs below if __name__ == "__main__":)'
+    )
+    assert "hpamdp.train: a worker process imports this script again; put what the script runs below" in done.stderr
+    script.write_text(f"if __name__ == '__main__':\n    {script.read_text().replace(chr(10), chr(10) + '    ')}")
+    done = subprocess.run([sys.executable, script], cwd=CONF.parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -80,6 +80,12 @@ def test_an_empty_path_is_not_the_working_directory(tmp_path, monkeypatch):
         finished(["a", ""])
 
 
+@pytest.mark.parametrize("name", ["peers", "pearl"])
+def test_studies_of_curves_take_no_empty_path_for_the_working_directory(name):
+    with pytest.raises(SystemExit, match="an empty path; name the folder of the curves"):
+        study(name).main([""])
+
+
 def test_finished_runs_are_found_at_any_depth_and_unfinished_ones_left_out(tmp_path):
     leave_run(tmp_path / "b/deep/er", seed=1)
     leave_run(tmp_path / "a", seed=2)

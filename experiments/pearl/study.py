@@ -136,6 +136,8 @@ def main(arguments: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if len(arguments) > 1:
         raise SystemExit(f"give one folder with all curves, not {len(arguments)}")
+    if "" in arguments:
+        raise SystemExit("an empty path; name the folder of the curves")
     if arguments:
         write_tables(HERE, {"curves": merged(read_csv(HERE / "curves.csv"), gather(Path(arguments[0])))})
     curves = read_csv(HERE / "curves.csv")

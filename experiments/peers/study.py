@@ -144,6 +144,8 @@ def _draw_problem(axes: Axes, curves: Rows) -> None:
 
 def main(arguments: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
+    if "" in arguments:
+        raise SystemExit("an empty path; name the folder of the curves")
     if arguments:
         write_tables(HERE, gather(Path(arguments[0])))
     curves = read_csv(HERE / "curves.csv")

@@ -119,19 +119,17 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
             check_single(env_id, own)
             return gymnasium.make(env_id, **own)
         return gymnasium.make_vec(env_id, num_envs=checked.num_envs, **vector_arguments(env_id, own))
-    except (gymnasium.error.Error, ValueError, ModuleNotFoundError, TypeError) as error:
-        complaint = _complaint(error, env_id)
+    except (gymnasium.error.Error, ValueError, ModuleNotFoundError, TypeError, RuntimeError, MemoryError) as error:
+        complaint = _complaint(error, env_id, num_envs)
         if complaint is None:
             raise
         raise ConfigError(f"{env_id}: {complaint}") from error
-    except (RuntimeError, MemoryError) as error:
-        if num_envs is None or not is_about_memory(error):
-            raise
-        raise ConfigError(f"num_envs={num_envs}: takes more memory than there is") from error
 
 
-def _complaint(error: Exception, env_id: str) -> str | None:
+def _complaint(error: Exception, env_id: str, num_envs: int | None) -> str | None:
     """Return what a user gave wrong, in one line; None for other errors, whose traceback says more."""
+    if is_about_memory(error) and num_envs is not None:
+        return f"num_envs={num_envs}: takes more memory than there is"
     if isinstance(error, TypeError):
         wrong_class = re.match(r"options: must be \w+, not \w+", str(error))
         if wrong_class is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -91,12 +92,14 @@ def train(
             nothing is written.
         DivergedError: a reward, a loss or a weight is not finite.
         EnvironmentFaultError: the environment's own code raised an error, which is the cause.
+        SystemExit: a worker process imports a script that calls this function outside `if __name__ == "__main__":`.
         RuntimeError: a worker process died, or somebody's code called `sys.exit`.
 
     Example:
         >>> import hpamdp
         >>> agent = hpamdp.train("platform", low="hppo", total_frames=20_000, progress=False)
     """
+    _check_guarded()
     if settings.get("mode") == "eval":
         raise ConfigError("mode=eval: use hpamdp.load(...).evaluate()")
     flag("progress", progress)
@@ -183,6 +186,15 @@ def _words_of(settings: Mapping[str, Any], problem: Arguments, folders: Sequence
             own += settings_words(with_env_prefix(of_problem, cfg.env))
         words = [*folders, *problem.with_words(own)]
     return saved, words
+
+
+def _check_guarded() -> None:
+    """End a worker process that runs an unguarded script while it imports the script."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # as multiprocessing checks it
+        raise SystemExit(
+            "hpamdp.train: a worker process imports this script again; put what the script runs below "
+            'if __name__ == "__main__":'
+        )
 
 
 def _checked_callbacks(given: Any) -> list[Callback]:

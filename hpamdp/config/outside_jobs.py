@@ -153,6 +153,23 @@ def check_given_once(words: Sequence[str]) -> None:
                 raise ConfigError(given_twice(".".join(name[:shorter]), first, value))
 
 
+def check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
+    """Refuse an experiment that is a sweep, unless words give every swept setting a value.
+
+    Raises:
+        ConfigError: the message names the swept settings.
+    """
+    given = {name for each in words for name in settings_in(each)}
+    swept = [name for name in cfg.hydra.sweeper.get("params") or {} if name not in given]
+    if cfg.hydra.mode == RunMode.MULTIRUN and swept:
+        chosen = cfg.hydra.runtime.choices
+        sweep = next((f"{group}={chosen[group]}" for group in ("experiment", "search") if chosen.get(group)), "train")
+        raise ConfigError(
+            f"{sweep}: a sweep over {', '.join(swept)}, for the command line; to train one agent, give "
+            f"{'it a value' if len(swept) == 1 else 'each of them a value'}"
+        )
+
+
 def _single_values(name: tuple[str, ...], value: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield the entries of a mapping, of the mappings in it and so on, or else the value itself; nothing if empty."""
     if not isinstance(value, dict):
@@ -210,20 +227,3 @@ def choosing_class(group: str, cls: type) -> str:
     settings = defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group]))
     ConfigStore.instance().store(name=name, group=group, node={TARGET: dotted, **settings, **budget})
     return word(group, name)
-
-
-def check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
-    """Refuse an experiment that is a sweep, unless words give every swept setting a value.
-
-    Raises:
-        ConfigError: the message names the swept settings.
-    """
-    given = {name for each in words for name in settings_in(each)}
-    swept = [name for name in cfg.hydra.sweeper.get("params") or {} if name not in given]
-    if cfg.hydra.mode == RunMode.MULTIRUN and swept:
-        chosen = cfg.hydra.runtime.choices
-        sweep = next((f"{group}={chosen[group]}" for group in ("experiment", "search") if chosen.get(group)), "train")
-        raise ConfigError(
-            f"{sweep}: a sweep over {', '.join(swept)}, for the command line; to train one agent, give "
-            f"{'it a value' if len(swept) == 1 else 'each of them a value'}"
-        )
