@@ -147,7 +147,7 @@ def check_effects_on(problem: ProblemFacts, config: Config, words: Sequence[str]
         ConfigError: there is such a word.
     """
     agent, has_choice = config.run.agent, _has_choice(config, problem)
-    never_acts = agent.sharing == "per_option" and with_acting_learners(config, problem) is not config
+    is_low_unused = agent.sharing == "per_option" and with_acting_learners(config, problem) is not config
     for name, word in _words_by_setting(words).items():
         why = None
         if name == "agent.uniform_option_steps" and agent.uniform_option_steps:
@@ -157,7 +157,7 @@ def check_effects_on(problem: ProblemFacts, config: Config, words: Sequence[str]
                 why = f"{config.high} chooses uniformly in all steps"
         elif name == "agent.sharing" and agent.sharing == "shared" and not has_choice:
             why = f"{config.env} has no options to choose, and one learner"
-        elif never_acts and name.startswith("low.") and name.split(".")[1] not in RUN_VALUES["low"]:
+        elif is_low_unused and name.startswith("low.") and name.split(".")[1] not in RUN_VALUES["low"]:
             why = "low.per_option names a learner for every option"
         if why is not None:
             raise ConfigError(f"{word}: has no effect, because {why}; leave it out")
