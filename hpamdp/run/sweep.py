@@ -23,6 +23,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
@@ -110,7 +111,11 @@ def _check_number(config: DictConfig) -> None:
         return
     words = {name: f"{name}={values}" for name, values in (sweeper.params or {}).items()}
     words |= {setting_of(word): word for word in config.hydra.overrides.task}
-    swept = [each for each in OverridesParser.create().parse_overrides([*words.values()]) if each.is_discrete_sweep()]
+    try:
+        overrides = OverridesParser.create().parse_overrides([*words.values()])
+    except HydraException:  # which Hydra will report
+        return
+    swept = [each for each in overrides if each.is_discrete_sweep()]
     if math.prod(map(_num_values, swept)) > _MOST_JOBS:
         given = " ".join(each.input_line or "" for each in swept if _num_values(each) > 1)
         raise ConfigError(f"{given}: more than {_MOST_JOBS:,} jobs; give fewer values")
