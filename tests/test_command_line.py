@@ -120,7 +120,7 @@ MISTAKES = [
         ["-m", "experiment=domains/moving,platform", "env=goal,hard_goal"],
         "env=goal,hard_goal: experiment=domains/moving chooses env=moving itself; leave env=goal,hard_goal out",
     ),
-    (["-m", "low=glob(x*)"], "low=glob(x*): matches no choice; conf/low has bc, "),
+    (["-m", "low=glob(x*)"], "low=glob(x*): matches no choice; conf/low has "),
     (["-m", "experiment=glob(domains/*)"], "experiment=glob(domains/*): matches no choice; conf/experiment has "),
     (["-m", "seed=glob(*)"], "seed=glob(*): glob is for a group, as in low=glob(h*); list the values"),
     (["low=glob(h*)"], "low=glob(h*): several values; add --multirun"),
