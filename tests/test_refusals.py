@@ -449,7 +449,7 @@ BOTH_OPTIONS = "+low.per_option={run: random, jump: random}"
     [
         ("high=none low=hppo agent.uniform_option_steps=10", "env=platform has no options to choose"),
         ("high=uniform +env.grouping=default low=hppo agent.uniform_option_steps=10", "high=uniform chooses uniformly"),
-        ("high=none low=hppo agent.sharing=shared", "env=platform has no options to choose, and one learner"),
+        ("high=none low=hppo agent.sharing=shared", "env=platform has no options to choose"),
         (f"high=ucb +env.grouping=default low=hppo {BOTH_OPTIONS} low.lr=0.5", "low.per_option names a learner for"),
         ("high=none low=hppo total_frames=64 low.budget.total_frames=32", "beside total_frames=64"),
         ("high=none low=hppo eval.every=64 low.budget.eval_every=32", "beside eval.every=64"),

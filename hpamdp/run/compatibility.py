@@ -156,7 +156,7 @@ def check_effects_on(problem: ProblemFacts, config: Config, words: Sequence[str]
             elif config.high.name == "uniform":
                 why = f"{config.high} chooses uniformly in all steps"
         elif name == "agent.sharing" and agent.sharing == "shared" and not has_choice:
-            why = f"{config.env} has no options to choose, and one learner"
+            why = f"{config.env} has no options to choose"
         elif is_low_unused and name.startswith("low.") and name.split(".")[1] not in RUN_VALUES["low"]:
             why = "low.per_option names a learner for every option"
         if why is not None:
