@@ -481,7 +481,7 @@ def hierarchy() -> list[Claim]:
         Claim(RESULTS, "that of the fixed layouts {ceiling:.3f}.", numbers),
         Claim(
             RESULTS,
-            "Over H-PPO, selectors that see the layout score {mean_gain:.1f} higher than those that do not.",
+            "Over H-PPO, selectors that see the layout score {mean_gain:.1f} higher than the others.",
             numbers,
         ),
         Claim(
