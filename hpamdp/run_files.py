@@ -79,5 +79,36 @@ def flat_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in values.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+        # An empty map among a user's own values, as in `env.kwargs={a: {}}`, is a value.
+        if isinstance(value, Mapping) and (value or not _is_users_own(prefix)):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value
     return flat
+
+
+def _is_users_own(name: str) -> bool:
+    """Return whether a dotted name lies within a setting of a problem, such as `env.kwargs`."""
+    return name.startswith("env.") and name.count(".") > 1
+
+
+def differing_settings(here: Mapping[str, Any], there: Mapping[str, Any]) -> list[str]:
+    """Return the names whose values differ in two configs of `flat_settings`.
+
+    A setting that is missing counts as null, since saved runs lack newer settings. Values within a setting of a
+    problem, such as `env.kwargs`, are a user's own: there, a missing one differs from null.
+    """
+    return [
+        name
+        for name in {**here, **there}
+        if not are_same(here.get(name), there.get(name)) or (_is_users_own(name) and (name in here) != (name in there))
+    ]
+
+
+def are_same(first: Any, second: Any) -> bool:
+    """Return whether two values of a config are the same; 1 and 1.0 are, 1 and true are not."""
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return first.keys() == second.keys() and all(are_same(first[name], second[name]) for name in first)
+    if isinstance(first, list | tuple) and isinstance(second, list | tuple):
+        return len(first) == len(second) and all(map(are_same, first, second))
+    return isinstance(first, bool) == isinstance(second, bool) and bool(first == second)

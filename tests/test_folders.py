@@ -23,7 +23,7 @@ from hpamdp.run.loggers import TensorboardLogger, WandbLogger
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 from hpamdp.run.trainer import Trainer
-from hpamdp.run_files import CONFIG_NAME, ERROR_NAME
+from hpamdp.run_files import CONFIG_NAME, ERROR_NAME, differing_settings, flat_settings
 
 TINY = ["num_envs=8", "steps_per_batch=4", "total_frames=128", "log_every=32", "eval.layouts=4", "eval.every=0"]
 TINY += ["high=ucb", "low=random"]
@@ -315,6 +315,33 @@ def test_the_same_command_after_a_requeue_goes_on_with_its_run(tmp_path, command
     assert contents(tmp_path / "run") == before
     assert command(*words, "seed=4", "overwrite=true")[0] == 0
     assert "seed: 4" in (tmp_path / "run/config.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("env", "saved", "names"),
+    [
+        ({"kwargs": {"a": 1}}, {"kwargs": {"a": True}}, ["env.kwargs.a"]),
+        ({"kwargs": {"a": [0, 1]}}, {"kwargs": {"a": [False, 1]}}, ["env.kwargs.a"]),
+        ({"kwargs": {"a": None}}, {"kwargs": {}}, ["env.kwargs.a"]),
+        ({"kwargs": {"a": {}}}, {"kwargs": {}}, ["env.kwargs.a"]),
+        ({"kwargs": {"a": {}}}, {"kwargs": {"a": {"b": None}}}, ["env.kwargs.a", "env.kwargs.a.b"]),
+        ({"kwargs": {"a": 1, "b": 2}}, {"kwargs": {"b": 2, "a": 1.0}}, []),
+        ({"id": "Toy-v0", "new": None, "kwargs": {}}, {"id": "Toy-v0"}, []),
+    ],
+)
+def test_other_values_of_an_environments_own_arguments_make_another_run(env, saved, names):
+    here, there = flat_settings({"env": env}), flat_settings({"env": saved})
+    assert sorted(differing_settings(here, there)) == sorted(differing_settings(there, here)) == names
+
+
+def test_a_missing_argument_of_an_environment_is_named_as_no_value(tmp_path, command):
+    words = [*TINY, "env=gymnasium", "env.entry_point=toy_environments:Drawn", "env.max_steps=4", "high=none"]
+    words += ["film=false", "hydra.run.dir=run", "resume=auto"]
+    assert command(*words, "env.kwargs={is_wrong: true}")[0] == 0
+    code, _, err = command(*words, "env.kwargs={is_wrong: 1}")
+    assert code == 2 and "with env.kwargs.is_wrong=true for 1;" in err
+    code, _, err = command(*words)
+    assert code == 2 and "with env.kwargs.is_wrong=true for no value;" in err
 
 
 def test_jobs_whose_folder_cannot_be_made_are_named_and_the_others_run(tmp_path, command, capsys):

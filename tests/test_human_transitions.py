@@ -10,6 +10,7 @@ import re
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 import synthetic_human
 import torch
@@ -181,7 +182,7 @@ def test_all_recorded_transitions_are_finite_and_start_as_the_environment_does(p
 
 
 def test_selected_episodes_meet_every_condition_and_keep_their_presses(data):
-    chosen = select(data, complete=True, successes=True, best_people=1, controller="congruent")
+    chosen = select(data, complete=True, successes=True, best_people=np.int64(1), controller="congruent")
     best = int(scores_by_person(data).argmax())
     assert (chosen.episodes["person"] == best).all() and chosen.episodes["complete"].all()
     assert (chosen.episodes["outcome"] == physics.SUCCESS).all() and (chosen.episodes["controller"] == 1).all()

@@ -31,6 +31,7 @@ from hpamdp.run_files import (
     SUMMARY_NAME,
     TENSORBOARD_NAME,
     WANDB_NAME,
+    are_same,
     saved_config,
     saved_summary,
 )
@@ -215,7 +216,7 @@ def _fault_in_problem(run: Run, settings: Mapping[str, Collection[Any] | None]) 
         if setting in ENV_WITHOUT_INFLUENCE or setting not in own:
             continue
         allowed = settings.get(f"{name}.{setting}", (own[setting],))
-        if allowed is not None and value not in [*allowed]:
+        if allowed is not None and not any(are_same(value, each) for each in allowed):
             return _not_of_study(f"env.{setting}", value, allowed)
     return None
 

@@ -13,7 +13,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import upgraded
 from hpamdp.config.schema import Config
 from hpamdp.run import checkpoint
-from hpamdp.run_files import SUMMARY_NAME, flat_settings, saved_config, saved_summary
+from hpamdp.run_files import SUMMARY_NAME, differing_settings, flat_settings, saved_config, saved_summary
 
 
 class Rest(NamedTuple):
@@ -58,9 +58,9 @@ def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
     # Convert through yaml, like the saved config.
     here = flat_settings(yaml.safe_load(wanted.to_yaml()))
     there = flat_settings(upgraded(saved) if saved else {})
-    names = [name for name in {**here, **there} if here.get(name) != there.get(name)]
+    names = differing_settings(here, there)
     if not names:
         return ""
     more = f" and {len(names) - 1} more" if names[1:] else ""
-    values = [json.dumps(each.get(names[0]), default=str) for each in (there, here)]
+    values = [json.dumps(each[names[0]], default=str) if names[0] in each else "no value" for each in (there, here)]
     return f"{names[0]}={values[0]} for {values[1]}{more}"

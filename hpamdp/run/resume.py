@@ -26,7 +26,7 @@ from hpamdp.messages import warn
 from hpamdp.renamed import with_new_names
 from hpamdp.run import checkpoint, compatibility
 from hpamdp.run.assemble import choose_selector, make_env
-from hpamdp.run_files import ENV_WITHOUT_INFLUENCE, flat_settings
+from hpamdp.run_files import ENV_WITHOUT_INFLUENCE, are_same, flat_settings
 from hpamdp.shell import setting
 
 # Settings that a run does not take over from the saved run.
@@ -109,7 +109,7 @@ def _check_same_run(saved: Mapping[str, Any], resolved: Config, file: Path, word
     earlier = with_new_names("env", before["env"], now["env"])
     for name, value in now["env"].items():
         has_moved = isinstance(value, str) and resolved.env.is_guarded(name, value)
-        if name not in earlier or value == earlier[name] or name in ENV_WITHOUT_INFLUENCE or has_moved:
+        if name not in earlier or are_same(value, earlier[name]) or name in ENV_WITHOUT_INFLUENCE or has_moved:
             continue
         raise ConfigError(
             f"env.{name}={as_json(value)}: the run in {file} has env.{name}={as_json(earlier[name])}; {elsewhere}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -40,7 +41,7 @@ def check_conditions(complete: object, successes: object, best_people: object, c
     for name, value in (("complete", complete), ("successes", successes)):
         if not isinstance(value, bool):
             raise DataError(f"{name}={as_code(value)}, but must be True or False")
-    if best_people is not None and type(best_people) is not int:
+    if best_people is not None and (isinstance(best_people, bool) or not isinstance(best_people, int | np.integer)):
         raise DataError(f"best_people={as_code(best_people)}, but must be a whole number or None")
     if controller is not None and controller not in harbour.CONTROLLERS:
         raise DataError(f"controller={as_code(controller)}, but must be one of {', '.join(harbour.CONTROLLERS)}")

@@ -369,7 +369,7 @@ class Copies:
 
 def _rate_of(env: gymnasium.Env) -> float:
     rate: Any = env.metadata.get("render_fps")
-    is_rate = isinstance(rate, int | float) and not isinstance(rate, bool) and 0.0 < rate < math.inf
+    is_rate = isinstance(rate, int | float | np.number) and not isinstance(rate, bool) and 0.0 < rate < math.inf
     return float(rate) if is_rate else _PICTURES_PER_SECOND
 
 
