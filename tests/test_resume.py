@@ -18,7 +18,7 @@ from hpamdp.run.recorder import Recorder
 from hpamdp.run.stopping import STOP_SIGNALS
 from hpamdp.run.train import run
 
-SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=416", "eval.layouts=4", "eval.every=192", "log_every=64"]
+SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=416", "eval.layouts=2", "eval.every=224", "log_every=64"]
 STOPPED_AFTER = 9  # batches, in the middle of a log interval
 SELECTORS = ("ucb", "linucb", "meta_critic", "actor", "exp3")
 
