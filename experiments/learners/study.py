@@ -168,9 +168,9 @@ def _draw_learner(axes: Axes, rows: Rows, low: str, x: str) -> float:
 
 def _draw_references(axes: Axes, results: Rows, boat: str) -> None:
     references = {
-        "ceiling": (results[0]["ceiling"], "#2b2b2b", "-"),
+        "ceiling": (_mean(results, "ceiling"), "#2b2b2b", "-"),
         "people": (HUMAN[boat]["score"], "#D98200", "--"),
-        "random": (results[0]["random"], "#8c8c8c", ":"),
+        "random": (_mean(results, "random"), "#8c8c8c", ":"),
     }
     for name, (height, colour, style) in references.items():
         axes.axhline(height, color=colour, linestyle=style, linewidth=1.0, zorder=1)
