@@ -106,9 +106,10 @@ def differing_settings(here: Mapping[str, Any], there: Mapping[str, Any]) -> lis
 
 
 def are_same(first: Any, second: Any) -> bool:
-    """Return whether two values of a config are the same; 1 and 1.0 are, 1 and true are not."""
+    """Return whether two values of a config are the same: 1 and 1.0 are, NaN and NaN are, 1 and true are not."""
     if isinstance(first, Mapping) and isinstance(second, Mapping):
         return first.keys() == second.keys() and all(are_same(first[name], second[name]) for name in first)
     if isinstance(first, list | tuple) and isinstance(second, list | tuple):
         return len(first) == len(second) and all(map(are_same, first, second))
-    return isinstance(first, bool) == isinstance(second, bool) and bool(first == second)
+    are_nan = first != first and second != second
+    return isinstance(first, bool) == isinstance(second, bool) and bool(first == second or are_nan)

@@ -158,6 +158,15 @@ def test_metrics_of_ones_own_are_columns_of_every_row_and_part_of_the_summary(tm
     assert json.loads((folder / "summary.json").read_text())["own/frames"] == 128.0
 
 
+def test_metrics_of_ones_own_are_kept_by_a_run_that_goes_on_where_nothing_is_left_to_do():
+    words = [*SMALL, "total_frames=32"]
+    own = OwnMetrics(lambda trainer: {"frames": trainer.frames})
+    trainer, resumed = train(own, words=words), train(words=words)
+    resumed.recorder.set_state(trainer.recorder.state())
+    resumed.finish()
+    assert resumed.recorder.summary["own/frames"] == 32.0
+
+
 @pytest.mark.parametrize(
     ("returned", "complaint"),
     [

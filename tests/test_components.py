@@ -197,6 +197,21 @@ def test_soft_values_of_pairs_off_the_marginals_are_reached_by_autoregressive_po
     assert reward > 0.95 if autoregressive else 0.4 < reward < 0.55
 
 
+def test_critics_see_the_parameters_of_earlier_components_as_they_were_executed(monkeypatch):
+    torch.manual_seed(0)
+    specs = PAMDPSpecs(2, (), (1, 1, 1, 1), (-1.0,) * 4, (1.0,) * 4, component_sizes=(2, 2))
+    learner = HSAC(specs, **SMALL, autoregressive=True)
+    seen, of_discrete = [], learner.critics.of_discrete
+    monkeypatch.setattr(
+        learner.critics,
+        "of_discrete",
+        lambda state, discrete, unit: (seen.append(unit), of_discrete(state, discrete, unit))[1],
+    )
+    executed = torch.tensor([[1.0, -1.0, 0.0, 0.0], [0.5, -0.99, 0.0, 0.0]])
+    learner._turn(1, torch.randn(2, 2), None, None, torch.zeros(2, 2, dtype=torch.long), executed)
+    torch.testing.assert_close(seen[0][:, :2], executed[:, :2].repeat_interleave(2, 0), atol=1e-4, rtol=0.0)
+
+
 def test_the_greedy_action_of_autoregressive_heads_is_the_most_probable_together():
     torch.manual_seed(0)
     specs = PAMDPSpecs(2, (), (1, 0, 0, 0, 2, 0, 0), (-1.0,) * 3, (1.0,) * 3, component_sizes=(2, 3, 2))

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import os
 import signal
 import struct
@@ -326,6 +327,7 @@ def test_the_same_command_after_a_requeue_goes_on_with_its_run(tmp_path, command
         ({"kwargs": {"a": {}}}, {"kwargs": {}}, ["env.kwargs.a"]),
         ({"kwargs": {"a": {}}}, {"kwargs": {"a": {"b": None}}}, ["env.kwargs.a", "env.kwargs.a.b"]),
         ({"kwargs": {"a": 1, "b": 2}}, {"kwargs": {"b": 2, "a": 1.0}}, []),
+        ({"kwargs": {"a": [math.nan]}}, {"kwargs": {"a": [math.nan]}}, []),
         ({"id": "Toy-v0", "new": None, "kwargs": {}}, {"id": "Toy-v0"}, []),
     ],
 )

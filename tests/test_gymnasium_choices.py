@@ -143,7 +143,15 @@ def test_a_method_that_gives_a_mask_is_reported_in_one_line_unless_masks_are_ign
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("mask", [3, 4]), ("mask", np.zeros((2, 2))), ("valid_action", True), ("legal_actions", None)]
+    ("name", "value"),
+    [
+        ("mask", [3, 4]),
+        ("mask", np.zeros((2, 2))),
+        ("mask_1", [3, 4]),
+        ("Masks-2", np.zeros((2, 2))),
+        ("valid_action", True),
+        ("legal_actions", None),
+    ],
 )
 def test_other_entries_with_such_names_are_no_masks(name, value):
     for where in ("info", "attribute"):

@@ -475,6 +475,17 @@ def test_with_a_window_the_critics_see_the_newest_steps_alone_and_none_of_the_wa
     assert len(drawn) > 250, "the codec sees all"
 
 
+def test_with_a_window_a_run_that_resumes_without_its_steps_learns_from_the_new_ones_at_once():
+    torch.manual_seed(0)
+    settings = dict(critic_window=80, warmup_steps=200, codec_pretrain_updates=1, updates_per_step=1.0, batch_size=60)
+    earlier, resumed = make(**settings), make(**settings)
+    learn(earlier, 1)
+    learn(earlier, 1, 100)
+    resumed.load_state_dict(earlier.state_dict())
+    learn(resumed, 1, 70)
+    assert resumed.updates == earlier.updates + 70
+
+
 def test_the_noise_falls_with_the_episodes_after_the_warm_up():
     learner = make(
         noise_initial=1.0, noise_episodes=100, parameter_noise=0.1, epsilon_final=0.0, epsilon_steps=0,

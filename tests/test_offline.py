@@ -18,11 +18,13 @@ from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.metrics_file import read_rows
+from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.low_level.bc import BC
 from hpamdp.policies.low_level.iql import IQL
 from hpamdp.policies.low_level.td3_bc import TD3BC
+from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
-from hpamdp.run.train import run
+from hpamdp.run.train import begin, run
 from hpamdp.run.trainer import Trainer
 from hpamdp.specs import PAMDPSpecs
 
@@ -63,6 +65,21 @@ def test_a_run_that_fails_in_its_first_evaluation_keeps_its_data_set(path, tmp_p
     resumed = ["mode=offline", f"resume={tmp_path / 'first'}"]
     assert run(compose_config(resumed), tmp_path / "second", resumed) == 0
     assert json.loads((tmp_path / "second" / "summary.json").read_text())["without_update"] == []
+
+
+def test_a_run_that_fails_at_its_start_adds_its_data_set_once(path, tmp_path, monkeypatch):
+    added, add = [], HierarchicalAgent.add_demonstrations
+    counted = lambda self, *data: (added.append(len(data[0])), add(self, *data))  # noqa: E731
+    monkeypatch.setattr(HierarchicalAgent, "add_demonstrations", counted)
+    words = ["data=human", "data.checksum=null", f"data.path={path}", "high=linucb", "low=pdqn", "low.warmup_steps=8"]
+    words += ["num_envs=4", "steps_per_batch=4", "total_frames=16", "eval.layouts=4", "eval.every=0", "film=false"]
+    with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
+        patched.setattr(Trainer, "_evaluate", lambda self, bar: 1 / 0)
+        run(compose_config(words), tmp_path, words)
+    trainer = begin(make_config(words), checkpoint.find(tmp_path, "resume"), tmp_path)  # as `resume=auto` does
+    assert trainer.frames == 0
+    trainer.train()
+    assert trainer.frames == 16 and len(added) == 1
 
 
 @pytest.mark.parametrize("high", ["ucb", "linucb", "meta_critic"])

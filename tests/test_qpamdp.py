@@ -187,6 +187,15 @@ def test_the_bound_shortens_sarsas_step_to_cancel_the_error():
     assert error == 36.0
 
 
+def test_the_mean_error_of_sarsa_counts_its_own_steps_alone():
+    sarsa = make_sarsa(step_size=1e-12)
+    ends = [[True, True], [True, True]]
+    phi = [[[1.0], [1.0]], [[1.0], [1.0]]]
+    rows = sarsa_rows(phi, phi, [[0, 0], [0, 0]], [[1.0, 3.0], [2.0, 3.0]], ends, ends)
+    rows["mask"] = torch.tensor([[True, False], [True, False]])
+    assert sarsa.update(torch.zeros(2, 1), rows, ONE, ONE)[1] == pytest.approx(2.5), "of 1 and 4"
+
+
 def one_row(phi: float, reward: float, done: bool = True) -> TensorDict:
     """Return one step of one environment with discrete action 0; the next state has the feature 1."""
     return sarsa_rows([[[phi]]] * 2, [[[1.0]]] * 2, [[0]] * 2, [[reward]] * 2, [[done]] * 2, [[done]] * 2)

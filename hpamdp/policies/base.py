@@ -551,6 +551,8 @@ class Learner(Level, nn.Module):
         memory_lasts_an_episode: whether that memory remembers the whole episode, and not the option alone.
         remembers_directions: whether the learner remembers the directions of actions that a problem reveals, unless it
             has another memory or `augment=false`.
+        needs_current_policy: whether each batch must be of the policy after the last update. A collector that collects
+            ahead is refused.
         counts_durations: whether discounts are those of `step_discounts`. A run warns if the environment writes
             durations and the learner does not count them.
         exploring_keys: those of the policy's states that only exploration reads. They do not keep it from an export.
@@ -577,6 +579,7 @@ class Learner(Level, nn.Module):
     memory_key: str | None = None
     memory_lasts_an_episode: bool = False
     remembers_directions: ClassVar[bool] = False
+    needs_current_policy: ClassVar[bool] = False
     counts_durations: ClassVar[bool] = False
     exploring_keys: ClassVar[frozenset[str]] = frozenset()
     explores_with: ClassVar[frozenset[str]] = frozenset()

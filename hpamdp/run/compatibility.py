@@ -563,7 +563,7 @@ def memories_have_values(config: Config) -> str | None:
 
 
 def collector_fits_the_run(config: Config) -> str | None:
-    """Require of a collector with workers its package, a mode with steps, and an equal share for each worker."""
+    """Require of a collector its package, a mode with steps, an equal share for each worker, and the policy needed."""
     collector, run = config.collector, config.run
     if run.mode == "eval":  # which collects nothing
         return None
@@ -578,6 +578,13 @@ def collector_fits_the_run(config: Config) -> str | None:
             f"collector.num_workers={num_workers}: must divide num_envs={run.num_envs}, of which each worker "
             "has an equal share"
         )
+    if collector.settings.get("ahead", False):
+        for low in config.learners:
+            if getattr(low.cls, "needs_current_policy", False):
+                return (
+                    f"collector.ahead=true: {low} learns from steps of its current policy alone, and batches ahead are "
+                    "of the one before; use collector.ahead=false"
+                )
     return None
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import FiniteFloat
+from pydantic import Field, FiniteFloat
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -35,6 +35,7 @@ class _State(SavedPart):
     ended: list[dict[str, Tensor]]
     scalars: dict[str, FiniteFloat]
     held: dict[str, FiniteFloat]
+    own: dict[str, FiniteFloat] = Field(default_factory=dict)
 
 
 class Recorder:
@@ -99,6 +100,7 @@ class Recorder:
             "ended": [dict(ended.items()) for ended in self._ended],
             "scalars": dict(self._scalars),
             "held": dict(self._held),
+            "own": dict(self._own),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -118,6 +120,7 @@ class Recorder:
         self._ended = [TensorDict(ended).auto_batch_size_(1) for ended in saved.ended]
         self._scalars = saved.scalars
         self._held = saved.held
+        self._own = saved.own
 
     def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
         """Note a collected batch `[N, T]`, if there is one, and the scalars that the agent returned from learning."""
@@ -236,11 +239,13 @@ class Recorder:
         return self._played
 
     def _drift(self, measured: dict[str, float]) -> dict[str, float]:
-        """Return the change of the score with each option held since the last evaluation."""
+        """Return, for each option, how much the score with that option held has changed since the last evaluation."""
         held = {name: value for name, value in measured.items() if name.startswith("score_")}
         before, self._held = self._held, held
         return {
-            name.replace("score_", "drift_"): value - before[name] for name, value in held.items() if name in before
+            f"drift_{name.removeprefix('score_')}": value - before[name]
+            for name, value in held.items()
+            if name in before
         }
 
     def _training_scores(self) -> dict[str, float]:

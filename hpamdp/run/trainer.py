@@ -256,7 +256,8 @@ class Trainer:
             learner.while_compiling = partial(_said_by, bar, "compiling the updates")
         with bar:
             is_new = self.last_score is None and self.frames == 0
-            if is_new and self.parts.data is not None:  # before anything can end the run, which has the data only now
+            # First of all, since a resumed run does not add the data again.
+            if is_new and self._saved is None and self.parts.data is not None:
                 self.parts.agent.add_demonstrations(self.parts.data.batch, self.parts.data.decisions)
             self._call(lambda callback: callback.on_start(self))
             if is_new or self.is_evaluation_due:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
+from functools import lru_cache
 from itertools import chain
 from typing import Any, Literal
 
@@ -233,17 +233,21 @@ def _in_attributes(env: Any, *, is_new: bool) -> Iterator[tuple[str, str, Any]]:
         layer = getattr(layer, "__dict__", {}).get("env")
 
 
-@cache
+@lru_cache(maxsize=4096)  # an environment may name its entries anew in each episode
 def _meaning(entry: str) -> str | None:
     """Return the mask that the name of an entry suggests, if any."""
-    letters = re.sub(r"[^a-z]", "", entry.lower())
+    letters = _letters(entry)
     if letters in _VAGUE:
         return keys.ACTION_MASK
     return next((name for name, pattern in _MEANINGS.items() if re.fullmatch(pattern, letters)), None)
 
 
 def _is_vague(entry: str) -> bool:
-    return entry.lower() in _VAGUE
+    return _letters(entry) in _VAGUE
+
+
+def _letters(entry: str) -> str:
+    return re.sub(r"[^a-z]", "", entry.lower())
 
 
 def _is_like_mask(value: Any, size: int) -> bool:

@@ -231,6 +231,7 @@ class HPPO(OnPolicy, Learner):
         left = 1.0 + progress * (options.entropy_final - 1.0)
         entropy_weight = torch.tensor(left, device=rows.device, dtype=torch.float32)
         steps = [self.gradient_step(self.loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]
+        # The lower limit is the one before this batch, the upper one the one after it. Published scores were made so.
         self.actor.set_min_scale(options.min_scale * (options.min_scale_final / options.min_scale) ** progress)
         if options.max_scale_final is not None:
             fall = options.max_scale_final / options.max_scale

@@ -70,6 +70,9 @@ from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.settings import LearningRate, OnlyWith
 from hpamdp.specs import PAMDPSpecs
 
+# Largest squashed parameter that is kept of an executed action, whose inverse tanh is finite.
+_LARGEST_EXECUTED = 1.0 - 1e-6
+
 
 class HSACOptions(HeadOptions, ReplayMemoryOptions, ActorCriticOptions, TargetRateOptions, ScaleOptions):
     """Settings of `HSAC`."""
@@ -408,7 +411,7 @@ class HSAC(ReplayLearner):
         size = self.specs.components.sizes[number]
         discrete_weight, parameter_weight = self.temperatures()
         own = torch.arange(size, device=state.device).repeat(len(state))
-        rows = state, allowed, is_fixed, discrete, unsquashed(unit)
+        rows = state, allowed, is_fixed, discrete, unsquashed(unit, _LARGEST_EXECUTED)
         state, mask, fixed, discrete, raw = (_repeated(each, size) for each in rows)
         discrete, raw, distribution = self.actor.act_from(number, own, discrete, raw, state, mask)
         log_probs, densities = self.log_probs(distribution, discrete, raw, fixed)

@@ -313,7 +313,7 @@ class HyAR(ReplayLearner):
     takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
     may_be_nan: ClassVar[frozenset[str]] = frozenset({LATENT})
-    progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"episodes"}
+    progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"episodes", "warmup_rows"}
 
     options: HyAROptions
     policy: HyARPolicy
@@ -399,6 +399,12 @@ class HyAR(ReplayLearner):
             if self.updates % (self.options.latent_range_every * self.options.codec_every) == 0:
                 self.fit_latent_range()
         return scalars
+
+    def store(self, batch: TensorDictBase, mask: Tensor) -> None:
+        """Store the batch's transitions."""
+        if self.buffer.write_count == 0:  # also in a resumed run whose checkpoint has no stored transitions
+            self.warmup_rows.zero_()
+        super().store(batch, mask)
 
     def _codec_sample(self) -> TensorDictBase:
         """Return a sample of all stored transitions for an update of the codec."""

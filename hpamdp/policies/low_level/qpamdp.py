@@ -254,8 +254,8 @@ class SarsaLambda(SizedByData):
             for group, taken, traces in zip(groups, next_discrete.split(size), self.traces.split(size), strict=True):
                 row = {name: values[:, t] for name, values in group.items()}
                 w, error = self.step(w, row, taken[:, t], traces, temperature, step_scale)
-                errors.append(error)
-        return w, torch.stack(errors).mean()
+                errors.append(error * row["mask"].sum())
+        return w, torch.stack(errors).sum() / rows["mask"].sum().clamp(min=1)
 
     def step(
         self,
@@ -430,6 +430,7 @@ class QPAMDP(Learner):
     """
 
     Options = QPAMDPOptions
+    needs_current_policy = True  # the scores of the rows are those of the parameters' present distribution
     takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
     explores_with: ClassVar[frozenset[str]] = frozenset({"actions", "rewards"})
     # A run from `low.checkpoint` goes on in the saved phase: a second warm-up would fit other bases under the weights.
