@@ -30,6 +30,7 @@ PLATFORM = "env=platform high=none low=random "
 GYMNASIUM = "env=gymnasium high=none low=random env.max_steps=9 "
 
 REFUSED = [
+    ("low=qpamdp collector=multi collector.ahead=true", "low=qpamdp learns from steps of its current policy"),
     # More than there is memory for.
     ("num_envs=1000000000", "num_envs=1000000000, steps_per_batch=4: the run takes at least "),
     ("num_envs=100000000000000000000", "num_envs=100000000000000000000: must lie between "),
@@ -453,10 +454,6 @@ BOTH_OPTIONS = "+low.per_option={run: random, jump: random}"
         (f"high=ucb +env.grouping=default low=hppo {BOTH_OPTIONS} low.lr=0.5", "low.per_option names a learner for"),
         ("high=none low=hppo total_frames=64 low.budget.total_frames=32", "beside total_frames=64"),
         ("high=none low=hppo eval.every=64 low.budget.eval_every=32", "beside eval.every=64"),
-        (
-            "high=none low=qpamdp collector=multi collector.ahead=true",
-            "low=qpamdp learns from steps of its current policy",
-        ),
         ("mode=offline data=human env=boatdock high=human low=iql low.budget.num_envs=5", "with mode=offline"),
     ],
 )

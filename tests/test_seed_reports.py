@@ -66,6 +66,33 @@ def test_runs_are_grouped_by_all_settings_but_the_seed(tmp_path):
     assert (second["configuration"], second["mean"]) == ("low.lr=0.5", 7.0)
 
 
+def test_evaluations_of_one_agent_do_not_count_as_seeds(tmp_path, capsys):
+    for agent in "ab":
+        for seed in (0, 1, 2):
+            folder = tmp_path / f"{agent}{seed}"
+            leave_run(folder, seed=seed, scores=(0.0, float(seed)))
+            with (folder / "config.yaml").open("a") as file:
+                file.write(f"mode: eval\ncheckpoint: {agent}\n")
+    rows = hpamdp.report(tmp_path)
+    assert [(row["configuration"], row["seeds"], row["mean"]) for row in rows] == [
+        ("checkpoint=a", 1, 0.0),
+        ("checkpoint=b", 1, 0.0),
+    ]
+    assert f"{tmp_path}/a1: evaluates the agent of {tmp_path}/a0, left out\n" in capsys.readouterr().err
+
+
+def test_runs_on_objects_from_python_are_said_to_look_alike(tmp_path, capsys):
+    for seed in (0, 1):
+        leave_run(tmp_path / str(seed), seed=seed)
+        file = tmp_path / f"{seed}/config.yaml"
+        file.write_text(file.read_text().replace("slip: 0.0", "id: null, entry_point: null, slip: 0.0"))
+    hpamdp.report(tmp_path)
+    assert (
+        "and 1 more: their environments were objects from Python, which no config tells apart"
+        in capsys.readouterr().err
+    )
+
+
 def test_a_name_has_what_was_swept_but_not_what_follows_from_it(tmp_path):
     leave_run(tmp_path / "0", low="hppo", lr=0.1, total_frames=400)
     leave_run(tmp_path / "1", low="pdqn", lr=0.9, total_frames=900)  # as its yaml file says

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from hpamdp.analysis.study import fault_of, run_folders
+from hpamdp.env.registration import NAMING_SETTINGS
 from hpamdp.messages import one_line, reason_of, warn
 from hpamdp.metrics_file import EVALUATION, read_curve
 from hpamdp.run_files import (
@@ -254,11 +255,30 @@ def _shown(text: str) -> str:
 
 
 def _one_a_seed(runs: Sequence[SeedRun]) -> list[SeedRun]:
-    """Return one run for each seed, a finished one if there is one."""
+    """Return one run for each seed, or one evaluation for each agent; a finished one if there is one."""
+    _warn_of_objects(runs)
     chosen: dict[str, SeedRun] = {}
     for run in sorted(runs, key=lambda run: run.state != FINISHED):
-        if run.seed in chosen:
-            warn(one_line(f"{run.folder}: has the settings and the seed of {chosen[run.seed].folder}, left out"))
+        is_evaluation = run.settings.get("mode") == json.dumps("eval")
+        # All of these evaluations are of one agent, since `checkpoint` is among their settings.
+        seed = "" if is_evaluation else run.seed
+        if seed in chosen:
+            same = "evaluates the agent" if is_evaluation else "has the settings and the seed"
+            warn(one_line(f"{run.folder}: {same} of {chosen[seed].folder}, left out"))
         else:
-            chosen[run.seed] = run
-    return [run for run in runs if chosen[run.seed] is run]
+            chosen[seed] = run
+    return [run for run in runs if any(run is each for each in chosen.values())]
+
+
+def _warn_of_objects(runs: Sequence[SeedRun]) -> None:
+    """Warn if runs count as seeds of one configuration whose environments were objects from Python."""
+    first = runs[0]
+    names = [f"env.{name}" for name in NAMING_SETTINGS]
+    is_object = all(first.settings.get(name) == "null" for name in names)
+    if is_object and len(runs) > 1:
+        warn(
+            one_line(
+                f"{first.folder} and {len(runs) - 1} more: their environments were objects from Python, which no "
+                "config tells apart; they count as one environment"
+            )
+        )
