@@ -28,6 +28,8 @@ from hpamdp.renamed import with_new_names
 from hpamdp.run_files import (
     CONFIG_NAME,
     ENV_WITHOUT_INFLUENCE,
+    EVALUATION_NAME,
+    METRICS_NAME,
     SUMMARY_NAME,
     TENSORBOARD_NAME,
     WANDB_NAME,
@@ -58,11 +60,11 @@ class Run:
 
     def evaluations(self) -> list[dict[str, float]]:
         """Return the rows of the run's metrics that hold an evaluation."""
-        return [row for row in read_rows(self.folder / "metrics.csv") if "eval/score" in row]
+        return [row for row in read_rows(self.folder / METRICS_NAME) if "eval/score" in row]
 
     def played(self) -> dict[str, np.ndarray]:
         """Return the run's final evaluation as arrays whose first dimension is the episode."""
-        with np.load(self.folder / "evaluation.npz", allow_pickle=False) as file:
+        with np.load(self.folder / EVALUATION_NAME, allow_pickle=False) as file:
             return dict(file)
 
 
@@ -282,7 +284,7 @@ def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:
 
 
 def read_csv(path: Path) -> Rows:
-    """Read rows from a csv file, with numbers as floats.
+    """Read rows from a csv file, with whole numbers as ints and other numbers as floats.
 
     Raises:
         SystemExit: a row has more or fewer cells than the file has columns.

@@ -41,7 +41,7 @@ class DecisionTracker(Transform):
     Args:
         gamma: discount of an environment step within the option.
         option_length: steps after which an option ends, unless its episode or trip ends first. If None, an option lasts
-            as long as these. If `math.inf`, the selector ends it: it sets `is_decision` in the root of the step at
+            until then. If `math.inf`, the selector ends it: it sets `is_decision` in the root of the step at
             which it chooses again. If "chosen", the policy writes the number of steps of each option under
             `option_length`, int64 `[*B]`.
         option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`, if options are sets of
@@ -165,9 +165,9 @@ class DecisionTracker(Transform):
         option = tensordict.get(keys.OPTION)
         is_stuck = ~possible.gather(-1, option.unsqueeze(-1))
         if self.option_length is None:
-            is_held = is_stuck & ~next_tensordict.get(keys.TRIP_ENDED) if self.ends_with_trips else is_stuck
-            if is_held.any():
-                row = int(is_held.flatten().nonzero()[0])
+            cannot_end = is_stuck & ~next_tensordict.get(keys.TRIP_ENDED) if self.ends_with_trips else is_stuck
+            if cannot_end.any():
+                row = int(cannot_end.flatten().nonzero()[0])
                 lifetime = "trips" if self.ends_with_trips else "episodes"
                 raise ProblemError(
                     f"environment {row}: option {option.flatten()[row].item()} has no allowed action left, and options "
@@ -190,9 +190,9 @@ class DecisionTracker(Transform):
         pairs = None if pair_mask is None else pair_mask.unsqueeze(-3)
         has_action = allowed.any(-1) if self.components is None else self.components.leaves_any(allowed, pairs)
         possible = has_action | tensordict.get(keys.DONE)
-        is_stuck = ~possible.any(-1)
-        if is_stuck.any():
-            row = int(is_stuck.flatten().nonzero()[0])
+        has_none = ~possible.any(-1)
+        if has_none.any():
+            row = int(has_none.flatten().nonzero()[0])
             masks = " and ".join(name for name in (keys.ACTION_MASK, keys.PAIR_MASK) if name in tensordict.keys())
             raise ProblemError(
                 f"environment {row}: its {masks} leaves none of the options an action; give them more actions"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _TRIED_AGAIN = "tried_again"
 
 
-def go_on(config: DictConfig) -> int | None:
+def first_job_of_search(config: DictConfig) -> int | None:
     """Set up Hydra's Optuna sweeper to continue a search, and return the number of its first job.
 
     The search first repeats trials that were stopped or failed. Then it proposes new trials until `n_trials` are

@@ -33,7 +33,7 @@ from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.messages import one_line, reason_of, say, warn
 from hpamdp.run.folder import check_no_link, has_foreign_error, is_about_folder, locked, remove_error, write_error
-from hpamdp.run.search import go_on
+from hpamdp.run.search import first_job_of_search
 from hpamdp.run.stopping import exits_explained, pass_on_signal
 from hpamdp.run_files import ERROR_NAME, MAX_TEXT_BYTES, saved_summary
 from hpamdp.shell import path_setting
@@ -52,7 +52,7 @@ _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and fi
 _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
 
 
-class SweepDir(Callback):
+class SweepFolderCallback(Callback):
     """Remember the sweep's folder, which Hydra gives only to callbacks, and keep Hydra from writing into runs."""
 
     path: ClassVar[Path | None] = None
@@ -68,16 +68,18 @@ class SweepDir(Callback):
         _check_output_subdir(config)
         _check_effects(config, _OF_RUNS, "has no effect on a sweep; give hydra.sweep.dir")
         _check_fixed(config, "hydra.sweep.dir")
-        SweepDir.path = Path(os.path.abspath(config.hydra.sweep.dir))
+        SweepFolderCallback.path = Path(os.path.abspath(config.hydra.sweep.dir))
         try:
-            _check_sweep_dir(SweepDir.path)
+            _check_sweep_dir(SweepFolderCallback.path)
             _check_number(config)
-            first_job = go_on(config)
+            first_job = first_job_of_search(config)
         except ConfigError as error:
             warn(str(error))
             sys.exit(_MISTAKE)
         if first_job is None:
-            say(f"{SweepDir.path}: this search has all of its trials; set hydra.sweeper.n_trials to add some")
+            say(
+                f"{SweepFolderCallback.path}: this search has all of its trials; set hydra.sweeper.n_trials to add some"
+            )
             sys.exit(0)
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
@@ -274,7 +276,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     say(f"Job {job.number}: {job.overrides}")
     try:
         with locked(folder, _LOCK_PATIENCE_S), exits_explained():
-            job.state, job.score, job.reason = _go_on(cfg, overrides, folder)
+            job.state, job.score, job.reason = _run_rest(cfg, overrides, folder)
     except ConfigError as error:
         job.state, job.reason = _REFUSED, one_line(str(error))
         with suppress(OSError):
@@ -293,7 +295,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     return job.score
 
 
-def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None, str]:
+def _run_rest(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None, str]:
     """Run the rest of the job in a folder, and return the job's state, its score and the reason of a failure."""
     # These imports take seconds, which --help need not wait for.
     from hpamdp.run import train
@@ -338,7 +340,7 @@ def _watch(parent: int) -> None:
 
 def has_begun(start: str) -> bool:
     """Return whether any job has started."""
-    return SweepDir.path is not None and bool(Records(SweepDir.path, start).read())
+    return SweepFolderCallback.path is not None and bool(Records(SweepFolderCallback.path, start).read())
 
 
 def report(start: str, error: BaseException | None = None) -> int:
@@ -350,7 +352,7 @@ def report(start: str, error: BaseException | None = None) -> int:
         start: name of this start of the sweep.
         error: the error that ended the sweep early, if any.
     """
-    sweep_dir = SweepDir.path
+    sweep_dir = SweepFolderCallback.path
     assert sweep_dir is not None
     records = Records(sweep_dir, start)
     jobs = records.read()
@@ -358,7 +360,9 @@ def report(start: str, error: BaseException | None = None) -> int:
     is_stopped = isinstance(error, KeyboardInterrupt | SystemExit)
     for job in jobs:
         if job.state == _RUNNING:
-            job.state, job.reason = (_STOPPED, "") if is_stopped else (_FAILED, "ended without a word, or still runs")
+            job.state, job.reason = (
+                (_STOPPED, "") if is_stopped else (_FAILED, "ended without reporting a state, or is still running")
+            )
     failed = [job for job in jobs if job.state in (_REFUSED, _FAILED)]
     if not is_stopped:
         _report_seeds(sweep_dir, jobs)

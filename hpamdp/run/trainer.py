@@ -80,7 +80,7 @@ class Trainer:
         self.wall_s = 0.0
         self.cpu_s = 0.0
         self.last_score: float | None = None
-        self.is_evaluation_due = False  # whether one was begun and not ended
+        self.is_evaluation_due = False  # whether one was begun and not ended; a resumed run repeats it
         self._saved: checkpoint.Saved | None = None  # what a resumed run continues from
         self.unit = " steps"
         if config.run.mode == "offline":
@@ -175,9 +175,10 @@ class Trainer:
     def train(self) -> bool:
         """Train until `num_frames`, `eval.stop_score` or a callback ends it, and save the agent.
 
-        Returns whether a signal stopped it before.
-
         A signal takes effect between two batches, so that the saved state equals that of an uninterrupted run.
+
+        Returns:
+            True if a signal stopped training before its end.
 
         Raises:
             DivergedError: a reward, a loss or a weight is not finite. Nothing has been saved since.

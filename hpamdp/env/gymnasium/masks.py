@@ -1,4 +1,4 @@
-"""The masks of the discrete actions and options that a Gymnasium environment forbids; masks elsewhere are found."""
+"""Read the masks of allowed discrete actions and options, and refuse masks in places that are not read."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ class MetaCritic(RemembersDecisions):
         return {"warmup_decisions": self.options.warmup_decisions, "updates_per_decision": first_update}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
-        """Store finished decisions and, after the warm-up, make the updates that are due."""
+        """Store finished decisions `[N]` and, after the warm-up, make the updates that are due."""
         return self._learn(self._rows(decisions))
 
     def learn_from_options(self, steps: TensorDictBase) -> dict[str, float]:

@@ -155,7 +155,7 @@ class OptionCritic(RemembersDecisions):
         }
 
     def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
-        """Store the steps and, after the warm-up, make the updates that are due."""
+        """Store the steps `[*B, T]` and, after the warm-up, make the updates that are due."""
         rows = self._rows(batch).flatten()
         self.buffer.extend(rows)
         before = int(self.num_steps)

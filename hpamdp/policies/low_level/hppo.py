@@ -117,7 +117,7 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     """Steps of the whole run over which learning rate, `min_scale`, `max_scale` and entropy bonuses are annealed.
 
     Steps of other options' learners count, too. So a learner whose option is seldom chosen ends its exploration with
-    the others.
+    the others, at its next update.
     """
     max_grad_norm: PositiveFloat = 1.0
     """Largest gradient norm, of actors and critic together."""

@@ -213,7 +213,7 @@ class HSAC(ReplayLearner):
     ) -> None:
         options = HSACOptions.of(options, settings)
         super().__init__(specs, device, options)
-        self.most_discrete_entropy = sum(math.log(size) for size in specs.components.sizes)
+        self.max_discrete_entropy = sum(math.log(size) for size in specs.components.sizes)
         self.register_buffer("parameter_dims", torch.tensor(specs.parameter_dims).float(), persistent=False)
         self.set_perception(options)
         self.actor = make_actor(self.perception.specs, options)
@@ -337,8 +337,8 @@ class HSAC(ReplayLearner):
         own_target = self.options.parameter_target_entropy * dims
         q = critics(state, unit_parameters).amin(0) - discrete_weight * log_probs - parameter_weight * own_log_density
         probs = log_probs.exp()
-        most_entropy = self.most_discrete_entropy if allowed is None else allowed.sum(-1).log()
-        discrete_excess = -(probs * log_probs).sum(-1) - self.options.discrete_target_entropy * most_entropy
+        max_entropy = self.max_discrete_entropy if allowed is None else allowed.sum(-1).log()
+        discrete_excess = -(probs * log_probs).sum(-1) - self.options.discrete_target_entropy * max_entropy
         parameter_excess = -(probs * (own_log_density + own_target)).sum(-1)
         return (probs * q).sum(-1), discrete_excess, parameter_excess
 
@@ -452,12 +452,12 @@ class HSAC(ReplayLearner):
     ) -> tuple[Tensor, Tensor]:
         """Return samples of both entropies minus their targets, `[N]` each, of log-likelihoods `[N]`."""
         components = self.specs.components
-        most_entropy: Tensor | float = self.most_discrete_entropy
+        max_entropy: Tensor | float = self.max_discrete_entropy
         if allowed is not None:
-            most_entropy = torch.stack([part.sum(-1) for part in allowed.split(components.sizes, -1)], -1).log().sum(-1)
+            max_entropy = torch.stack([part.sum(-1) for part in allowed.split(components.sizes, -1)], -1).log().sum(-1)
         is_own = components.is_chosen(discrete).index_select(-1, self.owner)
         num_own = (is_own if is_fixed is None else is_own & ~is_fixed).sum(-1)
-        discrete_excess = -discrete_log_prob - self.options.discrete_target_entropy * most_entropy
+        discrete_excess = -discrete_log_prob - self.options.discrete_target_entropy * max_entropy
         return discrete_excess, -parameter_log_prob - self.options.parameter_target_entropy * num_own
 
     def temperatures(self) -> tuple[Tensor, Tensor]:

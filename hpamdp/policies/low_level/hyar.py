@@ -98,7 +98,7 @@ class HyAROptions(CodecOptions, TargetRateOptions, SearchingActorOptions):
     """
 
     twin: bool = True
-    """Act by TD3 (HyAR-TD3); else by DDPG (HyAR-DDPG), with one critic, no delay and no target smoothing."""
+    """Train by TD3 (HyAR-TD3). If false, train by DDPG (HyAR-DDPG): one critic, no delay, no target smoothing."""
     discrete: Literal["greedy", "nearest"] = "greedy"
     """Discrete action: the one with the highest value (`greedy`), or with the embedding nearest to e (`nearest`).
 
@@ -506,9 +506,9 @@ class HyAR(ReplayLearner):
 
         This is the representation-shift correction: e is replaced by the discrete action's embedding where it no longer
         decodes to that action; z is encoded again if the predicted change of the state is off by more than
-        `correction_factor` times the codec's mean error or, if `parameter_tolerance` is given, where the decoded
-        parameters are off by more than that. With `relabelling="sample"` the new e carries noise, and the new z is a
-        sample of the encoder's distribution instead of its mean.
+        `correction_factor` times the codec's error (`correction_error`) or, if `parameter_tolerance` is given, where
+        the decoded parameters are off by more than that. With `relabelling="sample"` the new e carries noise, and the
+        new z is a sample of the encoder's distribution instead of its mean.
 
         Latents are `[B, embedding_dim + latent_dim]`.
         """

@@ -436,7 +436,10 @@ class PDQN(ReplayLearner):
         set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
     def num_updates(self, steps: int) -> int:
-        """Return the updates for this many steps; none with one hidden layer, whose compiled updates take longer."""
+        """Return the number of updates, or 0 with at most one hidden layer.
+
+        With 0, `compile_updates=auto` does not compile: compiled updates of such networks take longer.
+        """
         return super().num_updates(steps) if len(self.options.hidden_dims) > 1 else 0
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:

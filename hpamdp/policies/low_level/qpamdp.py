@@ -464,7 +464,7 @@ class QPAMDP(Learner):
         self.sarsa = SarsaLambda(self.options)
         self.enac = NaturalActorCritic(self.options.ridge)
         self.open = PendingOptionEnds()
-        self.register_buffer("mask", specs.parameter_mask.float())
+        self.register_buffer("mask", specs.parameter_mask.float())  # the own parameters of each discrete action
         self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf, dtype=torch.float32))
         self.register_buffer("high", torch.full((specs.observation_dim,), -torch.inf, dtype=torch.float32))
         self.register_buffer("best_return", torch.tensor(-torch.inf, dtype=torch.float32))

@@ -163,11 +163,11 @@ class HybridActor(nn.Module):
         """Return the distribution whose `log_prob` is that of an action in a state; arguments as for `act`.
 
         Args:
-            observation: of the states.
-            discrete: the chosen discrete actions.
-            raw: raw parameters.
-            mask: the discrete actions that may be taken.
-            pair_mask: the discrete actions that go together.
+            observation: of the states, `[*B, observation_dim]`.
+            discrete: the chosen discrete actions, `[*B]`, or `[*B, num_components]` if there are several components.
+            raw: raw parameters, `[*B, num_parameters]`.
+            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`.
+            pair_mask: the discrete actions that go together, bool `[*B, num_discrete, num_discrete]`.
         """
         return self(observation, mask)
 

@@ -17,7 +17,8 @@ from hpamdp.specs import PAMDPSpecs
 # Initial parameters: the problem's own convention, if it has one (`domain`), or the network's initial output (`none`).
 InitialParameters = Literal["domain", "none"]
 
-# Squashed parameters start within the first bound, past which they hardly move, and are drawn to none past the second.
+# Initial squashed parameters are clamped to the first bound, past which tanh has hardly any gradient. Targets of an
+# actor's squashed parameters are clamped to the second.
 _LARGEST_INITIAL = 0.99
 _LARGEST_DRAWN_TO = 0.97
 
@@ -28,7 +29,7 @@ _MAX_PASSES = 1 << 13
 def in_float32(layer: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """Apply a layer in float32, also where autocast computes products in bfloat16.
 
-    bfloat16 has steps of 0.25 near 50. So what networks say is computed in float32, from hidden layers in bfloat16.
+    bfloat16 has steps of 0.25 near 50. So network outputs are computed in float32, from hidden layers in bfloat16.
     """
     if x.is_meta or not torch.is_autocast_enabled(x.device.type):
         return layer(x)
@@ -50,7 +51,7 @@ class EnsembleLinear(nn.Module):
     def __init__(self, num_members: int, in_dim: int, out_dim: int) -> None:
         super().__init__()
         bound = 1.0 / math.sqrt(in_dim)  # as in nn.Linear
-        # Values follow when both are registered: weights of a wrong size are refused before they take memory.
+        # Registered first and filled afterwards, so that weights of a wrong size are refused before they take memory.
         self.weight = nn.Parameter(torch.empty(num_members, in_dim, out_dim, dtype=torch.float32))
         self.bias = nn.Parameter(torch.empty(num_members, 1, out_dim, dtype=torch.float32))
         nn.init.uniform_(self.weight, -bound, bound)
@@ -261,7 +262,7 @@ class HybridCritics(nn.Module):
 
     With `is_multipass`, the value of k comes from a forward pass that sees only its own parameters x_k; the others are
     0. The passes of a state share their first layer but for the columns of x_k, and pass k computes only output k. So K
-    passes of H units take memory `[B, K, H]`, and never `[B, K, K]`.
+    passes of H units take memory `[B, K, H]`, and not `[B, K, K]`, unless there is no hidden layer.
 
     If an action has several components, its value is the sum of the values of what each component chose (Sunehag et al.
     2018, *Value-Decomposition Networks for Cooperative Multi-Agent Learning*, arXiv 1706.05296). So the best choice of
@@ -331,7 +332,7 @@ class HybridCritics(nn.Module):
 
         x = (in_float32(of_states, state) if first is last else of_states(state)).unsqueeze(2)
         for slot, is_own in zip(self.slots.unbind(-1), self.is_own.unbind(-1), strict=True):
-            # Of every discrete action the next one of its parameters, `[B, K]`, in its own pass.
+            # Add the next parameter of each discrete action, `[B, K]`, to its own pass.
             x = torch.addcmul(x, (unit_parameters[:, slot] * is_own).unsqueeze(-1), of_parameters[:, slot].unsqueeze(1))
         if first is last:
             return x.expand(-1, -1, self.num_discrete, -1).diagonal(dim1=-2, dim2=-1)

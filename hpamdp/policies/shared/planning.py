@@ -42,7 +42,7 @@ class SearchOptions(Settings):
 
         Args:
             samples: names of the settings that are numbers of samples.
-            factors: names of the other settings whose product is the number of actions.
+            factors: names of the other settings. Times the samples, their product is the number of actions tried.
         """
         for name in samples:
             if self.num_elites > getattr(self, name):
@@ -63,7 +63,7 @@ class SequenceSearchOptions(SearchOptions):
     num_samples: PositiveInt = 12
     """Samples of the parameters for each sequence in an iteration."""
     greedy_samples: PositiveInt = 60
-    """The same in a greedy plan, where nothing makes up for a plan that is not the best."""
+    """`num_samples` of a greedy plan. Greedy plans need more, because no exploration corrects them."""
     num_elites: PositiveInt = 4
     """The best of the samples, which define the next iteration's Gaussians."""
     first_min_deviation: NonNegativeFloat = 0.3
@@ -72,7 +72,10 @@ class SequenceSearchOptions(SearchOptions):
     The shortest step that reaches a target lies at a cliff of the return, which elites alone approach too slowly.
     """
     min_deviation: NonNegativeFloat = 0.04
-    """Smallest standard deviation of a parameter in the last iteration."""
+    """Smallest standard deviation of a parameter in the last iteration.
+
+    With two iterations `first_min_deviation` counts.
+    """
 
     @model_validator(mode="after")
     def _check_sequences(self) -> Self:
@@ -122,12 +125,12 @@ def discounted_return(
 
 
 def elite_weights(returns: Tensor, num_elites: int, temperature: Tensor) -> tuple[Tensor, Tensor]:
-    """Return of candidates' returns `[*B, S]` the best ones' places and their weights, `[*B, num_elites]` each.
+    """Return the indices and the weights of the best candidates, `[*B, num_elites]` each.
 
     The weights are exp(return / temperature), normalised.
 
     Args:
-        returns: of the candidates.
+        returns: of the candidates, `[*B, S]`.
         num_elites: how many of them are the best ones.
         temperature: positive, of a shape that broadcasts with `returns`.
     """
@@ -180,8 +183,8 @@ class SequenceSearch:
 
     At first, every sequence of discrete actions is tried with a few samples of the parameters, spread evenly over
     their bounds; if there are more than `max_sequences`, so many random ones, in which the first actions occur equally
-    often. Then the best `num_kept` of them are refined, and in each iteration but the first half as many: samples come
-    from a Gaussian for every parameter, whose mean and deviation are those of the elites of the iteration before. Its
+    often. Then the best `num_kept` of them are refined. Each later iteration refines half as many. Samples come from a
+    Gaussian for every parameter, whose mean and deviation are those of the elites of the iteration before. Its
     deviation has a lower bound, which falls from iteration to iteration: where a return is a cliff, such as at the
     shortest way into a target, the elites' own deviation shrinks before the edge is found. The best sample so far is
     among the next ones, and the best of the last ones is the plan.

@@ -91,7 +91,8 @@ class ReplayLearner(Learner):
         stores_own_parameters: true if the buffer holds only the parameters of the discrete action that was taken. This
             saves memory where there are many; samples then have 0 for the others. With several components the buffer
             holds all parameters.
-        slots: for each discrete action the places of its parameters among all, int64 `[num_discrete, D]`.
+        slots: for each discrete action the places of its parameters among all, int64 `[num_discrete, D]`. D is the
+            largest of `parameter_dims`; unused places are those of other actions' parameters.
         owner: the discrete action that each parameter belongs to, int64 `[num_parameters]`.
         catches_up: true if the first updates make up for the steps of the warm-up.
         max_grad_norm: largest gradient norm of a gradient step; if None, there is no limit.
