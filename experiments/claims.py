@@ -481,15 +481,16 @@ def hierarchy() -> list[Claim]:
         Claim(RESULTS, "that of the fixed layouts {ceiling:.3f}.", numbers),
         Claim(
             RESULTS,
-            "Over H-PPO, selectors that see the layout score {mean_gain:.1f} higher than the others.",
+            "Over H-PPO, selectors that see the layout score {mean_gain:.1f} higher than the others, except the actor "
+            "without uniform options.",
             numbers,
         ),
         Claim(
             page("hierarchy"),
             "the `actor`, with uniform options at first, and the `meta_critic` both end {actor_below:.2f} "
             "below the ceiling. People score {people:.3f}. Selectors that see the layout gain {gains} over "
-            "one boat. The `actor` without uniform options scores {actor_gain:.2f} more than the best of these, "
-            "which is unclear.",
+            "one boat, with one exception. The `actor` without uniform options scores {actor_gain:.2f} more than the "
+            "best of these, which is unclear.",
             numbers,
             holds=round(actor["below"], 2) == round(meta_critic["below"], 2) and not actor_over_one.is_clear,
         ),
@@ -741,8 +742,9 @@ def domains() -> list[Claim]:
         Claim(
             README,
             "On each of the {all:word} domains with published scores, our best learner has a higher mean than the best "
-            "published one. Each mean is over {seeds} seeds that nobody had used before. The best learner is the one "
-            "of {learners} with the highest mean ([domains]",
+            "published one. On Goal and Hard Goal that takes a search when it acts. Each mean is over {seeds} "
+            "seeds that nobody had used before. The best learner is the one of {learners} with the highest mean "
+            "([domains]",
             numbers,
             holds=all(is_above) and all(are_fresh),
         ),
@@ -1531,6 +1533,12 @@ def offline() -> list[Claim]:
         few_updates=rows("offline/discount_scores.csv")[0]["updates"],
         last=last_block["score"],
     )
+    early = {
+        low: mean(
+            rows("offline/curves.csv", low=low, start="offline", data="rest-to-rest", frames=numbers["few_updates"])
+        )
+        for low in ("iql", "td3_bc")
+    }
     return [
         Claim(
             RESULTS,
@@ -1541,8 +1549,9 @@ def offline() -> list[Claim]:
         Claim(
             page("offline"),
             "After {updates:,.0f} updates `td3_bc` scores {means[td3_bc]:.2f} and `iql` {means[iql]:.2f}; people score "
-            "{people:.3f}.",
+            "{people:.3f}. After {few_updates:,.0f} updates `iql` is the better one.",
             numbers,
+            holds=early["iql"] > early["td3_bc"],
         ),
         Claim(
             page("offline"),
@@ -2101,9 +2110,10 @@ def speed() -> list[Claim]:
         Claim(
             page("speed"),
             "In float32 an update takes {ratio} times as long as its products, compiled {compiled} times. Compiled "
-            "and in bfloat16, H-PPO, DLPA and TD3+BC take less time than their products in float32.",
+            "and in bfloat16, H-PPO and DLPA take less time than their products in float32.",
             numbers,
-            holds={row["learner"] for row in updates if row["bfloat16_ratio"] < 1.0} == {"hppo", "dlpa", "td3_bc"},
+            # Two such measurements differ by a few tenths, so a ratio close to 1 says nothing.
+            holds={row["learner"] for row in updates if row["bfloat16_ratio"] < 0.9} == {"hppo", "dlpa"},
         ),
     ]
 
