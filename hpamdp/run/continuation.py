@@ -40,17 +40,31 @@ def rest_of(wanted: Config, folder: Path, name: str = "its folder") -> Rest:
     saved = saved_config(folder)
     if not saved and file.exists():
         saved = checkpoint.progress_of(file)["config"]
-    difference = _difference(wanted, saved)
-    if difference and wanted.run.overwrite:
+    if wanted.run.overwrite and _difference(wanted, saved):
         return Rest()
+    refuse_another(wanted, saved, name)
+    summary = saved_summary(folder)
+    score = summary.get("score") if summary.get("finished") else None
+    return Rest(score if isinstance(score, int | float) else None, file if file.exists() else None)
+
+
+def refuse_another(wanted: Config, saved: Mapping[str, Any], name: str) -> None:
+    """Refuse a saved run with another config, except for bookkeeping.
+
+    Args:
+        wanted: the config of the run.
+        saved: the config of the saved run.
+        name: name of its folder in the error.
+
+    Raises:
+        ConfigError: the configs differ.
+    """
+    difference = _difference(wanted, saved)
     if difference:
         raise ConfigError(
             f"{name} has the results of another config, with {difference}; they stay as they are: set another "
             "folder, or move this one away"
         )
-    summary = saved_summary(folder)
-    score = summary.get("score") if summary.get("finished") else None
-    return Rest(score if isinstance(score, int | float) else None, file if file.exists() else None)
 
 
 def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
