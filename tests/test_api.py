@@ -537,6 +537,84 @@ def test_fewer_episodes_of_a_seed_are_the_first_of_more(platform_agent):
     np.testing.assert_array_equal(few, more[:3])
 
 
+class Spoken(gymnasium.Env):
+    """Observe a dict of a box and a number."""
+
+    observation_space = spaces.Dict(
+        pos=spaces.Box(-1.0, 1.0, (2,), np.float32), time=spaces.Box(0.0, 9.0, (), np.float32)
+    )
+    action_space = Reach.action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return {"pos": np.zeros(2, np.float32), "time": np.float32(0.0)}, {}
+
+    def step(self, action):
+        return {"pos": np.zeros(2, np.float32), "time": np.float32(1.0)}, 0.0, False, False, {}
+
+
+@pytest.fixture(scope="module")
+def dict_agent() -> hpamdp.Agent:
+    return hpamdp.train(Spoken, **OWN)
+
+
+@pytest.mark.parametrize(
+    ("observation", "line"),
+    [
+        (
+            {"pos": np.zeros((2, 2)), "time": 0.0},
+            "act: the entry time has the shape [], but the entry pos holds 2 observations, so it must have [2]",
+        ),
+        (
+            {"pos": np.zeros(2), "time": np.zeros(3)},
+            "act: the entry time has the shape [3], but the entry pos holds one observation, so it must have []",
+        ),
+        (
+            {"pos": np.zeros((2, 2)), "time": np.zeros(3)},
+            "act: the entry time has the shape [3], but the entry pos holds 2 observations, so it must have [2]",
+        ),
+        (
+            {"pos": np.zeros((0, 2)), "time": np.zeros(0)},
+            "act: the entry pos has the shape [0, 2], but must have [2] or [N, 2], with N from 1 on",
+        ),
+        (
+            {"pos": np.zeros((1, 2, 2)), "time": np.zeros(1)},
+            "act: the entry pos has the shape [1, 2, 2], but must have [2] or [N, 2], with N from 1 on",
+        ),
+    ],
+)
+def test_entries_of_a_dict_with_other_numbers_of_observations_are_refused(dict_agent, observation, line):
+    with pytest.raises(ValueError) as raised:
+        dict_agent.act(observation)
+    assert str(raised.value) == line
+
+
+def test_a_batch_of_entries_of_a_dict_acts_as_its_rows_do(dict_agent):
+    one = dict_agent.act({"pos": np.full(2, 0.5), "time": 1.0})
+    both = dict_agent.act({"pos": np.full((2, 2), 0.5), "time": np.ones(2)})
+    np.testing.assert_array_equal(both[0], [one[0], one[0]])
+
+
+def test_a_batch_of_no_boxes_is_refused():
+    agent = hpamdp.train(Reach, **OWN)
+    with pytest.raises(
+        ValueError, match=r"^act: the observation has the shape \[0, 3\], but must have \[3\] or \[N, 3\]"
+    ):
+        agent.act(np.zeros((0, 3)))
+
+
+def test_an_unknown_keyword_of_act_is_refused_with_the_known_ones(platform_agent):
+    with pytest.raises(TypeError, match=r"^act: deterministic=True: no such argument; use greedy=True$"):
+        platform_agent.act(np.zeros(9), deterministic=True)
+    with pytest.raises(TypeError, match=r"^act: state=None: no such argument; it has observation, info, greedy$"):
+        platform_agent.act(np.zeros(9), state=None)
+
+
+def test_load_takes_the_problem_as_its_second_argument(platform_agent, tmp_path):
+    platform_agent.save(tmp_path / "a.pt")
+    assert hpamdp.load(tmp_path / "a.pt", "platform").specs == platform_agent.specs
+
+
 # Mistakes that a hostile user found: each is one line, or has the effect that one would expect.
 
 

@@ -282,8 +282,8 @@ def _torch_restored() -> Iterator[None]:
 
 def load(
     source: str | Path,
-    *,
     env: Any = None,
+    *,
     config_dirs: Sequence[str | Path] = (),
     trust: bool = False,
     **settings: Any,

@@ -15,6 +15,8 @@ from hpamdp.config.schema import Config
 from hpamdp.run import checkpoint
 from hpamdp.run_files import SUMMARY_NAME, differing_settings, flat_settings, saved_config, saved_summary
 
+_CHOSEN = "choices."  # what precedes the groups in a saved config
+
 
 class Rest(NamedTuple):
     """The rest of a run: nothing if it has a score, otherwise everything after its checkpoint, if it has one."""
@@ -72,9 +74,14 @@ def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
     # Convert through yaml, like the saved config.
     here = flat_settings(yaml.safe_load(wanted.to_yaml()))
     there = flat_settings(upgraded(saved) if saved else {})
-    names = differing_settings(here, there)
+    names = sorted(differing_settings(here, there), key=_depth)
     if not names:
         return ""
     more = f" and {len(names) - 1} more" if names[1:] else ""
     values = [json.dumps(each[names[0]], default=str) if names[0] in each else "no value" for each in (there, here)]
-    return f"{names[0]}={values[0]} for {values[1]}{more}"
+    return f"{names[0].removeprefix(_CHOSEN)}={values[0]} for {values[1]}{more}"
+
+
+def _depth(name: str) -> int:
+    """Return a number that puts settings before those that may follow from them: choices, values of the run, others."""
+    return 0 if name.startswith(_CHOSEN) else 1 + ("." in name)
