@@ -624,6 +624,9 @@ def test_load_takes_the_problem_as_its_second_argument(platform_agent, tmp_path)
         ({"folder": ""}, "folder='': must be a path"),
         ({"folder": 3}, "folder=3: must be a path"),
         ({"folder": "a\0b"}, "must be a path"),
+        ({"folder": "p/\ud800"}, r"folder='p/\\ud800': must be a path; no file can have this name"),
+        ({"low.hidden_dims": np.zeros((2, 2))}, "must be a number, a text, or a list or mapping of these"),
+        ({"env": Reach, "env.kwargs": {"a": np.zeros(2)}}, "must be a number, a text, or a list or mapping of these"),
         ({"callbacks": None}, "must be a list of objects of subclasses"),
         ({"callbacks": [hpamdp.BestAgent]}, "not BestAgent, a class"),
         ({"hydra.run.dir": "other"}, "Hydra runs no job here"),
@@ -640,6 +643,20 @@ def test_a_mistake_in_an_argument_leaves_no_file_and_no_open_environment(tmp_pat
     with pytest.raises(hpamdp.ConfigError, match=message):
         hpamdp.train(given.pop("env"), **given)
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("given", [np.array([16, 8]), range(16, 0, -8), torch.tensor([16, 8]), (16, 8)])
+def test_a_list_may_be_an_array_or_a_range(given):
+    agent = hpamdp.train("platform", low={"name": "hppo", "hidden_dims": given}, **TINY)
+    assert agent._config.low.settings["hidden_dims"] == (16, 8)
+
+
+def test_a_folder_that_is_a_link_to_nowhere_says_so(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    for folder in ("link", "link/run"):
+        line = rf"link: a link to {re.escape(str(tmp_path))}/gone, which does not exist$"
+        with pytest.raises(hpamdp.ConfigError, match=line):
+            hpamdp.train("platform", low="hppo", folder=tmp_path / folder, **TINY)
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
@@ -959,6 +976,11 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make("circuit", ion_costs=[0.03]), "env.ion_costs.1: missing"),
         (lambda: hpamdp.load("hppo_platform", low="pdqn"), "low: has no effect on a trained agent"),
         (lambda: hpamdp.report(), "name the folder of a run"),
+        (
+            lambda: hpamdp.report(["runs", "more"]),
+            r"^report: folders in a list; give them one by one, such as report\(",
+        ),
+        (lambda: hpamdp.report(__file__), r"test_api\.py: a file; give the folder of a run, or one that contains runs"),
         (lambda: hpamdp.report(3), "folders=3: must be a path"),
         (lambda: hpamdp.report(".", metric=3), "metric=3: must be the name of a column"),
         (lambda: hpamdp.HPPO("platform"), r"specs='platform': must be PAMDPSpecs.from_env\(env\)"),

@@ -244,12 +244,20 @@ def _own_folder(folder: Path) -> Iterator[None]:
             try:
                 stack.enter_context(locked(folder))
             except OSError as error:
-                raise ConfigError(f"folder={folder}: {reason_of(error)}") from error
+                raise ConfigError(f"folder={folder}: {_why_not_made(folder, error)}") from error
             yield
     finally:
         with suppress(OSError):  # at the first folder that is not empty
             for each in missing:
                 each.rmdir()
+
+
+def _why_not_made(folder: Path, error: OSError) -> str:
+    """Return why a folder cannot be made. The system calls a link to nowhere an existing file."""
+    for each in (folder, *folder.parents):
+        if os.path.islink(each) and not os.path.exists(each):
+            return f"{each}: a link to {os.readlink(each)}, which does not exist"
+    return reason_of(error)
 
 
 def _rest_of(config: Config, folder: Path) -> Rest:
