@@ -385,10 +385,8 @@ def _check_batch(space: spaces.Space, observation: Any) -> None:
             first, first_num = entry, num
         elif num != first_num:
             held = "one observation" if first_num is None else f"{first_num} observations"
-            allowed = list(shape) if first_num is None else [first_num, *shape]
-            raise ValueError(
-                f"{entry} has the shape {list(given)}, but {first} holds {held}, so it must have {allowed}"
-            )
+            wanted = list(shape) if first_num is None else [first_num, *shape]
+            raise ValueError(f"{entry} has the shape {list(given)}, but {first} holds {held}, so it must have {wanted}")
 
 
 def _shapes(space: spaces.Space, observation: Any, name: str) -> Iterator[tuple[str, _Shape, _Shape]]:
