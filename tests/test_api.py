@@ -537,6 +537,84 @@ def test_fewer_episodes_of_a_seed_are_the_first_of_more(platform_agent):
     np.testing.assert_array_equal(few, more[:3])
 
 
+class Spoken(gymnasium.Env):
+    """Observe a dict of a box and a number."""
+
+    observation_space = spaces.Dict(
+        pos=spaces.Box(-1.0, 1.0, (2,), np.float32), time=spaces.Box(0.0, 9.0, (), np.float32)
+    )
+    action_space = Reach.action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return {"pos": np.zeros(2, np.float32), "time": np.float32(0.0)}, {}
+
+    def step(self, action):
+        return {"pos": np.zeros(2, np.float32), "time": np.float32(1.0)}, 0.0, False, False, {}
+
+
+@pytest.fixture(scope="module")
+def dict_agent() -> hpamdp.Agent:
+    return hpamdp.train(Spoken, **OWN)
+
+
+@pytest.mark.parametrize(
+    ("observation", "line"),
+    [
+        (
+            {"pos": np.zeros((2, 2)), "time": 0.0},
+            "act: the entry time has the shape [], but the entry pos holds 2 observations, so it must have [2]",
+        ),
+        (
+            {"pos": np.zeros(2), "time": np.zeros(3)},
+            "act: the entry time has the shape [3], but the entry pos holds one observation, so it must have []",
+        ),
+        (
+            {"pos": np.zeros((2, 2)), "time": np.zeros(3)},
+            "act: the entry time has the shape [3], but the entry pos holds 2 observations, so it must have [2]",
+        ),
+        (
+            {"pos": np.zeros((0, 2)), "time": np.zeros(0)},
+            "act: the entry pos has the shape [0, 2], but must have [2] or [N, 2], with N from 1 on",
+        ),
+        (
+            {"pos": np.zeros((1, 2, 2)), "time": np.zeros(1)},
+            "act: the entry pos has the shape [1, 2, 2], but must have [2] or [N, 2], with N from 1 on",
+        ),
+    ],
+)
+def test_entries_of_a_dict_with_other_numbers_of_observations_are_refused(dict_agent, observation, line):
+    with pytest.raises(ValueError) as raised:
+        dict_agent.act(observation)
+    assert str(raised.value) == line
+
+
+def test_a_batch_of_entries_of_a_dict_acts_as_its_rows_do(dict_agent):
+    one = dict_agent.act({"pos": np.full(2, 0.5), "time": 1.0})
+    both = dict_agent.act({"pos": np.full((2, 2), 0.5), "time": np.ones(2)})
+    np.testing.assert_array_equal(both[0], [one[0], one[0]])
+
+
+def test_a_batch_of_no_boxes_is_refused():
+    agent = hpamdp.train(Reach, **OWN)
+    with pytest.raises(
+        ValueError, match=r"^act: the observation has the shape \[0, 3\], but must have \[3\] or \[N, 3\]"
+    ):
+        agent.act(np.zeros((0, 3)))
+
+
+def test_an_unknown_keyword_of_act_is_refused_with_the_known_ones(platform_agent):
+    with pytest.raises(TypeError, match=r"^act: deterministic=True: no such argument; use greedy=True$"):
+        platform_agent.act(np.zeros(9), deterministic=True)
+    with pytest.raises(TypeError, match=r"^act: state=None: no such argument; it has observation, info, greedy$"):
+        platform_agent.act(np.zeros(9), state=None)
+
+
+def test_load_takes_the_problem_as_its_second_argument(platform_agent, tmp_path):
+    platform_agent.save(tmp_path / "a.pt")
+    assert hpamdp.load(tmp_path / "a.pt", "platform").specs == platform_agent.specs
+
+
 # Mistakes that a hostile user found: each is one line, or has the effect that one would expect.
 
 
@@ -546,6 +624,9 @@ def test_fewer_episodes_of_a_seed_are_the_first_of_more(platform_agent):
         ({"folder": ""}, "folder='': must be a path"),
         ({"folder": 3}, "folder=3: must be a path"),
         ({"folder": "a\0b"}, "must be a path"),
+        ({"folder": "p/\ud800"}, r"folder='p/\\ud800': must be a path; no file can have this name"),
+        ({"low.hidden_dims": np.zeros((2, 2))}, "must be a number, a text, or a list or mapping of these"),
+        ({"env": Reach, "env.kwargs": {"a": np.zeros(2)}}, "must be a number, a text, or a list or mapping of these"),
         ({"callbacks": None}, "must be a list of objects of subclasses"),
         ({"callbacks": [hpamdp.BestAgent]}, "not BestAgent, a class"),
         ({"hydra.run.dir": "other"}, "Hydra runs no job here"),
@@ -562,6 +643,20 @@ def test_a_mistake_in_an_argument_leaves_no_file_and_no_open_environment(tmp_pat
     with pytest.raises(hpamdp.ConfigError, match=message):
         hpamdp.train(given.pop("env"), **given)
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("given", [np.array([16, 8]), range(16, 0, -8), torch.tensor([16, 8]), (16, 8)])
+def test_a_list_may_be_an_array_or_a_range(given):
+    agent = hpamdp.train("platform", low={"name": "hppo", "hidden_dims": given}, **TINY)
+    assert agent._config.low.settings["hidden_dims"] == (16, 8)
+
+
+def test_a_folder_that_is_a_link_to_nowhere_says_so(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    for folder in ("link", "link/run"):
+        line = rf"link: a link to {re.escape(str(tmp_path))}/gone, which does not exist$"
+        with pytest.raises(hpamdp.ConfigError, match=line):
+            hpamdp.train("platform", low="hppo", folder=tmp_path / folder, **TINY)
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
@@ -881,6 +976,11 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make("circuit", ion_costs=[0.03]), "env.ion_costs.1: missing"),
         (lambda: hpamdp.load("hppo_platform", low="pdqn"), "low: has no effect on a trained agent"),
         (lambda: hpamdp.report(), "name the folder of a run"),
+        (
+            lambda: hpamdp.report(["runs", "more"]),
+            r"^report: folders in a list; give them one by one, such as report\(",
+        ),
+        (lambda: hpamdp.report(__file__), r"test_api\.py: a file; give the folder of a run, or one that contains runs"),
         (lambda: hpamdp.report(3), "folders=3: must be a path"),
         (lambda: hpamdp.report(".", metric=3), "metric=3: must be the name of a column"),
         (lambda: hpamdp.HPPO("platform"), r"specs='platform': must be PAMDPSpecs.from_env\(env\)"),

@@ -13,18 +13,19 @@ from types import SimpleNamespace
 
 import pytest
 import wandb
-from conftest import compose_config
+from conftest import compose_config, make_config
 from test_metrics import without_login  # noqa: F401  (a fixture)
 
 from hpamdp.config.errors import ConfigError
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
+from hpamdp.run.continuation import rest_of
 from hpamdp.run.folder import locked, moved_aside, write_error
 from hpamdp.run.loggers import TensorboardLogger, WandbLogger
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 from hpamdp.run.trainer import Trainer
-from hpamdp.run_files import CONFIG_NAME, ERROR_NAME, differing_settings, flat_settings
+from hpamdp.run_files import CONFIG_NAME, ERROR_NAME, SUMMARY_NAME, differing_settings, flat_settings
 
 TINY = ["num_envs=8", "steps_per_batch=4", "total_frames=128", "log_every=32", "eval.layouts=4", "eval.every=0"]
 TINY += ["high=ucb", "low=random"]
@@ -292,6 +293,22 @@ def test_a_logger_that_fails_is_switched_off_with_one_warning(where, tmp_path, m
     )
     assert capsys.readouterr().err.count(warning) == 1
     assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 6
+
+
+@pytest.mark.parametrize(
+    ("words", "difference"),
+    [
+        (["low=hppo", "total_frames=1000"], "with total_frames=900 for 1000 and "),
+        (["low=hppo", "total_frames=900", "low.lr=0.5"], "with low.lr=0.001 for 0.5;"),
+        (["low=pdqn", "total_frames=1000"], 'with low="hppo" for "pdqn" and '),
+    ],
+)
+def test_a_run_of_another_config_is_refused_by_the_setting_that_others_follow(words, difference, tmp_path):
+    (tmp_path / CONFIG_NAME).write_text(make_config(["low=hppo", "total_frames=900"]).to_yaml())
+    (tmp_path / SUMMARY_NAME).write_text("{}")
+    with pytest.raises(ConfigError) as raised:
+        rest_of(make_config(words), tmp_path)
+    assert difference in str(raised.value)
 
 
 def test_the_same_command_after_a_requeue_goes_on_with_its_run(tmp_path, command, capsys):

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from hpamdp import DLPA, HPPO, HSAC, IQL, PADDPG, PDQN, TD3BC
 from hpamdp.geometry import PlaneGeometry
 from hpamdp.policies.masks import sample_index
 from hpamdp.policies.shared import networks
@@ -13,6 +14,7 @@ from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     HybridCritics,
     InitialLayer,
+    OutputLinear,
     VectorProducts,
     mlp,
     polyak_update,
@@ -138,6 +140,20 @@ def test_a_target_network_moves_the_fraction_tau_of_the_way_and_has_no_gradient(
     for old, parameter, aim in zip(before, target.parameters(), source.parameters(), strict=True):
         torch.testing.assert_close(parameter, old + 0.1 * (aim - old))
         assert parameter.grad_fn is None and not aim.equal(parameter)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("learner", [HPPO, PDQN, PADDPG, HSAC, IQL, TD3BC, DLPA])
+def test_networks_for_actions_without_parameters_warn_of_nothing(learner):
+    assert learner(specs_of(0, 0)).policy is not None
+
+
+def test_a_layer_without_outputs_draws_no_random_numbers():
+    torch.manual_seed(0)
+    OutputLinear(3, 0)
+    drawn = torch.rand(3)
+    torch.manual_seed(0)
+    torch.testing.assert_close(drawn, torch.rand(3), rtol=0.0, atol=0.0)
 
 
 def test_a_network_leaves_its_input_as_it_is():

@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from hydra.core.config_store import ConfigStore
 
 import hpamdp
 
@@ -128,3 +129,116 @@ def test_an_id_that_only_this_program_registered_is_refused_in_one_line(processe
         assert "\n" not in str(raised.value)
     finally:
         del gymnasium.registry["OnlyHere-v0"]
+
+
+# Saved agents of passed classes.
+
+
+class Softmax(hpamdp.UCB):
+    """A selector that no yaml file names."""
+
+
+class SizedOptions(hpamdp.HPPO.Options):
+    """Settings of `Sized`, one of them without a default."""
+
+    width: int
+
+
+class Sized(hpamdp.HPPO):
+    """A learner with a setting that has no default."""
+
+    Options = SizedOptions
+
+
+def forget(monkeypatch: pytest.MonkeyPatch, **classes: type) -> None:
+    """Forget passed classes until the end of the test, as a new process has not seen them."""
+    for group, cls in classes.items():
+        monkeypatch.delitem(ConfigStore.instance().repo[group], f"{cls.__name__}.yaml")
+
+
+@pytest.fixture(scope="module")
+def of_classes(tmp_path_factory):
+    """Return the folder of a run of a learner and a selector that were passed as classes."""
+    folder = tmp_path_factory.mktemp("passed") / "run"
+    hpamdp.train("boatdock", low={"name": Sized, "width": 3}, high=Softmax, folder=folder, **TINY)
+    return folder
+
+
+def test_an_agent_of_passed_classes_is_loaded_with_the_classes_in_a_new_process(of_classes, monkeypatch):
+    forget(monkeypatch, low=Sized, high=Softmax)
+    agent = hpamdp.load(of_classes, low=Sized, high=Softmax)
+    assert "high=Softmax, low=Sized" in repr(agent)
+    assert agent._config.low.settings["width"] == 3
+
+
+def test_an_agent_of_passed_classes_is_loaded_without_them_in_the_same_process(of_classes):
+    assert hpamdp.load(of_classes)._config.low.settings["width"] == 3
+
+
+def test_an_agent_of_a_forgotten_class_asks_for_the_class(of_classes, monkeypatch):
+    forget(monkeypatch, high=Softmax)
+    line = r"high/Softmax, which is not there; is a --config-dir missing\? Pass a class from Python again, as high$"
+    with pytest.raises(hpamdp.ConfigError, match=line):
+        hpamdp.load(of_classes)
+
+
+@pytest.mark.parametrize(
+    ("group", "value", "line"),
+    [
+        ("high", hpamdp.Exp3, "high=Exp3: the agent was trained with high=Softmax; pass that class, or leave it out"),
+        ("low", "hppo", "low: has no effect on a trained agent; leave it out"),
+        ("low", {"name": Sized}, "low: a trained agent keeps its settings; pass the class Sized alone"),
+        ("exploration", int, "exploration=int: int is no Exploration (hpamdp.policies.exploration.base)"),
+    ],
+)
+def test_another_choice_than_the_class_of_a_saved_agent_is_refused(of_classes, group, value, line):
+    with pytest.raises(hpamdp.ConfigError) as raised:
+        hpamdp.load(of_classes, **{group: value})
+    assert line in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_a_run_of_a_class_with_a_required_setting_is_resumed(of_classes, tmp_path, monkeypatch):
+    forget(monkeypatch, low=Sized)
+    more = {**TINY, "total_frames": 2048}
+    agent = hpamdp.train(resume=of_classes, low=Sized, folder=tmp_path / "more", **more)
+    assert agent._config.low.settings["width"] == 3
+    assert agent.history[-1]["frames"] == 2048
+
+
+def test_a_finished_run_of_passed_classes_comes_back_with_resume_auto(of_classes, monkeypatch):
+    forget(monkeypatch, low=Sized, high=Softmax)
+    given = {"low": {"name": Sized, "width": 3}, "high": Softmax, "folder": of_classes, "resume": "auto"}
+    agent = hpamdp.train("boatdock", **given, **TINY)
+    assert agent.history[-1]["frames"] == 1024
+
+
+def test_resume_auto_loads_no_finished_agent_of_another_config(tmp_path):
+    """Somebody else may have put another checkpoint beside the config.yaml of the run."""
+    given = {**TINY, "low": "hppo", "high": None}
+    hpamdp.train("platform", folder=tmp_path / "run", **given)
+    hpamdp.train(own_class(), folder=tmp_path / "other", **{**OWN, "high": None})
+    for name in ("checkpoint.zip", "policy.pt"):
+        (tmp_path / "other" / name).replace(tmp_path / "run" / name)
+    line = 'has the results of another config, with env="gymnasium" for "platform"'
+    with pytest.raises(hpamdp.ConfigError, match=line) as raised:
+        hpamdp.train("platform", folder=tmp_path / "run", resume="auto", **given)
+    assert "\n" not in str(raised.value)
+
+
+def test_resume_auto_searches_no_folder_that_only_the_saved_run_names(tmp_path):
+    own = tmp_path / "conf"
+    (own / "high").mkdir(parents=True)
+    given = {**TINY, "low": "random", "high": Softmax, "folder": tmp_path / "run"}
+    hpamdp.train("boatdock", config_dirs=[own], **given)
+    (own / "high" / "Softmax.yaml").write_text("_target_: nowhere.Another\n")
+    assert hpamdp.train("boatdock", resume="auto", **given).history[-1]["frames"] == 1024
+
+
+def test_a_run_that_was_trained_on_an_object_asks_for_it_when_it_is_resumed(tmp_path):
+    env = own_class()
+    hpamdp.train(env, folder=tmp_path / "0", **OWN)
+    line = r"^resume: .*: the agent was trained on an object from Python; pass it again as env$"
+    with pytest.raises(hpamdp.ConfigError, match=line):
+        hpamdp.train(resume=tmp_path / "0", total_frames=2048, progress=False)
+    agent = hpamdp.train(env, resume=tmp_path / "0", total_frames=2048, progress=False)
+    assert agent.history[-1]["frames"] == 2048

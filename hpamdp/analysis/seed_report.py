@@ -163,7 +163,11 @@ def report_on(folders: Iterable[Path | str], metric: str = DEFAULT_METRIC) -> Re
     paths = [Path(folder) for folder in folders]
     for path in paths:
         if not os.path.isdir(path):
-            raise ConfigError(f"{one_line(path)}: there is no such folder")
+            is_file = os.path.exists(path)
+            why = (
+                "a file; give the folder of a run, or one that contains runs" if is_file else "there is no such folder"
+            )
+            raise ConfigError(f"{one_line(path)}: {why}")
     runs = read_runs(paths, metric)
     if not runs:
         raise ConfigError(f"{', '.join(one_line(path) for path in paths)}: no run in there")

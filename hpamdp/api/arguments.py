@@ -69,6 +69,10 @@ def path_argument(name: str, value: Any) -> Path:
     """
     if not isinstance(value, str | Path) or not str(value) or "\0" in str(value):
         raise ConfigError(f"{name}={as_code(value)}: must be a path")
+    try:
+        os.fsencode(value)
+    except UnicodeEncodeError as error:
+        raise ConfigError(f"{name}={as_code(value)}: must be a path; no file can have this name") from error
     path = Path(os.path.expanduser(value))  # before `Path` drops "./", after which "./~" would mean the home directory
     return path.absolute() if str(path).startswith("~") else path  # so that nobody expands it later
 

@@ -46,6 +46,8 @@ def report(*folders: str | Path, metric: str = DEFAULT_METRIC, to: str | Path | 
     if not isinstance(metric, str):
         raise ConfigError(f"metric={as_code(metric)}: must be the name of a column of metrics.csv")
     target = None if to is None else path_argument("to", to)
+    if any(isinstance(folder, list | tuple) for folder in folders):
+        raise ConfigError("report: folders in a list; give them one by one, such as report(*folders)")
     report = report_on([path_argument("folders", folder) for folder in folders], metric)
     if target is not None:
         report.write(target)

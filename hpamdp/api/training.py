@@ -30,7 +30,8 @@ from hpamdp.complaints import no_such
 from hpamdp.config.components import TARGET
 from hpamdp.config.compose import setting_of
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.outside_jobs import check_no_sweep, composed, searching
+from hpamdp.config.outside_jobs import check_no_sweep, choosing_class, composed, searching, word
+from hpamdp.config.saved import choices_of
 from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.env.errors import closed_on_error
 from hpamdp.env.registration import NAMING_SETTINGS
@@ -40,7 +41,7 @@ from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import Callback
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.compatibility import check_effects
-from hpamdp.run.continuation import Rest, rest_of
+from hpamdp.run.continuation import Rest, refuse_another, rest_of
 from hpamdp.run.folder import locked
 from hpamdp.run.players import load_agent
 from hpamdp.run.resume import resolve, saved_words
@@ -48,6 +49,8 @@ from hpamdp.run.stopping import exits_explained
 from hpamdp.run.train import begin, check_callbacks, problems_explained
 from hpamdp.run_files import METRICS_NAME
 
+# Groups of a trained agent, of which only classes from Python are given again.
+_OF_AGENT = ("high", "low", "encoder", "exploration")
 # Values of the run that count for a trained agent, too.
 _OF_LOADING = ("device", "threads")
 # Values of the run that are of use only if the run writes files.
@@ -124,7 +127,7 @@ def train(
             if goes_on and output_dir is not None:
                 score, source = _rest_of(config, output_dir)
                 if score is not None:
-                    return load(output_dir, env=env, config_dirs=config_dirs, trust=True)
+                    return _finished_agent(config, output_dir, arguments, config_dirs)
             trainer = begin(config, source, output_dir, words, may_overwrite=goes_on, callbacks=callbacks)
         stack.callback(trainer.parts.close)
         trainer.shows_progress = progress
@@ -181,6 +184,8 @@ def _words_of(settings: Mapping[str, Any], problem: Arguments, folders: Sequence
     words = [*folders, *problem.with_words(own)]
     resumed = settings.get("resume")
     saved = [] if resumed is None else saved_words(str(resumed), "resume", words)
+    if resumed is not None and not problem.words and not problem.objects:
+        _check_problem(checkpoint.find(str(resumed), "resume"), words, "resume")
     if of_problem:
         with composed([*saved, *words]) as cfg:
             own += settings_words(with_env_prefix(of_problem, cfg.env))
@@ -239,12 +244,20 @@ def _own_folder(folder: Path) -> Iterator[None]:
             try:
                 stack.enter_context(locked(folder))
             except OSError as error:
-                raise ConfigError(f"folder={folder}: {reason_of(error)}") from error
+                raise ConfigError(f"folder={folder}: {_why_not_made(folder, error)}") from error
             yield
     finally:
         with suppress(OSError):  # at the first folder that is not empty
             for each in missing:
                 each.rmdir()
+
+
+def _why_not_made(folder: Path, error: OSError) -> str:
+    """Return why a folder cannot be made. The system calls a link to nowhere an existing file."""
+    for each in (folder, *folder.parents):
+        if os.path.islink(each) and not os.path.exists(each):
+            return f"{each}: a link to {os.readlink(each)}, which does not exist"
+    return reason_of(error)
 
 
 def _rest_of(config: Config, folder: Path) -> Rest:
@@ -277,8 +290,8 @@ def _torch_restored() -> Iterator[None]:
 
 def load(
     source: str | Path,
-    *,
     env: Any = None,
+    *,
     config_dirs: Sequence[str | Path] = (),
     trust: bool = False,
     **settings: Any,
@@ -294,7 +307,8 @@ def load(
         trust: whether the file may name code to run, such as the entry point of an environment, and the folders of
             yaml files that the training had.
         settings: `device`, `threads`, and settings of the problem and of evaluations, such as `max_steps=50` and
-            `**{"eval.seed": 7}`.
+            `**{"eval.seed": 7}`. An agent that was trained with classes from Python needs them again in a new process:
+            `low=MyLearner`, and likewise `high`, `encoder` and `exploration`.
 
     Raises:
         ConfigError: there is no such agent, it does not fit the problem, or it needs your trust.
@@ -312,7 +326,8 @@ def load(
     unknown = [name for name in of_problem if name not in known]
     if unknown:
         raise ConfigError(f"{unknown[0]}: {no_such('setting of the problem', unknown[0], known)}")
-    others = all_but(settings, of_problem)
+    _check_classes(file, settings)
+    others = all_but(settings, [*of_problem, *_OF_AGENT])
     for name in others:
         if name not in _OF_LOADING and name.partition(".")[0] not in ("env", "eval"):
             raise ConfigError(f"{name}: has no effect on a trained agent; leave it out")
@@ -320,12 +335,50 @@ def load(
     check_effects("agent", own)
     words = [*searching(config_dirs), *arguments.with_words(own), *(["trust=true"] if trust else [])]
     if env is None:
-        _check_problem(file, words)
+        _check_problem(file, words, "load")
+    return _loaded(file, words, arguments.objects)
+
+
+def _loaded(file: Path, words: Sequence[str], objects: Mapping[str, Any]) -> Agent:
+    """Return the agent of a file, and the metrics beside it."""
     with _torch_restored(), problems_explained():
-        loaded = load_agent(str(file), words, arguments.objects)
+        loaded = load_agent(str(file), words, objects)
     with closed_on_error(loaded.env):
         rows = read_rows(file.parent / METRICS_NAME)
         return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, rows)
+
+
+def _finished_agent(config: Config, folder: Path, arguments: Arguments, config_dirs: Sequence[str | Path]) -> Agent:
+    """Return the agent of a finished run. It needs no trust: it is built as this config would build it.
+
+    Raises:
+        ConfigError: the saved agent has another config than the run.
+    """
+    file = checkpoint.find(folder, "load")
+    refuse_another(config, checkpoint.progress_of(file)["config"], str(file))
+    folders = searching(config_dirs) or [word("hydra.searchpath", [])]  # instead of those that the file names
+    return _loaded(file, [*folders, *arguments.with_words(), "trust=true"], arguments.objects)
+
+
+def _check_classes(file: Path, settings: Mapping[str, Any]) -> None:
+    """Make the passed classes of a saved agent known, as in a process that has not trained it.
+
+    Raises:
+        ConfigError: the agent has another class, or a setting of the agent is no class.
+    """
+    for group in (each for each in _OF_AGENT if each in settings):
+        cls = settings[group]
+        if isinstance(cls, Mapping) and isinstance(cls.get("name"), type):
+            raise ConfigError(
+                f"{group}: a trained agent keeps its settings; pass the class {cls['name'].__name__} alone"
+            )
+        if not isinstance(cls, type):
+            raise ConfigError(f"{group}: has no effect on a trained agent; leave it out")
+        saved = choices_of(checkpoint.progress_of(file)["config"])[group]
+        if choosing_class(group, cls) != word(group, saved):
+            raise ConfigError(
+                f"{group}={cls.__name__}: the agent was trained with {group}={saved}; pass that class, or leave it out"
+            )
 
 
 def _names_of_problem(file: Path, arguments: Arguments, config_dirs: Sequence[str | Path]) -> list[str]:
@@ -338,8 +391,10 @@ def _names_of_problem(file: Path, arguments: Arguments, config_dirs: Sequence[st
         return [name for name in cfg.env if name != TARGET]
 
 
-def _check_problem(file: Path, words: Sequence[str]) -> None:
+def _check_problem(file: Path, words: Sequence[str], where: str) -> None:
     """Refuse an agent whose problem was an object, unless words name the problem.
+
+    `where` is the argument that gives the file.
 
     Raises:
         ConfigError: the problem is unknown.
@@ -348,4 +403,4 @@ def _check_problem(file: Path, words: Sequence[str]) -> None:
     is_named = any(each.startswith(f"env.{name}=") for each in words for name in NAMING_SETTINGS)
     is_generic = isinstance(saved, Mapping) and {*NAMING_SETTINGS} <= saved.keys()
     if is_generic and not is_named and all(saved[name] is None for name in NAMING_SETTINGS):
-        raise ConfigError(f"load: {file}: the agent was trained on an object from Python; pass it again as env")
+        raise ConfigError(f"{where}: {file}: the agent was trained on an object from Python; pass it again as env")

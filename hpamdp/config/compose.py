@@ -28,6 +28,7 @@ RECIPE = "recipe"
 _EXPERIMENT = "experiment"
 _LONGEST_NAME = 200  # letters of a yaml file's name
 _SHOWN = 200  # letters of a command line in an error
+_MISSING = "???"  # what OmegaConf takes for a value that is missing
 _NAMED_BY_YAML = "a yaml file names the class; give the name of the file"
 # Entries that the learner of a single option cannot have, and the advice in the error.
 _NOT_PER_OPTION = {
@@ -83,14 +84,17 @@ def read_run(cfg: DictConfig) -> tuple[RunConfig, PlaceOf | None, tuple[str, ...
     Raises:
         ConfigError: a value is wrong, or nothing is chosen for a group.
     """
-    given, names, place_of, folders = _as_plain_values(cfg, chosen_names(cfg))
+    given, names, place_of, folders = _as_plain_values(cfg, chosen_names(cfg), may_lack=True)
     return check_run(given, names, place_of), place_of, folders
 
 
 def _as_plain_values(
-    cfg: DictConfig, names: Mapping[str, str]
+    cfg: DictConfig, names: Mapping[str, str], *, may_lack: bool = False
 ) -> tuple[dict[str, Any], Mapping[str, str], PlaceOf | None, tuple[str, ...]]:
-    """Return the composed config as plain values, the names, where a setting was set, and the folders of yaml files."""
+    """Return the composed config as plain values, the names, where a setting was set, and the folders of yaml files.
+
+    `may_lack`: see `plain`.
+    """
     for group in GROUPS:
         if cfg.get(group) is None or TARGET not in cfg[group]:
             if names.get(group) is not None:
@@ -106,7 +110,7 @@ def _as_plain_values(
         _check_found(node, names)
         folders = searched_folders(node)
         place_of = partial(_place_of, _words_of(node), names, folders)
-    return plain(own), names, place_of, folders
+    return plain(own, may_lack=may_lack), names, place_of, folders
 
 
 def _place_of(words: Sequence[str], names: Mapping[str, str], folders: Sequence[str], setting: str) -> str | None:
@@ -280,32 +284,54 @@ def names_of(group: str) -> tuple[str, ...]:
     return ()
 
 
-def plain_groups(cfg: DictConfig, run: Mapping[str, Any], groups: Iterable[str]) -> dict[str, dict[str, Any]]:
+def plain_groups(
+    cfg: DictConfig, run: Mapping[str, Any], groups: Iterable[str], *, may_lack: bool = False
+) -> dict[str, dict[str, Any]]:
     """Return these groups of a composed config as plain values.
 
     Settings that refer to a number of the run, such as `${total_frames}`, take it from `run`, but never text.
+    `may_lack`: see `plain`.
     """
     cfg = cfg.copy()
     for name in RunConfig.model_fields:
         if name in cfg and isinstance(run.get(name), int | float):
             cfg[name] = run[name]
-    return {group: plain(cfg[group], group) for group in groups}
+    return {group: plain(cfg[group], group, may_lack=may_lack) for group in groups}
 
 
-def plain(node: Any, where: str = "the config") -> dict[str, Any]:
-    """Resolve a part of the config into plain Python values."""
+def plain(node: Any, where: str = "the config", *, may_lack: bool = False) -> dict[str, Any]:
+    """Resolve a part of the config into plain Python values.
+
+    Args:
+        node: the part.
+        where: its name in errors.
+        may_lack: whether a value may be missing, since a saved run has it. Then it is left out.
+
+    Raises:
+        ConfigError: the part is no mapping, a value is missing, or a value cannot be resolved.
+    """
     if not isinstance(node, Mapping | DictConfig):
         raise ConfigError(f"{where}={as_json(node)}: must be a mapping")
     if not isinstance(node, DictConfig):
         return dict(node)
     try:
-        container = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+        container = OmegaConf.to_container(node, resolve=True, throw_on_missing=not may_lack)
     except OmegaConfBaseException as error:
         raise ConfigError(f"{error.full_key or where}: {first_line(error)}") from error
     except RecursionError as error:
         raise ConfigError(f"{where}: a value refers to itself, or nests too deep") from error
     assert isinstance(container, dict)
-    return {str(name): value for name, value in container.items()}
+    values = {str(name): value for name, value in container.items()}
+    return _without_missing(values) if may_lack else values
+
+
+def _without_missing(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that are not missing, also in the mappings among them."""
+    return {
+        name: _without_missing(value) if isinstance(value, Mapping) else value
+        for name, value in values.items()
+        if value != _MISSING
+    }
 
 
 def is_name(name: object) -> TypeGuard[str]:

@@ -32,7 +32,10 @@ class MissingChoiceError(ConfigError):
     """
 
     def __init__(self, choice: str, known: Iterable[str]) -> None:
-        super().__init__(f"the saved run chose {choice}, which is not there; is a --config-dir missing?")
+        super().__init__(
+            f"the saved run chose {choice}, which is not there; is a --config-dir missing? Pass a class from Python "
+            f"again, as {choice.partition('/')[0]}"
+        )
         self.known = tuple(known)
 
 

@@ -39,6 +39,8 @@ from hpamdp.shell import for_hydra
 
 # Hydra keeps one state for the whole process.
 _HYDRA = threading.RLock()
+# Arguments of an environment of the user's own, which may need an array rather than a list.
+_OF_CONSTRUCTOR = "env.kwargs"
 # Recommended budget of a learner's class that has no yaml file.
 _BUDGET = {"num_envs": 16, "steps_per_batch": 128, "total_frames": 200_000, "eval_every": 10_000}
 
@@ -116,13 +118,15 @@ def word(name: str, value: Any) -> str:
 def _written(name: str, value: Any) -> str:
     if hasattr(value, "item") and getattr(value, "ndim", None) == 0:  # a number of NumPy or torch
         value = value.item()
+    elif hasattr(value, "tolist") and getattr(value, "ndim", None) == 1 and not name.startswith(_OF_CONSTRUCTOR):
+        value = value.tolist()
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, Integral | Real):
         return repr(value)
     if isinstance(value, str | Path):
         return for_hydra(str(value))
-    if isinstance(value, list | tuple):
+    if isinstance(value, list | tuple | range):
         return f"[{','.join(_written(name, item) for item in value)}]"
     if isinstance(value, Mapping):
         for entry in value:

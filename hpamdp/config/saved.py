@@ -62,7 +62,8 @@ def read_saved(
     saved = upgraded(saved)
     groups = [group for group in GROUPS if group not in given]
     choices = {group: saved[_CHOICES][group] for group in groups}
-    today = plain_groups(compose([choosing(group, name) for group, name in choices.items()]), saved, groups)
+    composed = compose([choosing(group, name) for group, name in choices.items()])
+    today = plain_groups(composed, saved, groups, may_lack=True)
     values = {name: value for name, value in saved.items() if name not in (*GROUPS, _CHOICES)}
     for group in groups:
         renamed = with_new_names(group, saved[group], today[group])

@@ -15,6 +15,8 @@ from hpamdp.config.schema import Config
 from hpamdp.run import checkpoint
 from hpamdp.run_files import SUMMARY_NAME, differing_settings, flat_settings, saved_config, saved_summary
 
+_CHOSEN = "choices."  # what precedes the groups in a saved config
+
 
 class Rest(NamedTuple):
     """The rest of a run: nothing if it has a score, otherwise everything after its checkpoint, if it has one."""
@@ -40,17 +42,31 @@ def rest_of(wanted: Config, folder: Path, name: str = "its folder") -> Rest:
     saved = saved_config(folder)
     if not saved and file.exists():
         saved = checkpoint.progress_of(file)["config"]
-    difference = _difference(wanted, saved)
-    if difference and wanted.run.overwrite:
+    if wanted.run.overwrite and _difference(wanted, saved):
         return Rest()
+    refuse_another(wanted, saved, name)
+    summary = saved_summary(folder)
+    score = summary.get("score") if summary.get("finished") else None
+    return Rest(score if isinstance(score, int | float) else None, file if file.exists() else None)
+
+
+def refuse_another(wanted: Config, saved: Mapping[str, Any], name: str) -> None:
+    """Refuse a saved run with another config, except for bookkeeping.
+
+    Args:
+        wanted: the config of the run.
+        saved: the config of the saved run.
+        name: name of its folder in the error.
+
+    Raises:
+        ConfigError: the configs differ.
+    """
+    difference = _difference(wanted, saved)
     if difference:
         raise ConfigError(
             f"{name} has the results of another config, with {difference}; they stay as they are: set another "
             "folder, or move this one away"
         )
-    summary = saved_summary(folder)
-    score = summary.get("score") if summary.get("finished") else None
-    return Rest(score if isinstance(score, int | float) else None, file if file.exists() else None)
 
 
 def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
@@ -58,9 +74,14 @@ def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
     # Convert through yaml, like the saved config.
     here = flat_settings(yaml.safe_load(wanted.to_yaml()))
     there = flat_settings(upgraded(saved) if saved else {})
-    names = differing_settings(here, there)
+    names = sorted(differing_settings(here, there), key=_depth)
     if not names:
         return ""
     more = f" and {len(names) - 1} more" if names[1:] else ""
     values = [json.dumps(each[names[0]], default=str) if names[0] in each else "no value" for each in (there, here)]
-    return f"{names[0]}={values[0]} for {values[1]}{more}"
+    return f"{names[0].removeprefix(_CHOSEN)}={values[0]} for {values[1]}{more}"
+
+
+def _depth(name: str) -> int:
+    """Return a number that puts settings before those that may follow from them: choices, values of the run, others."""
+    return 0 if name.startswith(_CHOSEN) else 1 + ("." in name)

@@ -188,7 +188,7 @@ def _not_there(error: MissingChoiceError, file: Path) -> ConfigError:
     if not folders:
         return error
     named = ", ".join(map(as_json, folders))
-    return ConfigError(f"{error} The run had {named}; give the folder again, or add trust=true if you trust {file}")
+    return ConfigError(f"{error}. The run had {named}; give the folder again, or add trust=true if you trust {file}")
 
 
 def check_saved_options(config: Config, env: PAMDPEnv) -> None:

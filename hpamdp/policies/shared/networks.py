@@ -40,6 +40,11 @@ def in_float32(layer: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
 class OutputLinear(nn.Linear):
     """The last layer of a network, see `in_float32`."""
 
+    def reset_parameters(self) -> None:
+        """Draw the initial weights, if there are any. Actions without parameters have none."""
+        if self.out_features:
+            super().reset_parameters()
+
     def forward(self, x: Tensor) -> Tensor:
         """Apply the layer in float32."""
         return in_float32(super().forward, x)
