@@ -14,6 +14,7 @@ from hpamdp.files import read_regular
 
 # Files of a run that others read.
 CHECKPOINT_NAME = "checkpoint.zip"
+MANIFEST_NAME = "manifest.json"  # inside the checkpoint
 POLICY_NAME = "policy.pt"
 BEST_NAME = "best.pt"
 SUMMARY_NAME = "summary.json"

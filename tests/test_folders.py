@@ -134,6 +134,37 @@ def test_files_that_no_run_has_written_are_never_replaced(tmp_path):
     assert contents(tmp_path) == {CONFIG_NAME: b"title: my site\n"}
 
 
+@pytest.mark.parametrize(
+    "own",
+    [
+        {"best.pt": "my networks", "trajectories.png": "", "learning_curves.png": ""},
+        {"checkpoint.zip": "my backup"},
+        {"policy.pt": "my networks", CONFIG_NAME: "title: my site\n"},
+        {"summary.json": '{"of": "my thesis"}'},
+    ],
+)
+def test_a_file_of_a_users_own_with_the_name_of_a_result_is_never_deleted(own, tmp_path):
+    for name, text in own.items():
+        (tmp_path / name).write_text(text)
+    before = contents(tmp_path)
+    (first, *_) = (name for name in own if not name.endswith(".png"))
+    for word in ("overwrite=false", "overwrite=true"):
+        with pytest.raises(ConfigError, match=rf"holds {first}.*, which no run has written and a run would replace"):
+            start(tmp_path, word)
+        assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("kept", [CONFIG_NAME, "checkpoint.zip", "summary.json"])
+def test_a_run_that_has_lost_most_of_its_files_may_be_overwritten(kept, tmp_path):
+    start(tmp_path)
+    for path in tmp_path.iterdir():
+        if path.name not in (kept, "policy.pt"):
+            path.unlink()
+    with pytest.raises(ConfigError, match="holds the results of a run"):
+        start(tmp_path)
+    assert start(tmp_path, "overwrite=true", "seed=7") == 0
+
+
 def test_an_error_file_that_no_sweep_has_written_is_never_removed(tmp_path):
     (tmp_path / ERROR_NAME).write_text("my own errors\n")
     for word in ("overwrite=false", "overwrite=true"):

@@ -59,10 +59,9 @@ from hpamdp.run.state_checks import (
 )
 from hpamdp.run.tensor_archive import MemberFile, SavedTensor, TensorArchive, stored_members
 from hpamdp.run_files import CHECKPOINT_NAME as FILE_NAME
-from hpamdp.run_files import POLICY_NAME
+from hpamdp.run_files import MANIFEST_NAME, POLICY_NAME
 
 _FORMAT = 2
-_MANIFEST = "manifest.json"
 _MAX_JSON = 2**24
 _BLOCK = 2**20
 _CUDA_STATE_BYTES = 16
@@ -201,7 +200,7 @@ def save(
             checksums[name] = hashlib.sha256(data).hexdigest()
             archive.writestr(f"{name}.pt", data)
         manifest = {"format": _FORMAT, "members": checksums, "progress": dict(progress)}
-        archive.writestr(_MANIFEST, json.dumps(manifest))
+        archive.writestr(MANIFEST_NAME, json.dumps(manifest))
 
 
 def save_policy(path: Path, agent: HierarchicalAgent, env: PAMDPEnv, progress: Mapping[str, Any]) -> None:
@@ -410,8 +409,8 @@ class _Opened:
     def _open(self, file: IO[bytes], num_bytes: int) -> None:
         archive = stored_members(file, num_bytes)
         self._file, self._infos = file, {info.filename: info for info in archive.infolist()}
-        if _MANIFEST in self._infos:
-            text = archive.read(_MANIFEST)
+        if MANIFEST_NAME in self._infos:
+            text = archive.read(MANIFEST_NAME)
             manifest = checked(_Manifest, _json(text))
             _check_format(manifest.format)
             self._members = {
