@@ -35,8 +35,8 @@ from torchrl.data import ReplayBuffer
 from hpamdp.config.compose import package_dir
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.files import replacing
-from hpamdp.messages import first_line, warn
+from hpamdp.files import regular_size, replacing
+from hpamdp.messages import first_line, reason_of, warn
 from hpamdp.policies.agent import FOR_TRAINING, HierarchicalAgent
 from hpamdp.policies.base import Learner, Level, added_later
 from hpamdp.run.state_checks import (
@@ -97,21 +97,27 @@ def find(path: str | Path, where: str) -> Path:
         where: the setting that gives the path, for the error.
 
     Raises:
-        ConfigError: there is no checkpoint.
+        ConfigError: there is no checkpoint, or it cannot be opened.
     """
     path = Path(os.path.expanduser(path))  # before `Path` drops "./", after which "./~" would mean the home directory
     if not os.path.exists(path) and str(path) in agent_names():
         path = agents_dir() / path
     is_folder = os.path.isdir(path)  # `Path.is_dir` would fail for some texts
     file = path / FILE_NAME if is_folder else path
-    if where != "resume" and is_folder and not file.is_file() and (path / POLICY_NAME).is_file():
+    if where != "resume" and is_folder and not os.path.isfile(file) and os.path.isfile(path / POLICY_NAME):
         file = path / POLICY_NAME
-    if not os.path.isfile(file):
+    try:
+        regular_size(file)
+        with file.open("rb") as opened:
+            is_archive = zipfile.is_zipfile(opened)
+    except (FileNotFoundError, NotADirectoryError):
         has_policy = os.path.isfile(path / POLICY_NAME)
         why = _NOT_RESUMED if has_policy else "no checkpoint there"
         names = f", or one of {', '.join(agent_names())}" if os.sep not in str(path) and where != "resume" else ""
-        raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}{names}")
-    if not zipfile.is_zipfile(file):
+        raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}{names}") from None
+    except OSError as error:
+        raise ConfigError(f"{where}={file}: {reason_of(error)}") from error
+    if not is_archive:
         raise ConfigError(f"{where}={file}: not a checkpoint of this program")
     return file
 
