@@ -41,22 +41,32 @@ def replacing(path: Path) -> Iterator[Path]:
     after an hour.
 
     Raises:
-        OSError: the disk is full, or the folder is gone or cannot be written to.
+        OSError: the disk is full, `path` is a folder, a pipe, a socket or a device, or the folder around it is gone or
+            cannot be written to. The error names `path`, also where it is about the file beside it.
     """
+    with suppress(FileNotFoundError):
+        kind = stat.S_IFMT(path.lstat().st_mode)
+        if kind not in (stat.S_IFREG, stat.S_IFLNK):
+            raise _not_regular(path, kind)
     start = f".{path.name[:40]}."
     for leftover in path.parent.glob(f"{glob.escape(start)}*.partial{glob.escape(path.suffix)}"):
         with suppress(OSError):
             if _is_abandoned(leftover, start):
                 leftover.unlink()
     partial = path.with_name(f"{start}{_host()}-{os.getpid()}-{secrets.token_hex(8)}.partial{path.suffix}")
-    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
     try:
-        yield partial
-        with partial.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
+        try:
+            yield partial
+            with partial.open("rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        if error.filename is None or os.fsdecode(error.filename) != str(partial):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -88,6 +98,10 @@ def remove_link(path: Path) -> None:
             path.unlink()
 
 
+def _not_regular(path: Path, kind: int) -> OSError:
+    return OSError(errno.EINVAL, f"{_KINDS.get(kind, 'is no file')}, but must be a regular file", str(path))
+
+
 def regular_size(path: Path, *, follow_links: bool = True) -> int:
     """Return the size of a regular file in bytes.
 
@@ -100,7 +114,7 @@ def regular_size(path: Path, *, follow_links: bool = True) -> int:
         raise OSError(errno.EINVAL, "is no file name", str(path)) from error
     kind = stat.S_IFMT(found.st_mode)
     if kind != stat.S_IFREG:
-        raise OSError(errno.EINVAL, f"{_KINDS.get(kind, 'is no file')}, but must be a regular file", str(path))
+        raise _not_regular(path, kind)
     return found.st_size
 
 

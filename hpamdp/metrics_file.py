@@ -89,9 +89,10 @@ class Metrics(Protocol):
 def rows_up_to(frames: float, path: Path) -> list[dict[str, float]]:
     """Return the rows of a `metrics.csv` for a run that resumes from this many frames.
 
-    Later rows are left out, and so is the last row of a stopped run.
+    Later rows are left out, and so are the last row of a stopped run and rows without a number of frames.
     """
-    return list(takewhile(lambda row: STOPPED not in row and row.get(FRAMES, 0.0) <= frames, read_rows(path)))
+    rows = [row for row in read_rows(path) if FRAMES in row]
+    return list(takewhile(lambda row: STOPPED not in row and row[FRAMES] <= frames, rows))
 
 
 class MetricsInMemory:

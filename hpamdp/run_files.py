@@ -14,6 +14,7 @@ from hpamdp.files import read_regular
 
 # Files of a run that others read.
 CHECKPOINT_NAME = "checkpoint.zip"
+MANIFEST_NAME = "manifest.json"  # inside the checkpoint
 POLICY_NAME = "policy.pt"
 BEST_NAME = "best.pt"
 SUMMARY_NAME = "summary.json"
@@ -47,9 +48,11 @@ _BOOKKEEPING = (
 
 
 def saved_config(folder: Path) -> dict[str, Any]:
-    """Return the config of the run in a folder; empty if it is missing or cannot be read."""
+    """Return the config of the run in a folder; empty if it is missing, cut off or cannot be read."""
     try:
         text = read_regular(folder / CONFIG_NAME, MAX_TEXT_BYTES)
+        if not text.endswith(b"\n"):  # cut off in the middle, which may still be yaml
+            return {}
         check_size(folder / CONFIG_NAME)
         config = yaml.safe_load(text)
     except Exception:  # PyYAML raises errors of any kind, such as a KeyError for `!!bool x`

@@ -6,6 +6,7 @@ import os
 import pickle
 import random
 import zipfile
+from pathlib import Path
 
 import pytest
 import torch
@@ -295,3 +296,27 @@ def test_a_full_disk_leaves_the_old_checkpoint(parts, tmp_path, monkeypatch):
         checkpoint.save(file, parts.agent, states, {**PROGRESS, "frames": 2})
     assert file.read_bytes() == before
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["checkpoint.zip"]
+
+
+def test_a_checkpoint_that_may_not_be_opened_or_is_no_file_is_named_with_the_reason(tmp_path, monkeypatch):
+    (tmp_path / "run/checkpoint.zip").mkdir(parents=True)
+    with pytest.raises(ConfigError) as error:
+        checkpoint.find(tmp_path / "run", "resume")
+    found = f"resume={tmp_path / 'run/checkpoint.zip'}"
+    assert str(error.value) == f"{found}: is a folder, but must be a regular file"
+    (tmp_path / "own.pt").write_bytes(b"")
+
+    def closed(self, *_):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "open", closed)
+    with pytest.raises(ConfigError, match=r"^load=.*own\.pt: Permission denied$"):
+        checkpoint.find(tmp_path / "own.pt", "load")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read")
+def test_a_folder_that_may_not_be_searched_is_named_with_the_reason(tmp_path):
+    (tmp_path / "run").mkdir(mode=0o000)
+    for where in ("resume", "load"):
+        with pytest.raises(ConfigError, match=rf"^{where}=.*/run/checkpoint\.zip: Permission denied$"):
+            checkpoint.find(tmp_path / "run", where)

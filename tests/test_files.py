@@ -2,12 +2,15 @@
 
 import os
 import shutil
+import socket
+import stat
 import subprocess
 import sys
 
 import pytest
 from conftest import compose_config
 
+import hpamdp
 from hpamdp import files
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import remove_link, replacing
@@ -143,8 +146,50 @@ def test_only_links_are_removed(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["own"]
 
 
-def test_metrics_that_are_no_file_are_not_read(tmp_path):
+def test_metrics_that_are_no_file_are_neither_read_nor_replaced(tmp_path):
     os.mkfifo(tmp_path / "metrics.csv")
     metrics = MetricsFile(tmp_path / "metrics.csv", tmp_path / "metrics.csv")
-    metrics.append({"frames": 1.0})
-    assert metrics.rows() == [{"frames": 1.0}]
+    assert metrics.rows() == []
+    with pytest.raises(OSError, match="is a named pipe"):
+        metrics.append({"frames": 1.0})
+    assert stat.S_ISFIFO((tmp_path / "metrics.csv").stat().st_mode)
+
+
+def test_a_named_pipe_and_a_socket_are_never_replaced_by_a_file(tmp_path):
+    pipe, listening = tmp_path / "pipe.pt", tmp_path / "socket.pt"
+    os.mkfifo(pipe)
+    agent = hpamdp.load("hppo_platform")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(listening))
+        for path, kind in ((pipe, "named pipe"), (listening, "socket")):
+            with pytest.raises(OSError, match=rf"is a {kind}, but must be a regular file: '{path}'$"):
+                agent.save(path)
+    assert stat.S_ISFIFO(pipe.stat().st_mode) and stat.S_ISSOCK(listening.stat().st_mode)
+    assert {*tmp_path.iterdir()} == {pipe, listening}
+
+
+@pytest.mark.parametrize(
+    ("path", "reason"),
+    [
+        ("nowhere/x.pt", "No such file or directory"),
+        ("file/x.pt", "Not a directory"),
+        (".", "is a folder, but must be a regular file"),
+        ("x" * 300, "File name too long"),
+        pytest.param(
+            "closed/x.pt", "Permission denied", marks=pytest.mark.skipif(os.geteuid() == 0, reason="root may write")
+        ),
+    ],
+)
+def test_a_path_that_cannot_be_written_is_named_with_the_reason(path, reason, tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "closed").mkdir(mode=0o555)
+    with pytest.raises(OSError) as error, replacing(tmp_path / path):
+        pass
+    assert (error.value.filename, error.value.strerror) == (str(tmp_path / path), reason)
+
+
+def test_an_error_inside_the_block_about_the_new_file_names_the_path(tmp_path):
+    with pytest.raises(FileNotFoundError) as error, replacing(tmp_path / "x.pt") as partial:
+        partial.unlink()
+        partial.read_bytes()
+    assert error.value.filename == str(tmp_path / "x.pt")

@@ -16,6 +16,7 @@ import wandb
 from conftest import compose_config, make_config
 from test_metrics import without_login  # noqa: F401  (a fixture)
 
+import hpamdp
 from hpamdp.config.errors import ConfigError
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
@@ -134,6 +135,37 @@ def test_files_that_no_run_has_written_are_never_replaced(tmp_path):
     assert contents(tmp_path) == {CONFIG_NAME: b"title: my site\n"}
 
 
+@pytest.mark.parametrize(
+    "own",
+    [
+        {"best.pt": "my networks", "trajectories.png": "", "learning_curves.png": ""},
+        {"checkpoint.zip": "my backup"},
+        {"policy.pt": "my networks", CONFIG_NAME: "title: my site\n"},
+        {"summary.json": '{"of": "my thesis"}'},
+    ],
+)
+def test_a_file_of_a_users_own_with_the_name_of_a_result_is_never_deleted(own, tmp_path):
+    for name, text in own.items():
+        (tmp_path / name).write_text(text)
+    before = contents(tmp_path)
+    (first, *_) = (name for name in own if not name.endswith(".png"))
+    for word in ("overwrite=false", "overwrite=true"):
+        with pytest.raises(ConfigError, match=rf"holds {first}.*, which no run has written and a run would replace"):
+            start(tmp_path, word)
+        assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("kept", [CONFIG_NAME, "checkpoint.zip", "summary.json"])
+def test_a_run_that_has_lost_most_of_its_files_may_be_overwritten(kept, tmp_path):
+    start(tmp_path)
+    for path in tmp_path.iterdir():
+        if path.name not in (kept, "policy.pt"):
+            path.unlink()
+    with pytest.raises(ConfigError, match="holds the results of a run"):
+        start(tmp_path)
+    assert start(tmp_path, "overwrite=true", "seed=7") == 0
+
+
 def test_an_error_file_that_no_sweep_has_written_is_never_removed(tmp_path):
     (tmp_path / ERROR_NAME).write_text("my own errors\n")
     for word in ("overwrite=false", "overwrite=true"):
@@ -172,6 +204,34 @@ def test_a_finished_run_that_goes_on_and_is_killed_is_no_longer_finished(tmp_pat
     assert not json.loads((tmp_path / "summary.json").read_text())["finished"]
     assert resume(tmp_path, tmp_path, "total_frames=256") == 0
     assert json.loads((tmp_path / "summary.json").read_text())["finished"]
+
+
+LOST = {
+    "missing": (lambda text: None, "is missing; the rows up to frames=96 are lost"),
+    "empty": (lambda text: "", "is damaged; the rows up to frames=96 are lost"),
+    "without header": (lambda text: text.partition("\n")[2], "is damaged; the rows up to frames=96 are lost"),
+    "cut": (lambda text: "\n".join(text.splitlines()[:2]) + "\n3", "is cut; the rows after frames=0 are lost"),
+}
+
+
+@pytest.mark.parametrize("where", ["own", "other", "memory"])
+@pytest.mark.parametrize("name", LOST)
+def test_a_resumed_run_tells_which_rows_of_its_metrics_are_lost(name, where, tmp_path, capsys):
+    change, told = LOST[name]
+    start_and_kill(tmp_path / "run", 128, "checkpoint_every=96")
+    file = tmp_path / "run/metrics.csv"
+    text = change(file.read_text())
+    file.unlink() if text is None else file.write_text(text)
+    capsys.readouterr()
+    if where == "memory":
+        rows = hpamdp.train(resume=str(tmp_path / "run"), progress=False).history
+    else:
+        folder = tmp_path / ("run" if where == "own" else "other")
+        assert resume(tmp_path / "run", folder, "total_frames=128") == 0
+        rows = read_rows(folder / "metrics.csv")
+    lines = [line for line in capsys.readouterr().err.splitlines() if "metrics.csv" in line]
+    assert lines == [f"{file}: {told}; the run goes on, and its next rows begin after frames=96"]
+    assert [row["frames"] for row in rows] == [*([0.0] if name == "cut" else []), 128.0]
 
 
 def test_an_evaluation_never_touches_the_record_of_a_run(tmp_path, command, capsys):

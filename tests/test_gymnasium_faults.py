@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 
 import gymnasium
 import numpy as np
@@ -93,3 +94,16 @@ def test_an_environment_that_ignores_its_seed_is_named_once(capsys):
     assert capsys.readouterr().err.count("two resets with the same seed began differently") == 1
     hpamdp.train(Toy, low="hppo", high="none", progress=False, **sizes)
     assert "two resets" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("where", ["reset", "step"])
+@pytest.mark.parametrize("text", ["", "Unable to allocate 9. GiB"])
+def test_memory_that_an_environment_lacks_is_told_as_its_own_fault(where, text, monkeypatch):
+    def fails(self, *_, **__):
+        raise MemoryError(text) if text else MemoryError
+
+    monkeypatch.setattr(Toy, where, fails)
+    raised = re.escape(f"MemoryError: {text}" if text else "MemoryError")
+    with pytest.raises(EnvironmentFaultError) as error:
+        hpamdp.train(Toy, low="hppo", max_steps=3, total_frames=64, progress=False)
+    assert re.search(rf"environment 0: its {where} raised {raised} \({__file__}, line \d+\)$", str(error.value))

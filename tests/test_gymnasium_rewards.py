@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import torch
 from gymnasium_players import make, step
+from toy_environments import Toy
 
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv, _seeds
@@ -54,6 +57,18 @@ def test_a_reward_that_cannot_be_scaled_is_refused(reward):
     with pytest.raises(ProblemError, match=r"step returned the reward .*, which reward_scaling cannot scale"):
         scaling.scaled(np.array([1.0, reward]), np.ones(2, bool))
     assert np.isfinite(scaling.statistics.var).all()
+
+
+@pytest.mark.parametrize("reward", [1e300, -1e39])
+def test_a_reward_beyond_float32_is_refused_in_one_line_without_a_warning_of_numpy(reward, recwarn, monkeypatch):
+    env = make(2, max_steps=3, reward_scaling=None)
+    env.reset()
+    monkeypatch.setattr(Toy, "step", lambda self, action: (self._observation(), np.float64(reward), False, False, {}))
+    with pytest.raises(
+        ProblemError, match=rf"Toy: environment 0: step returned the reward {re.escape(f'{reward:g}')}, .* float32"
+    ):
+        step(env)
+    assert not [warning for warning in recwarn if issubclass(warning.category, RuntimeWarning)]
 
 
 def test_large_seeds_share_no_episodes_with_small_ones():

@@ -204,8 +204,9 @@ def test_memory_that_does_not_suffice_during_training_is_told_in_one_line(error,
         raise error
 
     monkeypatch.setattr("hpamdp.run.trainer.Trainer.train", train)
+    reason = rf" \({re.escape(str(error))}\)" if str(error) else ""
     with pytest.raises(
-        ConfigError, match=r"^num_envs=4, .*eval\.layouts=4, .*: the run takes more memory than there is"
+        ConfigError, match=rf"^num_envs=4, .*eval\.layouts=4, .*: the run takes more memory than there is{reason}$"
     ):
         run(config_of("low=random"), tmp_path)
 

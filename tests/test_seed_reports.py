@@ -241,6 +241,9 @@ def test_damaged_and_hostile_runs_cost_a_line_each(tmp_path, capsys):
     leave_run(study / "circular", seed="&a {b: *a}")
     (study / "gone").symlink_to(tmp_path / "nowhere")
     (study / "good/loop").symlink_to(study)
+    leave_run(study / "half", seed=7)
+    text = (study / "half/config.yaml").read_text()
+    (study / "half/config.yaml").write_text(text[: text.rindex(":") + 2])  # which is still yaml
     (study / "other").mkdir()
     (study / "other/config.yaml").write_text("a: 1\n")
     report = report_on([study])
@@ -250,6 +253,7 @@ def test_damaged_and_hostile_runs_cost_a_line_each(tmp_path, capsys):
         "cut: summary.json is damaged, left out",
         "gone: is a broken link, left out",
         f"good: has the settings and the seed of {study}/again, left out",
+        "half: config.yaml is missing or damaged, left out",
         "large/metrics.csv: has 1073741824 bytes, but may have at most 16777216; its curve is left out",
         "pipe/metrics.csv: is a named pipe, but must be a regular file; its curve is left out",
         "strange name: config.yaml is missing or damaged, left out",

@@ -175,6 +175,9 @@ class Faulty(Toy):
         self.perhaps("step")
         return super().step(action)
 
+    def close(self):
+        self.perhaps("close")
+
 
 class Killed(Toy):
     """Is killed in its second step."""

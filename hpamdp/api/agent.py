@@ -322,7 +322,7 @@ class Agent:
 
         Raises:
             ConfigError: `path` is not a path.
-            OSError: the file cannot be written.
+            OSError: the file cannot be written, or the path is a folder or a pipe.
         """
         checkpoint.save_policy(path_argument("save", path), self._agent, self._env, self._progress)
 
@@ -351,7 +351,7 @@ class Agent:
         Raises:
             ConfigError: `path` is not a path, the agent has no greedy policy that can be exported, or `hpamdp[onnx]` is
                 not installed.
-            OSError: the file cannot be written.
+            OSError: the file cannot be written, or the path is a folder or a pipe.
 
         Example:
             >>> import hpamdp

@@ -75,7 +75,7 @@ def fault_of(error: Exception, what: str) -> EnvironmentFaultError | None:
         return None
     # An installed environment has frames of installed packages alone.
     theirs = [summary for summary in theirs if not _is_installed(summary.filename)] or theirs
-    raised = one_line(f"{type(error).__name__}: {error}")
+    raised = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
     where = f"{theirs[-1].filename}, line {theirs[-1].lineno}"
     return EnvironmentFaultError(one_line(f"{what} raised {raised} ({where})"), "".join(traceback.format_list(theirs)))
 

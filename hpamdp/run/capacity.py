@@ -18,6 +18,7 @@ from hpamdp.config.components import Component
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.memory import in_gigabytes, is_about_memory, total_memory
 from hpamdp.messages import first_line
 from hpamdp.policies.agent import HierarchicalAgent
@@ -182,12 +183,14 @@ def memory_errors_explained(config: Config) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if isinstance(error, ConfigError) or not is_about_memory(error):
+        # If the environment's own code lacks memory, the line of its fault says so.
+        if isinstance(error, ConfigError | EnvironmentFaultError) or not is_about_memory(error):
             raise
         run = config.run
         sizes = f"num_envs={run.num_envs}, steps_per_batch={run.steps_per_batch}, eval.layouts={run.eval.layouts}"
         parts = f"{sizes}, {config.low.largest_sizes()}, {config.high.largest_sizes()}"
-        raise ConfigError(f"{parts}: the run takes more memory than there is ({first_line(error):.160})") from error
+        reason = f" ({first_line(error):.160})" if str(error) else ""
+        raise ConfigError(f"{parts}: the run takes more memory than there is{reason}") from error
 
 
 def check_length(config: Config, agent: HierarchicalAgent, learners: Iterable[tuple[Component, Learner]]) -> None:

@@ -35,8 +35,8 @@ from torchrl.data import ReplayBuffer
 from hpamdp.config.compose import package_dir
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.files import replacing
-from hpamdp.messages import first_line, warn
+from hpamdp.files import regular_size, replacing
+from hpamdp.messages import first_line, reason_of, warn
 from hpamdp.policies.agent import FOR_TRAINING, HierarchicalAgent
 from hpamdp.policies.base import Learner, Level, added_later
 from hpamdp.run.state_checks import (
@@ -59,10 +59,9 @@ from hpamdp.run.state_checks import (
 )
 from hpamdp.run.tensor_archive import MemberFile, SavedTensor, TensorArchive, stored_members
 from hpamdp.run_files import CHECKPOINT_NAME as FILE_NAME
-from hpamdp.run_files import POLICY_NAME
+from hpamdp.run_files import MANIFEST_NAME, POLICY_NAME
 
 _FORMAT = 2
-_MANIFEST = "manifest.json"
 _MAX_JSON = 2**24
 _BLOCK = 2**20
 _CUDA_STATE_BYTES = 16
@@ -98,21 +97,27 @@ def find(path: str | Path, where: str) -> Path:
         where: the setting that gives the path, for the error.
 
     Raises:
-        ConfigError: there is no checkpoint.
+        ConfigError: there is no checkpoint, or it cannot be opened.
     """
     path = Path(os.path.expanduser(path))  # before `Path` drops "./", after which "./~" would mean the home directory
     if not os.path.exists(path) and str(path) in agent_names():
         path = agents_dir() / path
     is_folder = os.path.isdir(path)  # `Path.is_dir` would fail for some texts
     file = path / FILE_NAME if is_folder else path
-    if where != "resume" and is_folder and not file.is_file() and (path / POLICY_NAME).is_file():
+    if where != "resume" and is_folder and not os.path.isfile(file) and os.path.isfile(path / POLICY_NAME):
         file = path / POLICY_NAME
-    if not os.path.isfile(file):
+    try:
+        regular_size(file)
+        with file.open("rb") as opened:
+            is_archive = zipfile.is_zipfile(opened)
+    except (FileNotFoundError, NotADirectoryError):
         has_policy = os.path.isfile(path / POLICY_NAME)
         why = _NOT_RESUMED if has_policy else "no checkpoint there"
         names = f", or one of {', '.join(agent_names())}" if os.sep not in str(path) and where != "resume" else ""
-        raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}{names}")
-    if not zipfile.is_zipfile(file):
+        raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}{names}") from None
+    except OSError as error:
+        raise ConfigError(f"{where}={file}: {reason_of(error)}") from error
+    if not is_archive:
         raise ConfigError(f"{where}={file}: not a checkpoint of this program")
     return file
 
@@ -201,7 +206,7 @@ def save(
             checksums[name] = hashlib.sha256(data).hexdigest()
             archive.writestr(f"{name}.pt", data)
         manifest = {"format": _FORMAT, "members": checksums, "progress": dict(progress)}
-        archive.writestr(_MANIFEST, json.dumps(manifest))
+        archive.writestr(MANIFEST_NAME, json.dumps(manifest))
 
 
 def save_policy(path: Path, agent: HierarchicalAgent, env: PAMDPEnv, progress: Mapping[str, Any]) -> None:
@@ -410,8 +415,8 @@ class _Opened:
     def _open(self, file: IO[bytes], num_bytes: int) -> None:
         archive = stored_members(file, num_bytes)
         self._file, self._infos = file, {info.filename: info for info in archive.infolist()}
-        if _MANIFEST in self._infos:
-            text = archive.read(_MANIFEST)
+        if MANIFEST_NAME in self._infos:
+            text = archive.read(MANIFEST_NAME)
             manifest = checked(_Manifest, _json(text))
             _check_format(manifest.format)
             self._members = {

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import traceback
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,7 +15,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from hpamdp.config.errors import ConfigError
-from hpamdp.files import read_regular, remove_link, replacing
+from hpamdp.files import read_regular, regular_size, remove_link, replacing
 from hpamdp.run_files import (
     BEST_NAME,
     CHECKPOINT_NAME,
@@ -24,6 +25,7 @@ from hpamdp.run_files import (
     EVALUATION_NAME,
     FIGURES_NAME,
     FILM_NAME,
+    MANIFEST_NAME,
     MAX_TEXT_BYTES,
     METRICS_NAME,
     POLICY_NAME,
@@ -35,7 +37,7 @@ from hpamdp.run_files import (
 )
 from hpamdp.shell import path_setting
 
-# Each of these files marks the folder of a run.
+# The results of a run.
 _MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME, BEST_NAME)
 _OTHERS = (
     METRICS_NAME,
@@ -95,14 +97,7 @@ def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
     Raises:
         ConfigError: the folder is refused.
     """
-    marks = [name for name in _MARKS if (folder / name).exists()]
-    if marks and not may_overwrite:
-        raise ConfigError(
-            f"{folder}: holds the results of a run; continue it with {path_setting('resume', folder)}, "
-            "take another folder (hydra.run.dir), or set overwrite=true"
-        )
-    is_of_a_run = marks or {"mode", "seed", "env", "low"} <= saved_config(folder).keys() or _aside(folder).exists()
-    if not is_of_a_run:
+    if not _is_of_a_run(folder):
         foreign = [path.name for path in written_by_a_run(folder) if path.name != ERROR_NAME]
         if has_foreign_error(folder):
             foreign.append(ERROR_NAME)
@@ -111,6 +106,25 @@ def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
                 f"{folder}: holds {', '.join(foreign)}, which no run has written and a run would replace; take another "
                 "hydra.run.dir"
             )
+    elif not may_overwrite and any((folder / name).exists() for name in _MARKS):
+        raise ConfigError(
+            f"{folder}: holds the results of a run; continue it with {path_setting('resume', folder)}, "
+            "take another folder (hydra.run.dir), or set overwrite=true"
+        )
+
+
+def _is_of_a_run(folder: Path) -> bool:
+    """Return whether a file says by its contents that a run has written it, since others use the same names."""
+    if {"mode", "seed", "env", "low"} <= saved_config(folder).keys() or _aside(folder).exists():
+        return True
+    if {"finished", "frames"} <= saved_summary(folder).keys():
+        return True
+    try:
+        regular_size(folder / CHECKPOINT_NAME)
+        with zipfile.ZipFile(folder / CHECKPOINT_NAME) as archive:
+            return MANIFEST_NAME in archive.namelist()
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):  # missing, or a file of another kind
+        return False
 
 
 def check_no_training(folder: Path) -> None:

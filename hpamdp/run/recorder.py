@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -69,14 +70,34 @@ class Recorder:
         random = random_agent(parts.agent.specs, parts.device, parts.agent.option_lengths)
         self._random = parts.evaluation.measure(parts.evaluation.run(random.policy))
 
-    def resume_from(self, folder: Path, frames: int) -> None:
-        """Start the metrics with the rows of the run in `folder`, up to `frames`."""
+    def resume_from(self, folder: Path, frames: int, log_every: int) -> None:
+        """Start the metrics with the rows of the run in `folder`, up to `frames`; warn if some are lost.
+
+        Args:
+            folder: the folder of the resumed run.
+            frames: frames of its checkpoint.
+            log_every: largest distance of two of its rows, beside the length of a batch; 0 if unknown.
+        """
         source = folder / METRICS_NAME
         if self.output_dir is None:
             self.metrics = MetricsInMemory(rows_up_to(frames, source))
         else:
             self.metrics = MetricsFile(self.output_dir / METRICS_NAME, source, frames)
         self._resumed_from = folder
+        self._warn_of_lost_rows(source, frames, log_every)
+
+    def _warn_of_lost_rows(self, source: Path, frames: int, log_every: int) -> None:
+        last = max((int(row[FRAMES]) for row in self.metrics.rows()), default=None)
+        # A run that failed in the middle of a batch may have saved its agent, but not the last row.
+        before = max(0, frames - max(1, self.config.run.num_envs * self.config.run.steps_per_batch))
+        if last is None and frames > 0:
+            why = "damaged" if os.path.lexists(source) else "missing"
+            lost = f"is {why}; the rows up to {FRAMES}={frames} are lost"
+        elif last is not None and log_every > 0 and last < before // log_every * log_every:
+            lost = f"is cut; the rows after {FRAMES}={last} are lost"
+        else:
+            return
+        warn(f"{source}: {lost}; the run goes on, and its next rows begin after {FRAMES}={frames}")
 
     def start(self) -> None:
         """Start the logger, if the run has a folder. It takes over the rows of a resumed run.
@@ -88,7 +109,7 @@ class Recorder:
             return
         earlier = None
         if self._resumed_from is not None:
-            earlier = EarlierRun(self._resumed_from, [row for row in self.metrics.rows() if FRAMES in row])
+            earlier = EarlierRun(self._resumed_from, self.metrics.rows())
         chosen, values = self.config.logger, self.config.to_dict()
         self._logger = Guarded(
             chosen.name, lambda: chosen.build(output_dir=self.output_dir, config=values, earlier=earlier)

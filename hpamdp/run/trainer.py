@@ -105,7 +105,10 @@ class Trainer:
             return
         self.resumed_from = source.parent
         # The evaluation that is due writes the row of these frames again.
-        self.recorder.resume_from(source.parent, self.frames - 1 if self.is_evaluation_due else self.frames)
+        frames = self.frames - 1 if self.is_evaluation_due else self.frames
+        both = self.config.run.log_every, progress["config"].get("log_every")
+        log_every = max(both) if all(type(every) is int and every > 0 for every in both) else 0
+        self.recorder.resume_from(source.parent, frames, log_every)
         try:
             self.recorder.set_state(saved.states["recorder"])
             self._restore_callbacks(saved.states.get("callbacks", {}))

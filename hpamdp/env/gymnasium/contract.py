@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium
 
-from hpamdp.env.errors import ProblemError
+from hpamdp.env.errors import ProblemError, fault_of
 from hpamdp.env.gymnasium.values import flag, number, shown
 from hpamdp.messages import one_line, warn
 
@@ -46,11 +46,15 @@ class ContractCheck(gymnasium.Wrapper):
         return checked_step(values)
 
     def close(self) -> None:
-        """Close the environment; if it calls `sys.exit`, warn and let the run go on."""
+        """Close the environment; if it raises an error or calls `sys.exit`, warn and let the run go on."""
+        what = f"{type(self.unwrapped).__name__}: close"
         try:
             self.env.close()
         except SystemExit as error:
-            warn(f"{type(self.unwrapped).__name__}: close called sys.exit({shown(error.code)}); the run goes on")
+            warn(f"{what} called sys.exit({shown(error.code)}); the run goes on")
+        except Exception as error:
+            told = fault_of(error, what) or f"{what} raised {type(error).__name__}: {error}"
+            warn(one_line(f"{told}; the run goes on"))
 
 
 def refuse_step(error: TypeError | SystemExit) -> None:

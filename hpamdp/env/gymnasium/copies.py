@@ -350,7 +350,7 @@ class Copies:
 
     def _explain(self, method: str, error: Exception) -> NoReturn:
         """Raise the error of a method, and say which copy broke its contract or raised it."""
-        if isinstance(error, EnvironmentFaultError | MemoryError):
+        if isinstance(error, EnvironmentFaultError):
             raise error
         where = f"{self._name}: environment {self._first + self._row}"
         if isinstance(error, ProblemError):

@@ -445,7 +445,17 @@ class GymnasiumEnv(PAMDPEnv):
         rewards = results.reward if is_all else np.where(is_stepped, results.reward, 0.0)
         if self._reward_scaling is not None:
             rewards = self._reward_scaling.scaled(rewards, is_stepped)
-        return self._read(rewards.astype(np.float32))
+        return self._read(self._in_float32(rewards))
+
+    def _in_float32(self, rewards: np.ndarray) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            rounded = rewards.astype(np.float32)
+        is_wrong = np.isinf(rounded) & np.isfinite(rewards)
+        if is_wrong.any():
+            row = int(is_wrong.argmax())
+            where = f"{self._name}: environment {self.first_env + row}"
+            raise ProblemError(f"{where}: step returned the reward {rewards[row]:g}, which is too large for float32")
+        return rounded
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         # `_read` returns every entry in its final shape. TorchRL takes a quarter of its own time to check that.

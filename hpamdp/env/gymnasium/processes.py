@@ -20,6 +20,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError, closed_on_error
 from hpamdp.env.gymnasium.copies import Copies, Reading
 from hpamdp.env.registration import register
+from hpamdp.messages import warn
 from hpamdp.search_path import protect_children, unprotect_children
 from hpamdp.settings import SettingError
 
@@ -228,23 +229,30 @@ class ProcessCopies:
 
     def _death(self) -> str:
         workers = self._vector.processes
+        how = {}
         for number, worker in enumerate(workers):
             worker.join(_PATIENCE_S / len(workers))
             code = worker.exitcode
             if code is not None:
-                how = f"exit code {code}" if code >= 0 else f"signal {-code}, {signal.Signals(-code).name}"
-                return f"worker {number} of {len(workers)} died ({how})"
-        return "a worker no longer answers"
+                how[number] = f"exit code {code}" if code >= 0 else f"signal {-code}, {signal.Signals(-code).name}"
+        if not how:
+            return "a worker no longer answers"
+        # A worker that was closed has the exit code 0.
+        number = min(how, key=lambda each: how[each] == "exit code 0")
+        return f"worker {number} of {len(workers)} died ({how[number]})"
 
     def close(self) -> None:
-        """Close the copies and end the workers."""
-        if self._is_broken:
-            for worker in self._vector.processes:
-                worker.kill()
-                worker.join()
-            self._vector.closed = True  # it would wait for the dead ones
-        else:
-            self._vector.close()
+        """Close the copies and end the workers; if one has died, warn and let the run go on."""
+        if not self._is_broken:
+            try:
+                self._vector.close()
+                return
+            except (EOFError, OSError):
+                warn(f"{self._name}: {self._death()} before it was closed; the run goes on")
+        for worker in self._vector.processes:
+            worker.kill()
+            worker.join()
+        self._vector.closed = True  # it would wait for the dead ones
 
 
 @contextmanager
