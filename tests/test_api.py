@@ -603,13 +603,6 @@ def test_a_batch_of_no_boxes_is_refused():
         agent.act(np.zeros((0, 3)))
 
 
-def test_an_unknown_keyword_of_act_is_refused_with_the_known_ones(platform_agent):
-    with pytest.raises(TypeError, match=r"^act: deterministic=True: no such argument; use greedy=True$"):
-        platform_agent.act(np.zeros(9), deterministic=True)
-    with pytest.raises(TypeError, match=r"^act: state=None: no such argument; it has observation, info, greedy$"):
-        platform_agent.act(np.zeros(9), state=None)
-
-
 def test_load_takes_the_problem_as_its_second_argument(platform_agent, tmp_path):
     platform_agent.save(tmp_path / "a.pt")
     assert hpamdp.load(tmp_path / "a.pt", "platform").specs == platform_agent.specs

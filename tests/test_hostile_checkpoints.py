@@ -173,7 +173,19 @@ def is_harmless(place, change):
         return change in ("gone", "None")
     if place[0] == "root" and len(place) > 1:  # counters, and what the next action replaces
         return change in ("gone", "huge", "negative", "inf", "nan")
-    optional = {"held", "scalars", "ended", "option_names", "last_score", "rows", "env", "frames", "cpu_s", "wall_s"}
+    optional = {
+        "held",
+        "scalars",
+        "own",
+        "ended",
+        "option_names",
+        "last_score",
+        "rows",
+        "env",
+        "frames",
+        "cpu_s",
+        "wall_s",
+    }
     return bool({*place} & {*optional, "episode", "steps", "presses", "pending", "has_gauss"}) or change == "empty"
 
 

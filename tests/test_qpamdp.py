@@ -187,6 +187,17 @@ def test_the_bound_shortens_sarsas_step_to_cancel_the_error():
     assert error == 36.0
 
 
+@pytest.mark.parametrize("step_scaling", [True, False])
+def test_observations_that_never_change_have_one_feature(step_scaling):
+    learner = make(warmup_steps=8, step_scaling=step_scaling)
+    batch = play(learner, 8, 4)
+    batch[keys.OBSERVATION] = torch.zeros_like(batch[keys.OBSERVATION])
+    batch["next", keys.OBSERVATION] = torch.zeros_like(batch["next", keys.OBSERVATION])
+    for _ in range(2):
+        learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
+    assert learner.policy.w.shape[1] == 1 and learner.policy.w.isfinite().all()
+
+
 def test_the_mean_error_of_sarsa_counts_its_own_steps_alone():
     sarsa = make_sarsa(step_size=1e-12)
     ends = [[True, True], [True, True]]

@@ -99,9 +99,7 @@ class Agent:
         """Number of weights of all networks."""
         return sum(each.numel() for each in self._agent.parameters())
 
-    def act(
-        self, observation: Any, info: Mapping[str, Any] | None = None, *, greedy: bool = True, **unknown: Any
-    ) -> Any:
+    def act(self, observation: Any, info: Mapping[str, Any] | None = None, *, greedy: bool = True) -> Any:
         """Return the action for an observation, in Gymnasium's form.
 
         The agent holds its option, and what its policy remembers, until `reset` says that a new episode begins. Agents
@@ -113,10 +111,8 @@ class Agent:
             info: the info of the same step. Its masks count if the problem gives them there, and its `trip_ended` if
                 options end with trips.
             greedy: whether to take the best action. Otherwise the agent explores as in training.
-            unknown: none; they are refused by name.
 
         Raises:
-            TypeError: there is no such argument.
             ValueError: an argument is wrong; the agent chooses by rewards, which `act` does not get; an agent that
                 holds an option or memory gets a batch of another size; or an episode exceeds the problem's limit, so a
                 `reset` is missing.
@@ -128,9 +124,6 @@ class Agent:
             >>> observation, info = env.reset(seed=0)
             >>> discrete, parameters = agent.act(observation)
         """
-        for name, value in unknown.items():
-            known = f"use greedy={as_code(value)}" if name == "deterministic" else "it has observation, info, greedy"
-            raise TypeError(f"act: {name}={as_code(value)}: no such argument; {known}")
         flag("act: greedy", greedy)
         if info is not None and not isinstance(info, Mapping):
             raise ValueError(f"act: info={as_code(info)}: must be a dict")

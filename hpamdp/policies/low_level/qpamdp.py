@@ -519,7 +519,7 @@ class QPAMDP(Learner):
         """Make Sarsa's updates of a batch and lower the temperature; return the mean squared error."""
         policy, options = self.policy, self.options
         coefficients = policy.phi.coefficients
-        step_scale = policy.phi.step_scale() if options.step_scaling else torch.ones_like(coefficients[:, 0])
+        step_scale = policy.phi.step_scale() if options.step_scaling else coefficients.new_ones(len(coefficients))
         policy.w, error = self.sarsa.update(policy.w, rows, policy.temperature, step_scale)
         cooled = policy.temperature * options.temperature_decay ** num_episodes.float()
         policy.temperature = cooled.clamp(min=min(options.temperature, options.temperature_final))
