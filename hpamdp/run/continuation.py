@@ -19,7 +19,11 @@ _CHOSEN = "choices."  # what precedes the groups in a saved config
 
 
 class Rest(NamedTuple):
-    """The rest of a run: nothing if it has a score, otherwise everything after its checkpoint, if it has one."""
+    """What is left of a run.
+
+    If `score` is set, the run is finished. If only `checkpoint` is set, it continues from there. If neither is set, it
+    starts anew.
+    """
 
     score: float | None = None
     checkpoint: Path | None = None

@@ -65,10 +65,10 @@ class Recorder:
         self._scalars: dict[str, float] = {}
         # The last evaluation; None once the agent has learned since.
         self._played: dict[str, np.ndarray] | None = None
-        self._own: Mapping[str, float] = {}  # the last metrics of callbacks
-        self._held: dict[str, float] = {}  # scores with each option held, at the last evaluation
+        self._callback_metrics: Mapping[str, float] = {}  # the last metrics of callbacks
+        self._option_scores: dict[str, float] = {}  # scores with each option held, at the last evaluation
         random = random_agent(parts.agent.specs, parts.device, parts.agent.option_lengths)
-        self._random = parts.evaluation.measure(parts.evaluation.run(random.policy))
+        self._random_scores = parts.evaluation.measure(parts.evaluation.run(random.policy))
 
     def resume_from(self, folder: Path, frames: int, log_every: int) -> None:
         """Start the metrics with the rows of the run in `folder`, up to `frames`; warn if some are lost.
@@ -120,8 +120,8 @@ class Recorder:
         return {
             "ended": [dict(ended.items()) for ended in self._ended],
             "scalars": dict(self._scalars),
-            "held": dict(self._held),
-            "own": dict(self._own),
+            "held": dict(self._option_scores),
+            "own": dict(self._callback_metrics),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -140,8 +140,8 @@ class Recorder:
                 check_values(f"ended.{name}", column, own[name])
         self._ended = [TensorDict(ended).auto_batch_size_(1) for ended in saved.ended]
         self._scalars = saved.scalars
-        self._held = saved.held
-        self._own = saved.own
+        self._option_scores = saved.held
+        self._callback_metrics = saved.own
 
     def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
         """Note a collected batch `[N, T]`, if there is one, and the scalars that the agent returned from learning."""
@@ -180,7 +180,7 @@ class Recorder:
         row = {FRAMES: float(frames), WALL_SECONDS: wall_s, **self._training_scores(), **self._scalars}
         if own is not None:
             row |= own
-            self._own = own
+            self._callback_metrics = own
         if is_stopped:
             row[STOPPED] = 1.0
         if is_evaluated:
@@ -212,8 +212,8 @@ class Recorder:
         measured = self.parts.evaluation.measure(played)
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
         env = self.parts.evaluation.problem
-        summary = summarise(self.config, env, measured, self._random, effort, is_finished=is_finished)
-        summary |= self._own
+        summary = summarise(self.config, env, measured, self._random_scores, effort, is_finished=is_finished)
+        summary |= self._callback_metrics
         if self.config.run.mode != "eval":
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
             summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])
@@ -262,7 +262,7 @@ class Recorder:
     def _drift(self, measured: dict[str, float]) -> dict[str, float]:
         """Return, for each option, how much the score with that option held has changed since the last evaluation."""
         held = {name: value for name, value in measured.items() if name.startswith("score_")}
-        before, self._held = self._held, held
+        before, self._option_scores = self._option_scores, held
         return {
             f"drift_{name.removeprefix('score_')}": value - before[name]
             for name, value in held.items()
