@@ -117,7 +117,7 @@ LAUGHS = "".join(f"  l{i}: &l{i} [{', '.join([f'*l{i - 1}' if i else '1'] * 9)}]
         ("env:\n\tseed: 1\n", "odd.yaml, line 3: "),
         ("num_envs: ${seed}\nseed: ${num_envs}\n", "seed: "),
         ('hydra: {run: {dir: "a\\0b"}}\n', "embedded null byte"),
-        ('resume: "a\\0b"\n', "no checkpoint there"),
+        ('resume: "a\\0b"\n', "is no file name"),
         ("hydra: {run: {dir: " + "x" * 300 + "}}\n", "File name too long"),
     ],
 )
