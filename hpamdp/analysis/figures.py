@@ -20,7 +20,7 @@ from hpamdp.figure_style import AGENT, REFERENCES, STYLE, label_ends
 from hpamdp.files import read_regular, regular_size, replacing
 from hpamdp.messages import duration, one_line, warn
 from hpamdp.metrics_file import EVALUATION, FRAMES, WALL_SECONDS, read_rows
-from hpamdp.run_files import EVALUATION_NAME, FIGURES_NAME, MAX_TEXT_BYTES, METRICS_NAME
+from hpamdp.run_files import EVALUATION_NAME, FIGURES_NAME, MAX_TEXT_BYTES, METRICS_NAME, SUMMARY_NAME
 
 
 def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
@@ -33,7 +33,7 @@ def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
         output_dir: the run's folder, to which the figures are written.
         env: the environment's class, which names the curves and draws its own figures.
     """
-    summary = _read_summary(output_dir / "summary.json")
+    summary = _read_summary(output_dir / SUMMARY_NAME)
     rows = read_rows(output_dir / METRICS_NAME)
     evaluation = _read_evaluation(output_dir / EVALUATION_NAME)
     with mpl.rc_context(STYLE):

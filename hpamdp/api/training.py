@@ -366,7 +366,9 @@ def _check_classes(file: Path, settings: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: the agent has another class, or a setting of the agent is no class.
     """
-    for group in (each for each in _OF_AGENT if each in settings):
+    given = [group for group in _OF_AGENT if group in settings]
+    choices = choices_of(checkpoint.progress_of(file)["config"]) if given else {}
+    for group in given:
         cls = settings[group]
         if isinstance(cls, Mapping) and isinstance(cls.get("name"), type):
             raise ConfigError(
@@ -374,10 +376,10 @@ def _check_classes(file: Path, settings: Mapping[str, Any]) -> None:
             )
         if not isinstance(cls, type):
             raise ConfigError(f"{group}: has no effect on a trained agent; leave it out")
-        saved = choices_of(checkpoint.progress_of(file)["config"])[group]
-        if choosing_class(group, cls) != word(group, saved):
+        if choosing_class(group, cls) != word(group, choices[group]):
             raise ConfigError(
-                f"{group}={cls.__name__}: the agent was trained with {group}={saved}; pass that class, or leave it out"
+                f"{group}={cls.__name__}: the agent was trained with {group}={choices[group]}; pass that class, or "
+                "leave it out"
             )
 
 
