@@ -581,9 +581,12 @@ def dict_agent() -> hpamdp.Agent:
             {"pos": np.zeros((1, 2, 2)), "time": np.zeros(1)},
             "act: the entry pos has the shape [1, 2, 2], but must have [2] or [N, 2], with N from 1 on",
         ),
+        ({"pos": np.zeros((2, 2))}, "act: the observation lacks the entry time"),
+        ({"time": np.zeros(2)}, "act: the observation lacks the entry pos"),
+        (3.0, "act: the observation lacks the entry pos"),
     ],
 )
-def test_entries_of_a_dict_with_other_numbers_of_observations_are_refused(dict_agent, observation, line):
+def test_entries_of_a_dict_that_are_missing_or_hold_other_numbers_of_observations_are_refused(dict_agent, observation, line):
     with pytest.raises(ValueError) as raised:
         dict_agent.act(observation)
     assert str(raised.value) == line

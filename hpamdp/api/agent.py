@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -37,8 +36,6 @@ from hpamdp.run.assemble import make_env, make_evaluation, option_length
 from hpamdp.run.capacity import check_number
 from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
-
-_Shape: TypeAlias = tuple[int, ...]
 
 
 class _Asked(Settings):
@@ -128,7 +125,6 @@ class Agent:
         if info is not None and not isinstance(info, Mapping):
             raise ValueError(f"act: info={as_code(info)}: must be a dict")
         try:
-            _check_batch(self.observation_space, observation)
             fresh, is_batch = self._form.read(observation, info)
         except ValueError as error:
             raise ValueError(f"act: {error}") from error
@@ -357,41 +353,6 @@ class Agent:
         """
         about = {group: getattr(self._config, group).name for group in ("env", "high", "low")}
         export_onnx(path_argument("export", path), self._agent, self._env, option_length(self._config), about)
-
-
-def _check_batch(space: spaces.Space, observation: Any) -> None:
-    """Refuse entries of an observation that hold different numbers of observations, or a batch of none.
-
-    Raises:
-        ValueError: the message names the entry.
-    """
-    first, first_num = "", None
-    for i, (name, shape, given) in enumerate(_shapes(space, observation, "")):
-        entry, own = f"the entry {name}" if name else "the observation", ", ".join(map(str, shape))
-        is_batch = len(given) == len(shape) + 1
-        has_form = is_batch or len(given) == len(shape) or not name  # without entries, the form names what is wrong
-        if not has_form or (is_batch and given[0] == 0):
-            allowed = f"[{own}] or [N, {own}]" if shape else "[] or [N]"
-            raise ValueError(f"{entry} has the shape {list(given)}, but must have {allowed}, with N from 1 on")
-        num = given[0] if is_batch else None
-        if i == 0:
-            first, first_num = entry, num
-        elif num != first_num:
-            held = "one observation" if first_num is None else f"{first_num} observations"
-            wanted = list(shape) if first_num is None else [first_num, *shape]
-            raise ValueError(f"{entry} has the shape {list(given)}, but {first} holds {held}, so it must have {wanted}")
-
-
-def _shapes(space: spaces.Space, observation: Any, name: str) -> Iterator[tuple[str, _Shape, _Shape]]:
-    """Yield the name of each entry, its shape in the space and the given shape. Skip what has no shape."""
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        inner = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        for part, its_space in inner:
-            with suppress(KeyError, IndexError, TypeError):  # refused by the form, which names what is missing
-                yield from _shapes(its_space, observation[part], f"{name}.{part}" if name else str(part))
-    elif space.shape is not None and not isinstance(space, spaces.Text):
-        with suppress(ValueError, TypeError):  # no array: refused by the form
-            yield name, space.shape, np.shape(observation)
 
 
 def _like(mask: torch.Tensor, value: torch.Tensor) -> torch.Tensor:

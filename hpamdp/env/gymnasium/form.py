@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -12,13 +13,14 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
-from hpamdp.env.gymnasium.action_spaces import written
 from hpamdp.env.gymnasium.copies import Copies, Reading
 from hpamdp.env.gymnasium.masks import Masks, as_leaf
 from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds, agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling
 from hpamdp.env.gymnasium_form import GymnasiumForm, ParameterMap, VectorScaling, checked_mask
+
+_Shape: TypeAlias = tuple[int, ...]
 
 
 class OwnForm(GymnasiumForm):
@@ -124,16 +126,37 @@ def num_in_batch(space: spaces.Space, observation: Any) -> int | None:
     """Return the number of observations in a batch; None for one observation.
 
     Raises:
-        ValueError: the observation has neither form.
+        ValueError: an entry is missing or has neither form, the entries hold different numbers of observations, or
+            none. The message names the entry.
     """
-    while isinstance(space, spaces.Dict | spaces.Tuple):
-        name: Any = next(iter(space.spaces)) if isinstance(space, spaces.Dict) else 0
-        space = space[name]
-        try:
-            observation = observation[name]
-        except (KeyError, IndexError, TypeError) as error:
-            raise ValueError(f"the observation lacks the entry {name!r}") from error
-    more = np.ndim(observation) - len(space.shape or ())
-    if more not in (0, 1):
-        raise ValueError(f"the observation has shape {list(np.shape(observation))}, but the space is {written(space)}")
-    return len(observation) if more else None
+    first, first_num = None, None
+    for name, shape, given in _shapes(space, observation, ""):
+        entry, own = f"the entry {name}" if name else "the observation", ", ".join(map(str, shape))
+        is_batch = len(given) == len(shape) + 1
+        if not (is_batch or len(given) == len(shape)) or (is_batch and given[0] == 0):
+            allowed = f"[{own}] or [N, {own}]" if shape else "[] or [N]"
+            raise ValueError(f"{entry} has the shape {list(given)}, but must have {allowed}, with N from 1 on")
+        num = given[0] if is_batch else None
+        if first is None:
+            first, first_num = entry, num
+        elif num != first_num:
+            held = "one observation" if first_num is None else f"{first_num} observations"
+            wanted = list(shape) if first_num is None else [first_num, *shape]
+            raise ValueError(f"{entry} has the shape {list(given)}, but {first} holds {held}, so it must have {wanted}")
+    return first_num
+
+
+def _shapes(space: spaces.Space, observation: Any, name: str) -> Iterator[tuple[str, _Shape, _Shape]]:
+    """Yield the name of each entry, its shape in the space and the given shape."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        inner = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        for part, its_space in inner:
+            own = f"{name}.{part}" if name else str(part)
+            try:
+                given = observation[part]
+            except (KeyError, IndexError, TypeError) as error:
+                raise ValueError(f"the observation lacks the entry {own}") from error
+            yield from _shapes(its_space, given, own)
+    else:
+        with suppress(ValueError, TypeError):  # no array: refused where it is read
+            yield name, space.shape or (), np.shape(observation)
