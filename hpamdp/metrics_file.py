@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 import shutil
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -93,6 +94,29 @@ def rows_up_to(frames: float, path: Path) -> list[dict[str, float]]:
     """
     rows = [row for row in read_rows(path) if FRAMES in row]
     return list(takewhile(lambda row: STOPPED not in row and row[FRAMES] <= frames, rows))
+
+
+def what_is_lost(
+    rows: Iterable[Mapping[str, float]], path: Path, frames: int, log_every: int, batch: int
+) -> str | None:
+    """Return which rows of a `metrics.csv` are lost, as part of a sentence; None if none is missed.
+
+    Args:
+        rows: what could be read of it.
+        path: the file, which may be missing.
+        frames: those of the saved agent, up to which it must have rows.
+        log_every: largest distance of two rows, beside the length of a batch; 0 if unknown.
+        batch: frames of a batch.
+    """
+    last = max((int(row[FRAMES]) for row in rows if FRAMES in row), default=None)
+    # A run that failed in the middle of a batch may have saved its agent, but not the last row.
+    before = max(0, frames - max(1, batch))
+    if last is None and frames > 0:
+        why = "damaged" if os.path.lexists(path) else "missing"
+        return f"{path}: is {why}; the rows up to {FRAMES}={frames} are lost"
+    if last is not None and log_every > 0 and last < before // log_every * log_every:
+        return f"{path}: is cut; the rows after {FRAMES}={last} are lost"
+    return None
 
 
 class MetricsInMemory:

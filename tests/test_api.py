@@ -586,7 +586,7 @@ def dict_agent() -> hpamdp.Agent:
         (3.0, "act: the observation lacks the entry pos"),
     ],
 )
-def test_entries_of_a_dict_that_are_missing_or_hold_other_numbers_of_observations_are_refused(dict_agent, observation, line):
+def test_entries_that_are_missing_or_hold_other_numbers_of_observations_are_refused(dict_agent, observation, line):
     with pytest.raises(ValueError) as raised:
         dict_agent.act(observation)
     assert str(raised.value) == line

@@ -234,6 +234,22 @@ def test_a_resumed_run_tells_which_rows_of_its_metrics_are_lost(name, where, tmp
     assert [row["frames"] for row in rows] == [*([0.0] if name == "cut" else []), 128.0]
 
 
+@pytest.mark.parametrize("name", LOST)
+def test_a_loaded_agent_tells_which_rows_of_its_history_are_lost(name, tmp_path, capsys):
+    change, told = LOST[name]
+    start_and_kill(tmp_path / "run", 128, "checkpoint_every=96")
+    file = tmp_path / "run/metrics.csv"
+    text = file.read_text()
+    capsys.readouterr()
+    hpamdp.load(tmp_path / "run")
+    assert "metrics.csv" not in capsys.readouterr().err
+    file.unlink() if change(text) is None else file.write_text(change(text))
+    hpamdp.load(tmp_path / "run")
+    lines = [line for line in capsys.readouterr().err.splitlines() if "metrics.csv" in line]
+    # Without the file the history is empty, as for a saved agent that was moved.
+    assert lines == ([] if name == "missing" else [f"{file}: {told}, and history lacks them"])
+
+
 def test_an_evaluation_never_touches_the_record_of_a_run(tmp_path, command, capsys):
     start(tmp_path / "run")
     start_and_kill(tmp_path / "killed", 64)

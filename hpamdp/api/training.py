@@ -36,7 +36,7 @@ from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.env.errors import closed_on_error
 from hpamdp.env.registration import NAMING_SETTINGS
 from hpamdp.messages import as_code, reason_of, say, warn
-from hpamdp.metrics_file import read_rows
+from hpamdp.metrics_file import read_rows, what_is_lost
 from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import Callback
 from hpamdp.run.capacity import memory_errors_explained
@@ -344,7 +344,12 @@ def _loaded(file: Path, words: Sequence[str], objects: Mapping[str, Any]) -> Age
     with _torch_restored(), problems_explained():
         loaded = load_agent(str(file), words, objects)
     with closed_on_error(loaded.env):
-        rows = read_rows(file.parent / METRICS_NAME)
+        metrics = file.parent / METRICS_NAME
+        rows, run = read_rows(metrics), loaded.config.run
+        batch = run.num_envs * run.steps_per_batch
+        lost = what_is_lost(rows, metrics, loaded.progress.get("frames", 0), run.log_every, batch)
+        if lost and os.path.lexists(metrics):  # a saved file may have been moved without it
+            warn(f"{lost}, and history lacks them")
         return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, rows)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +18,16 @@ from hpamdp.analysis import figures, film
 from hpamdp.config.schema import Config
 from hpamdp.files import replacing
 from hpamdp.messages import warn
-from hpamdp.metrics_file import FRAMES, STOPPED, WALL_SECONDS, Metrics, MetricsFile, MetricsInMemory, rows_up_to
+from hpamdp.metrics_file import (
+    FRAMES,
+    STOPPED,
+    WALL_SECONDS,
+    Metrics,
+    MetricsFile,
+    MetricsInMemory,
+    rows_up_to,
+    what_is_lost,
+)
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.closing_table import SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight
@@ -84,20 +92,10 @@ class Recorder:
         else:
             self.metrics = MetricsFile(self.output_dir / METRICS_NAME, source, frames)
         self._resumed_from = folder
-        self._warn_of_lost_rows(source, frames, log_every)
-
-    def _warn_of_lost_rows(self, source: Path, frames: int, log_every: int) -> None:
-        last = max((int(row[FRAMES]) for row in self.metrics.rows()), default=None)
-        # A run that failed in the middle of a batch may have saved its agent, but not the last row.
-        before = max(0, frames - max(1, self.config.run.num_envs * self.config.run.steps_per_batch))
-        if last is None and frames > 0:
-            why = "damaged" if os.path.lexists(source) else "missing"
-            lost = f"is {why}; the rows up to {FRAMES}={frames} are lost"
-        elif last is not None and log_every > 0 and last < before // log_every * log_every:
-            lost = f"is cut; the rows after {FRAMES}={last} are lost"
-        else:
-            return
-        warn(f"{source}: {lost}; the run goes on, and its next rows begin after {FRAMES}={frames}")
+        batch = self.config.run.num_envs * self.config.run.steps_per_batch
+        lost = what_is_lost(self.metrics.rows(), source, frames, log_every, batch)
+        if lost:
+            warn(f"{lost}; the run goes on, and its next rows begin after {FRAMES}={frames}")
 
     def start(self) -> None:
         """Start the logger, if the run has a folder. It takes over the rows of a resumed run.
