@@ -21,8 +21,8 @@ from hpamdp.env.gymnasium.scaling import ObservationScaling
 from hpamdp.env.gymnasium_form import GymnasiumForm, ParameterMap, VectorScaling, checked_mask
 
 
-class OwnForm(GymnasiumForm):
-    """The form of any Gymnasium environment.
+class NativeForm(GymnasiumForm):
+    """The form of any Gymnasium environment: its own spaces.
 
     Args:
         copies: the copies of the environment.
