@@ -490,7 +490,7 @@ def hierarchy() -> list[Claim]:
             "the `actor`, with uniform options at first, and the `meta_critic` both end {actor_below:.2f} "
             "below the ceiling. People score {people:.3f}. Selectors that see the layout gain {gains} over "
             "one boat, with one exception. The `actor` without uniform options scores {actor_gain:.2f} more than the "
-            "best of these, which is unclear.",
+            "best context-free selector, which is unclear.",
             numbers,
             holds=round(actor["below"], 2) == round(meta_critic["below"], 2) and not actor_over_one.is_clear,
         ),
@@ -1052,7 +1052,7 @@ def agents() -> list[Claim]:
         ),
         Claim(
             page("agents"),
-            "seed 0 of the runs before updates were compiled there, which scored {hard_goal} (",
+            "seed 0 of the runs before updates were compiled there. They scored {hard_goal} (",
             numbers,
             holds=is_best("pdqn_hard_goal", hard_goal),
         ),
@@ -1108,7 +1108,7 @@ def hybrid_control() -> list[Claim]:
         ),
         Claim(
             page("hybrid_control"),
-            "at 20,480 steps the return is {early[0]:.1f} with independent heads, {early[1]:.1f} with autoregressive "
+            "At 20,480 steps the return is {early[0]:.1f} with independent heads, {early[1]:.1f} with autoregressive "
             "heads and {early[2]:.1f} with one choice.",
             numbers,
         ),
@@ -2119,7 +2119,7 @@ def speed() -> list[Claim]:
         Claim(
             page("speed"),
             "In float32 an update takes {ratio} times as long as its products, compiled {compiled} times. Compiled "
-            "and in bfloat16, H-PPO and DLPA take less time than their products in float32.",
+            "and in bfloat16, H-PPO and DLPA take clearly less time than their products in float32.",
             numbers,
             # Two such measurements differ by a few tenths, so a ratio close to 1 says nothing.
             holds={row["learner"] for row in updates if row["bfloat16_ratio"] < 0.9} == {"hppo", "dlpa"},

@@ -17,7 +17,7 @@ import hpamdp
 from hpamdp.config.errors import ConfigError
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
-from hpamdp.run.state_checks import example_steps
+from hpamdp.run.state_checks import check_optimizer, example_steps, state_after_a_step
 from hpamdp.run.train import run
 from hpamdp.run.trainer import Trainer
 from hpamdp.run_files import DIVERGED_NAME
@@ -197,6 +197,14 @@ def test_weights_that_are_nan_are_refused(trained, parts, tmp_path):
     checkpoint.save(tmp_path / "nan.zip", parts.agent, states, PROGRESS)
     other = assemble(make_config(PDQN))
     assert "holds NaN" in refusal(tmp_path / "nan.zip", other)
+
+
+def test_the_error_about_an_optimizer_names_both_numbers_of_its_groups():
+    weights = [torch.nn.Parameter(torch.zeros(2)) for _ in range(2)]
+    own = state_after_a_step(torch.optim.Adam([{"params": [weight]} for weight in weights]))
+    saved = state_after_a_step(torch.optim.Adam(weights))
+    with pytest.raises(ValueError, match="low_optimizer has 1 param_groups, but must have 2"):
+        check_optimizer("low_optimizer", saved, own)
 
 
 def test_a_replay_takes_the_place_of_what_is_in_it(trained):

@@ -339,7 +339,7 @@ def test_an_option_is_possible_where_it_has_an_allowed_action_of_each_component(
     assert batch[keys.OPTION_MASK].equal(expected)
     assert specs.components.of_choice(batch[keys.ACTION_MASK], batch[keys.DISCRETE]).all()
     step = GreedyStep(agent, env.gymnasium_form(), None)
-    step.choice = lambda td: td[keys.OPTION_MASK].long().argmin(-1)  # the option that is not possible
+    step.greedy_choice = lambda td: td[keys.OPTION_MASK].long().argmin(-1)  # the option that is not possible
     held, is_due = torch.zeros(64, dtype=torch.long), torch.ones(64, dtype=torch.bool)
     given = {**batch.select(keys.OBSERVATION, keys.ACTION_MASK), "held_option": held, keys.IS_DECISION: is_due}
     assert step(*(given[name] for name in step.names))[2].equal(1 + coin)

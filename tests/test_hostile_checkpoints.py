@@ -66,7 +66,7 @@ class Opener:
             archive.writestr("manifest.json", manifest if isinstance(manifest, str) else json.dumps(manifest))
         try:
             self.trainer.restore(self.file)
-            self.trainer.continue_run(self.collection)
+            self.trainer.restore_collection(self.collection)
         except ConfigError:
             if not {*changed} & {"collection", "recorder"}:  # which are checked after the agent is complete
                 assert not [part for part in self.replays() if len(part)]

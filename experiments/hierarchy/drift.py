@@ -21,7 +21,7 @@ from hpamdp import keys
 from hpamdp.analysis.study import Rows, groups, read_csv, write_tables
 from hpamdp.config.compose import conf_dir, read
 from hpamdp.messages import exit_code
-from hpamdp.run.assemble import acting, assemble, make_env
+from hpamdp.run.assemble import assemble, env_and_policy, make_env
 
 HERE = Path(__file__).resolve().parent
 SELECTORS = ("ucb", "thompson", "epsilon_greedy", "exp3")
@@ -57,7 +57,7 @@ def play(run: str, high: str, memory: str, seed: int) -> Iterator[dict[str, floa
     torch.manual_seed(seed)
     agent = assemble(phases[0]).agent
     for phase, config in enumerate(phases):
-        env, policy = acting(make_env(config, NUM_ENVS, torch.device("cpu"), seed), agent, config)
+        env, policy = env_and_policy(make_env(config, NUM_ENVS, torch.device("cpu"), seed), agent, config)
         options: list[torch.Tensor] = []
         rewards: list[torch.Tensor] = []
         td = env.reset()

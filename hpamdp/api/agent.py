@@ -221,9 +221,9 @@ class Agent:
         """Play episodes greedily and return their means.
 
         Args:
-            env: another problem, as for `hpamdp.train`, with the same sizes. If None, the agent's own. If it has the
-                same name and class as the agent's own problem, settings that `env` does not give are taken from that
-                one, except `id`, `entry_point` and `kwargs`.
+            env: another problem, as for `hpamdp.train`, with the same sizes. If None, the agent's own. If both have
+                the same name and class, the settings that `env` does not give are those of the agent's own problem.
+                This leaves out `id`, `entry_point` and `kwargs`.
             episodes: number of episodes.
             seed: of the episodes. If None, that of the agent's own evaluations, so 100 episodes are their first 100.
             per_episode: whether to return arrays with one entry for each episode instead of means.
@@ -249,8 +249,8 @@ class Agent:
         check_number(
             f"episodes={checked.episodes}", checked.episodes, device, lambda: make_env(config, 1, device, seed=0)
         )
-        numbers_of_evaluation = config.run.eval.model_copy(update={"layouts": checked.episodes, "seed": checked.seed})
-        evaluation = make_evaluation(config.with_run(eval=numbers_of_evaluation, film=False), self._env)
+        eval_config = config.run.eval.model_copy(update={"layouts": checked.episodes, "seed": checked.seed})
+        evaluation = make_evaluation(config.with_run(eval=eval_config, film=False), self._env)
         try:
             played = evaluation.run(self.policy)
             return played if per_episode else evaluation.measure(played)

@@ -68,9 +68,9 @@ class GreedyStep(nn.Module):
         self.option_actions: Tensor | None = None
         if self.specs.has_action_mask and self.specs.option_actions is not None:
             self.option_actions = torch.tensor(self.specs.option_actions, device=self.device)
-        self.choice: Callable[[TensorDictBase], Tensor] | None = None
+        self.greedy_choice: Callable[[TensorDictBase], Tensor] | None = None
         if self.selector is not None:
-            self.choice = self.selector.greedy_choice()
+            self.greedy_choice = self.selector.greedy_choice()
         self.names = list(self.example())
 
     def _tensors(self, parts: object | None) -> dict[str, Tensor]:
@@ -131,17 +131,18 @@ class GreedyStep(nn.Module):
     def _choice(self, td: TensorDictBase, held: tuple[Tensor, ...], is_decision: Tensor) -> tuple[Tensor, ...]:
         """Return the options `[N]`, and their lengths if these are chosen.
 
-        They are new where a decision is due or the held option ends.
+        They are new in rows in which a decision is due or the held option ends.
         """
-        assert self.selector is not None and self.choice is not None
-        # At a decision the held option may be any number, even none of an option.
+        assert self.selector is not None and self.greedy_choice is not None
+        choose, pairs = self.greedy_choice, self.pairs
+        # At a decision the held option may be any number, even one that no option has.
         option = torch.where(is_decision, 0, held[0])
         td.set(keys.IS_DECISION, is_decision.unsqueeze(-1)).set(keys.OPTION, option)
         if self.option_actions is not None and self.option_length is not None:
             is_decision = is_decision | ~td.get(keys.OPTION_MASK).gather(-1, option.unsqueeze(-1)).squeeze(-1)
         if self.selector.decides_ends:
             is_decision = is_decision | self.selector.ends(td)
-        fresh = (self.choice(td),) if self.pairs is None else self.pairs.split(self.choice(self.pairs.with_pairs(td)))
+        fresh = (choose(td),) if pairs is None else pairs.split(choose(pairs.with_pairs(td)))
         return tuple(torch.where(is_decision, new, old) for new, old in zip(fresh, held, strict=True))
 
     def _action(self, td: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -162,13 +163,14 @@ class GreedyStep(nn.Module):
         """Return the numbers of the action space, float64 if they are not the agent's parameters."""
         if not self.parameter_map:
             return parameters
-        of = self.parameter_map
+        columns = self.parameter_map
+        low, high = columns["low"], columns["high"]
         parameters = parameters.double()
         fraction = 0.5 * (parameters.clamp(-1.0, 1.0) + 1.0)
-        width = of["high"] - of["low"]
-        offset = torch.where(of["is_many"], (fraction * (width + 1.0)).floor(), fraction * width)
-        numbers = torch.where(of["is_unit"], of["low"] + offset, parameters + of["shift"])
-        return torch.where(of["is_whole"], numbers.round(), numbers).clamp(of["low"], of["high"])
+        width = high - low
+        offset = torch.where(columns["is_many"], (fraction * (width + 1.0)).floor(), fraction * width)
+        numbers = torch.where(columns["is_unit"], low + offset, parameters + columns["shift"])
+        return torch.where(columns["is_whole"], numbers.round(), numbers).clamp(low, high)
 
 
 def export_onnx(
@@ -309,7 +311,7 @@ def _distances(first: Any, second: Any, p: float, compute_mode: Any) -> Any:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep back what torch says while it exports."""
+    """Suppress the output, logs and warnings of torch and onnxscript inside the block."""
     loggers = [logging.getLogger(name) for name in ("torch", "onnxscript")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:

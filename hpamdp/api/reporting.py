@@ -33,8 +33,8 @@ def report(*folders: str | Path, metric: str = DEFAULT_METRIC, to: str | Path | 
         A statistic is None if there are too few seeds for it.
 
     Raises:
-        ConfigError: an argument is wrong, a folder does not exist or has no runs, no run has the metric, or `to` holds
-            a file of one of these names that no report has written.
+        ConfigError: an argument is wrong, a folder does not exist or has no runs, or no run has the metric. Or `to`
+            holds a file of one of these names that no report has written.
         OSError: a file cannot be written.
 
     Example:

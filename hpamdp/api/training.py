@@ -299,13 +299,13 @@ def load(
     """Load a trained agent.
 
     Args:
-        source: the folder of a run, a file in it or one that `Agent.save` wrote, or the name of an agent that comes
-            with the package, such as `hppo_platform`.
+        source: the folder of a run, a file in it, or a file that `Agent.save` wrote. The name of an agent that comes
+            with the package, such as `hppo_platform`, works as well.
         env: the problem, as for `train`. If None, that of the training. An agent that was trained on an object needs
             it again.
         config_dirs: folders of yaml files of your own, if the training had them.
-        trust: whether the file may name code to run, such as the entry point of an environment, and the folders of
-            yaml files that the training had.
+        trust: whether the file may name code to run, such as the entry point of an environment. If so, the folders of
+            yaml files that the training had are searched, too.
         settings: `device`, `threads`, and settings of the problem and of evaluations, such as `max_steps=50` and
             `**{"eval.seed": 7}`. An agent that was trained with classes from Python needs them again in a new process:
             `low=MyLearner`, and likewise `high`, `encoder` and `exploration`.

@@ -217,8 +217,8 @@ def completed(line: CommandLine, conf: Path) -> CommandLine:
     """Add what the words stand for: a saved run's choices, a folder's experiments, globs and the sweep's folder.
 
     Raises:
-        ConfigError: there is no such run, a glob matches nothing, the experiments of a sweep have different folders, or
-            they have problems of their own beside a given one.
+        ConfigError: there is no such run, or a glob matches nothing. Or the experiments of a sweep have different
+            folders, or choose other problems than the command line.
     """
     line = line.with_words(_saved_words(line))
     line = _with_globs_written_out(_with_experiments_of_a_folder(line, conf), conf)

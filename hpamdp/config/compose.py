@@ -78,8 +78,8 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
 def read_run(cfg: DictConfig) -> tuple[RunConfig, PlaceOf | None, tuple[str, ...]]:
     """Check the values of the run alone; return them, where settings were set, and the folders besides conf/.
 
-    For a config that a saved run completes: what is chosen in the groups is then the saved run's, and settings that
-    need one another may be set by either.
+    This is for a config that a saved run completes. The choices of the groups are then those of the saved run, and
+    settings that need each other may come from either config.
 
     Raises:
         ConfigError: a value is wrong, or nothing is chosen for a group.

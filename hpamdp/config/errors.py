@@ -47,8 +47,8 @@ def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: st
         values: plain values by name.
         prefix: the names' prefix on the command line, such as `low.`.
         what: kind of the values, such as `setting of HPPO`.
-        where: for the end of a complaint. A function gets the value's name on the command line, or None for a check of
-            several values.
+        where: text for the end of a complaint, or a function that returns it. The function gets the value's name on the
+            command line, or None for a check of several values.
 
     Raises:
         ConfigError: some values are wrong; the message lists all of them in one line.
@@ -58,7 +58,7 @@ def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: st
         return where if isinstance(where, str) else where(setting)
 
     try:
-        # As JSON, in which the strict mode takes what a yaml can hold: a list where a tuple is wanted, 1 for 1.0.
+        # As JSON, in which the strict mode takes what a yaml can hold: a list for a tuple, 1 for 1.0.
         checked = model.model_validate_json(json.dumps(values, default=_plain))
     except ValidationError as error:
         raise ConfigError(complaints(error, model, values, what, prefix=prefix, where=place)) from error

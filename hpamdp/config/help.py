@@ -100,7 +100,8 @@ def _explained_choice(group: str, name: str, given: Mapping[str, Any], prefix: s
     except ConfigError:
         return ""
     if chosen.as_model is None:
-        return f"{group}={name} has the settings {', '.join(chosen.settings) or 'of its class alone: none'}\n\n"
+        settings = f"the settings {', '.join(chosen.settings)}" if chosen.settings else "no settings"
+        return f"{group}={name} has {settings}\n\n"
     lines = _explained(type(chosen.as_model), prefix, dict(chosen.settings))
     return "\n".join([f"Settings of {group}={name}", *lines, "", ""])
 

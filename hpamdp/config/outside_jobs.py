@@ -47,9 +47,9 @@ _BUDGET = {"num_envs": 16, "steps_per_batch": 128, "total_frames": 200_000, "eva
 
 @contextmanager
 def composed(words: Sequence[str]) -> Iterator[DictConfig]:
-    """Compose a command line's words, and search their folders inside the block.
+    """Compose the words of a command line. Inside the block, the folders that they add are searched.
 
-    Other threads wait until the block ends. Then Hydra's state from before comes back.
+    Other threads wait until the block ends. Then Hydra's earlier state comes back.
 
     Yields:
         The config with its `hydra` part.
@@ -65,9 +65,9 @@ def composed(words: Sequence[str]) -> Iterator[DictConfig]:
 
 @contextmanager
 def searched(words: Sequence[str]) -> Iterator[None]:
-    """Search the folders that `hydra.searchpath` names among these words, if it does, inside the block.
+    """Inside the block, search the folders of `hydra.searchpath`, if it is among these words.
 
-    This takes no time: nothing is composed. Other threads wait until the block ends.
+    This takes no time, because nothing is composed. Other threads wait until the block ends.
     """
     with _own_hydra():
         own = [each for each in words if each.startswith("hydra.searchpath=")]

@@ -93,8 +93,8 @@ class EnvConfig(Settings):
     """Options as sets of discrete actions: `{NAME: [ACTION, ...], ...}`, or `default` for the problem's suggestion."""
 
 
-class StartConfig(Settings):
-    """Settings of the learners at the start of a run, and of single options' learners."""
+class LowConfig(Settings):
+    """Settings that every learner has: what it starts with, whether it learns, and the learners of single options."""
 
     checkpoint: str | None = None
     """Earlier run from which the learners' networks are loaded: its output folder, or the checkpoint in it."""
@@ -152,7 +152,7 @@ class RunConfig(Settings):
     """Precision of the hidden layers in updates. bfloat16 is faster only with hardware support and large networks."""
     agent: AgentConfig = AgentConfig()
     env: EnvConfig = EnvConfig()
-    low: StartConfig = StartConfig()
+    low: LowConfig = LowConfig()
     total_frames: PositiveInt
     """Steps of training, over all environments. Default: the learner's recommendation."""
     num_envs: PositiveInt
@@ -166,7 +166,7 @@ class RunConfig(Settings):
     checkpoint_every: NonNegativeInt = 0
     """Steps between two checkpoints. If 0, steps trigger no checkpoint."""
     checkpoint_minutes: Annotated[float, Field(ge=0.0)] = 5.0
-    """Minutes between two checkpoints, the most that a killed run loses. If 0, time triggers no checkpoint."""
+    """Minutes between two checkpoints. A killed run loses at most these. If 0, time triggers no checkpoint."""
     checkpoint_replay: bool = True
     """Save the replay buffers in checkpoints. Without them, a resumed learner starts with an empty buffer."""
     checkpoint: str | None = None
@@ -280,7 +280,7 @@ def check_run(given: Mapping[str, Any], names: Mapping[str, str], place_of: Plac
         return RUN_FILE if place is None else f"{RUN_FILE}, {place}"
 
     values = {name: value for name, value in given.items() if name not in GROUPS}
-    own: dict[str, type[Settings]] = {"env": EnvConfig, "low": StartConfig}
+    own: dict[str, type[Settings]] = {"env": EnvConfig, "low": LowConfig}
     for group, entries in own.items():
         values[group] = {name: given[group][name] for name in entries.model_fields if name in given[group]}
     run = validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", where)

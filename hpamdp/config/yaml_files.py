@@ -82,7 +82,7 @@ def check_size(file: Path) -> None:
     except KeyError as error:
         raise ConfigError(f"{file}: *{error.args[0]} refers to nothing, or to a value that contains it") from error
     except (yaml.YAMLError, UnicodeDecodeError):
-        return  # Hydra reports these errors with the line
+        return  # Hydra reads the file next, and reports the error with its line
 
 
 def _counted(stream: Any) -> Iterator[tuple[int, int]]:

@@ -28,7 +28,7 @@ class Demonstrations:
 
     Args:
         transitions: `[M]`, one episode after another, with ascending episode numbers under `TRAJECTORY`. At the root
-            `observation`, the action leaves, `is_decision` and, where the agent chooses options, `option`; under
+            `observation`, the action leaves, `is_decision` and, if the agent chooses options, `option`; under
             `next` `observation`, `reward`, `done`, `terminated`, `truncated` and `is_decision`; shapes and types are
             the environment's. The last row of each episode is `done`, and no other row. Parameters of discrete actions
             that a row does not take may be 0. `action_mask` and `option_mask` are optional, at the root and under
@@ -95,11 +95,12 @@ def _batch(rows: TensorDict, device: torch.device | None) -> TensorDict:
 
 
 def with_option_sums(transitions: TensorDict, gamma: float = 1.0) -> TensorDict:
-    """Return the transitions with what `DecisionTracker` writes where an option lasts a whole episode.
+    """Return the transitions with what `DecisionTracker` writes if an option lasts a whole episode.
 
-    Under `next`, `option_return` `[N, 1]` is the discounted sum of the rewards since the episode began, `option_steps`
-    `[N, 1]` the number of these steps, and `decision_observation` `[N, observation_dim]` the episode's first
-    observation.
+    It is under `next`:
+    - `option_return` `[N, 1]`: the discounted sum of the rewards since the episode began;
+    - `option_steps` `[N, 1]`: the number of these steps;
+    - `decision_observation` `[N, observation_dim]`: the episode's first observation.
 
     Args:
         transitions: `[N]`, one episode after another, with ascending episode numbers under `TRAJECTORY`.

@@ -36,7 +36,7 @@ _MAX_RATIO = 100  # largest size of a data set, in sizes of its file, which may 
 _FEW_BYTES = 1 << 26
 _BYTES_AN_EPISODE = 40_000  # upper bound of the names and descriptions in HDF5
 _SPACES = ("observation_space", "action_space")  # in the metadata
-# What learners read of a state beside its observation. It is kept as an info where the transitions have it.
+# What learners read of a state beside its observation. It is kept as an info if the transitions have it.
 _OF_STATES = (keys.ACTION_MASK, keys.OPTION_MASK, keys.PAIR_MASK, keys.PARAMETER_LOW, keys.PARAMETER_HIGH)
 
 
@@ -88,8 +88,8 @@ def export(
         description: what a user should know of the data.
 
     Raises:
-        DataError: Minari is missing or refuses the data, the data set exists, there is no such environment, an option
-            ends inside an episode, or a mask or bound is not given for all states.
+        DataError: Minari is missing or refuses the data, the data set exists, or there is no such environment. Or an
+            option ends inside an episode, or a mask or bound is not given for all states.
     """
     library = _import_minari()
     from minari.data_collector import EpisodeBuffer

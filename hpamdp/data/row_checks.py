@@ -68,7 +68,7 @@ class _Rule(NamedTuple):
 
     Attributes:
         entry: the entry's name.
-        holds: where the entry keeps the rule, bool, of the entry's shape or `[N]`.
+        holds: whether each number of the entry keeps the rule, bool, of the entry's shape or `[N]`.
         allowed: the allowed values in words; for entries of several numbers, possibly one text each.
     """
 

@@ -86,7 +86,7 @@ class PAMDPEnv(EnvBase):
     discrete_names: tuple[str, ...] = ()  # of the discrete actions, if they have names
     option_actions: tuple[tuple[bool, ...], ...] | None = None  # what `group_actions` has made of the options
     can_change_option: bool = True  # whether an option may end before its episode
-    plans_change_options: bool = False  # whether the planned actions under `oracle` count on that
+    plans_change_options: bool = False  # whether the plans under `oracle` change options within an episode
     parameter_dims: tuple[int, ...]  # number of parameters of each discrete action
     component_sizes: tuple[int, ...] = ()  # number of discrete actions of each component; empty: one component
     integer_parameters: tuple[bool, ...] = ()  # whether each parameter is a whole number; empty: none is
@@ -223,10 +223,7 @@ class PAMDPEnv(EnvBase):
             if mask is None:
                 continue
             is_empty = ~(mask.any(-1) if name == keys.OPTION_MASK else self.components.any_of_each(mask))
-            is_stuck = is_empty & ~tensordict.get(keys.DONE).squeeze(-1)
-            if is_stuck.any():
-                row = int(is_stuck.nonzero()[0])
-                raise ProblemError(f"{self.title}: environment {row} gave an {name} that allows nothing")
+            self._refuse_stuck(is_empty, tensordict, f"an {name} that allows nothing")
             tensordict.set(name, mask | is_empty.unsqueeze(-1))
         pair_mask = tensordict.get(keys.PAIR_MASK, None)
         if pair_mask is not None:
@@ -238,12 +235,15 @@ class PAMDPEnv(EnvBase):
                 )
             mask = tensordict.get(keys.ACTION_MASK, torch.ones_like(pair_mask[..., 0]))
             is_empty = ~components.leaves_any(mask, pair_mask)
-            is_stuck = is_empty & ~tensordict.get(keys.DONE).squeeze(-1)
-            if is_stuck.any():
-                row = int(is_stuck.nonzero()[0])
-                raise ProblemError(f"{self.title}: environment {row} gave a {keys.PAIR_MASK} that allows no action")
+            self._refuse_stuck(is_empty, tensordict, f"a {keys.PAIR_MASK} that allows no action")
             tensordict.set(keys.PAIR_MASK, pair_mask | is_empty[..., None, None])
         return tensordict
+
+    def _refuse_stuck(self, is_empty: Tensor, tensordict: TensorDictBase, what: str) -> None:
+        """Refuse empty masks, bool `[N]`, of episodes that go on; `what` names the mask."""
+        is_stuck = is_empty & ~tensordict.get(keys.DONE).squeeze(-1)
+        if is_stuck.any():
+            raise ProblemError(f"{self.title}: environment {int(is_stuck.nonzero()[0])} gave {what}")
 
     @property
     def components(self) -> Components:
@@ -291,7 +291,9 @@ class PAMDPEnv(EnvBase):
         return super().set_seed(None if seed is None else checked_number("seed", seed), static_seed)
 
     def seed_evaluation(self, seed: int) -> None:
-        """Seed the episodes and the noise of an evaluation, which should differ from those of training with any seed.
+        """Seed the episodes and the noise of an evaluation.
+
+        They should differ from those of training, whatever its seed.
 
         The default is `set_seed` with another seed. With random numbers from `counter_rng`, draw them from the streams
         EVALUATION and EVALUATION_NOISE until the next `set_seed`.
@@ -308,8 +310,8 @@ class PAMDPEnv(EnvBase):
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
         """Return the initial parameters that learners of this problem conventionally start with; None if none are.
 
-        They are linear in the observation that the learner sees: weights `[num_parameters, observation_dim]` and a bias
-        `[num_parameters]`, in units in which the parameters' bounds are [-1, 1].
+        They are linear in the observation that the learner sees. Returned are weights `[num_parameters,
+        observation_dim]` and a bias `[num_parameters]`, in units in which the parameters' bounds are [-1, 1].
         """
         return None
 

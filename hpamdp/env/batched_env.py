@@ -1,7 +1,7 @@
 """A base for problems that are stepped as one batch of independent environments.
 
 The state is a tuple of columns, with one row for each environment. Random numbers are counter-based: each depends only
-on the seed, the number of the environment, the episode and the place of the draw in it (see `counter_rng`).
+on the seed, the number of the environment, the episode, and the place of the draw in it. See `counter_rng`.
 
 A subclass hands over three pure functions: how an episode starts, what an action does, and what is observed. The rest
 is the same for all of them: specs, checks of actions, masked steps and resets, the time limit, seeds and checkpoints.
@@ -32,7 +32,7 @@ from hpamdp.env.kernels import OUTCOME_ROW
 from hpamdp.env.state_columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.settings import SettingError, Settings
 
-# If a tensordict has only these keys and the problem's extra ones, its next root has no others either.
+# If a tensordict has only these keys and the problem's extra ones, there is nothing else to carry into its next root.
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
@@ -395,7 +395,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         self._put(restored(own, self._state, type(self).__name__))
 
     def seed_evaluation(self, seed: int) -> None:
-        """Begin with the episodes of an evaluation, which no training meets, whatever its seed."""
+        """Begin with the episodes of an evaluation, which training never has, whatever its seed."""
         self.set_seed(seed)
         self._streams = (counter_rng.EVALUATION, counter_rng.EVALUATION_NOISE)
         self._begin()
@@ -581,8 +581,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         if self.rows is None:  # the parameters require gradients
             return super()._step_and_maybe_reset(tensordict)
         results = self._act(leaves, None, restarts=True)
-        # The same in one pass: TorchRL's own steps between ours take longer than the kernel. It keeps the action, too;
-        # in a tensordict of its own, since an update of the root changes it in place.
+        # The same in one pass, because TorchRL's work between step and reset takes longer than the kernel. As in
+        # TorchRL, the root keeps the action. It is in a tensordict of its own, since updates of the root change it.
         action = TensorDict._new_unsafe(
             dict(tensordict.get(keys.ACTION).items()), batch_size=self.batch_size, device=self.device
         )

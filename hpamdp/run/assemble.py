@@ -36,7 +36,7 @@ from hpamdp.specs import PAMDPSpecs
 FILMED_EPISODES = 3
 # Largest number of steps of an episode in it, few enough to film in a second or two.
 FILMED_STEPS = 40
-# Number of a learner's updates in a run from which compilation saves time, although it takes some 40 s.
+# If a learner makes at least so many updates in a run, compilation saves more time than the 40 s or so that it takes.
 _UPDATES_THAT_PAY = 10_000
 
 
@@ -102,7 +102,7 @@ def _assemble(config: Config, env: PAMDPEnv, device: torch.device) -> AssembledR
     if is_new and run.low.checkpoint is not None:
         checkpoint.load_learners(checkpoint.find(run.low.checkpoint, "low.checkpoint"), agent, device)
     capacity.check_length(config, agent, with_learners(config, agent))
-    tracked, policy = acting(env, agent, config)
+    tracked, policy = env_and_policy(env, agent, config)
     return AssembledRun(tracked, policy, agent, make_evaluation(config, env), data, device)
 
 
@@ -298,9 +298,9 @@ def _compile_if_it_pays(config: Config, agent: HierarchicalAgent) -> None:
     run = config.run
     if _options_end_inside(config, agent) or run.low.freeze:
         return
-    share = 1.0 / len(agent.learners)
+    fraction = 1.0 / len(agent.learners)
     for _, learner in with_learners(config, agent):
-        num = run.num_frames if run.mode == "offline" else learner.num_updates(int(share * run.total_frames))
+        num = run.num_frames if run.mode == "offline" else learner.num_updates(int(fraction * run.total_frames))
         if num >= _UPDATES_THAT_PAY:
             with suppress(ValueError):  # the learner, or this machine, cannot compile
                 learner.compile_updates()
@@ -395,7 +395,9 @@ def make_evaluation(
         return Evaluation(_with_decisions(test_env, config), config.run.eval.seed, num_filmed, filmed_steps)
 
 
-def acting(env: PAMDPEnv, agent: HierarchicalAgent, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:
+def env_and_policy(
+    env: PAMDPEnv, agent: HierarchicalAgent, config: Config
+) -> tuple[TransformedEnv, TensorDictModuleBase]:
     """Return the environment to train in, with tracked decisions, and the policy that acts there."""
     gamma = _gamma(agent)
     if config.run.low.freeze:

@@ -157,7 +157,7 @@ class Saved:
             ConfigError: the file lacks statistics that the environment scales by, or they are of another environment.
         """
         with _explained(f"{self.file}: does not fit env"):
-            columns = _strings(self.states.get("collection", {}).get("env", {}))
+            columns = _by_name(self.states.get("collection", {}).get("env", {}))
             missing = sorted(env.statistics().keys() - columns.keys())
             if missing:
                 raise ValueError(f"it lacks the running statistics {', '.join(missing)}, by which env scales")
@@ -261,7 +261,7 @@ def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) ->
     """
     prefix = "learners."
     with _Opened(file) as opened, _explained(f"low.checkpoint={file}: of another class or size than low"):
-        saved = _strings(opened.part("agent"))
+        saved = _by_name(opened.part("agent"))
         own = {name.removeprefix(prefix): value for name, value in saved.items() if name.startswith(prefix)}
         saved_num, num = len({name.partition(".")[0] for name in own}), len(agent.learners)
         if own and saved_num != num:
@@ -316,10 +316,10 @@ def load(
             others = {name: opened.other(name, stateful[name], device) for name in stateful.keys() - buffers.keys()}
             for name in opened.names & {*buffers}:
                 replays[name] = opened.replay(name, buffers[name], agent, steps)
-        with _explained(f"{file}: damaged, or not a checkpoint of this program"):
+        with _explained(_damage_of(file)):
             for name in (*STATES, *_NEWER_STATES) if with_training else STATES[:1]:
                 if name in opened.names:
-                    states[name] = _strings(opened.filled(name, device))
+                    states[name] = _by_name(opened.filled(name, device))
             generators = Generators.of(opened.filled("rng")) if with_training else None
         progress = opened.progress
     agent.load_state_dict({**agent.state_dict(), **networks})
@@ -351,7 +351,16 @@ def _explained(what: str) -> Iterator[None]:
         raise ConfigError(f"{what} ({reason:.160})") from error
 
 
-def _strings(values: Any) -> dict[str, Any]:
+def _damage_of(file: Path) -> str:
+    return f"{file}: damaged, or not a checkpoint of this program"
+
+
+def _by_name(values: Any) -> dict[str, Any]:
+    """Return a mapping whose keys are texts.
+
+    Raises:
+        ValueError: it is something else.
+    """
     return checked_as(dict[str, Any], values)
 
 
@@ -394,12 +403,12 @@ class _Opened:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._damaged = f"{path}: damaged, or not a checkpoint of this program"
+        self._damage = _damage_of(path)
         self._parts: dict[str, TensorArchive] = {}
         self._stack = ExitStack()
 
     def __enter__(self) -> _Opened:
-        with _explained(self._damaged):
+        with _explained(self._damage):
             file = self._stack.enter_context(self.path.open("rb"))
             num_bytes = os.fstat(file.fileno()).st_size
             try:
@@ -438,7 +447,7 @@ class _Opened:
     def part(self, name: str) -> Any:
         """Return the contents of a member, with a `SavedTensor` in place of each tensor."""
         if name not in self._parts:
-            with _explained(self._damaged):
+            with _explained(self._damage):
                 member, checksum = self._members[name]
                 info = self._infos[member]
                 if _checksum(MemberFile(self._file, info)) != checksum:
@@ -510,7 +519,7 @@ class _Opened:
             return self.optimizer(name, part, device)
         saved = self.part(name)
         check_like(name, saved, part.state_dict())
-        return _strings(self._parts[name].filled(saved, device))
+        return _by_name(self._parts[name].filled(saved, device))
 
     def optimizer(self, name: str, optimizer: torch.optim.Optimizer, device: torch.device) -> dict[str, Any]:
         """Return a state dict that an optimizer can load.

@@ -87,16 +87,16 @@ def check(config: Config) -> None:
     """
     facts = facts_of(config)
     acting = config if facts is None else with_acting_learners(config, facts)
-    _check((rule(acting) for rule in RULES), config.run)
+    _refuse_first((rule(acting) for rule in RULES), config.run)
     if facts is not None:
         check_problem(config, facts)
 
 
 def check_saved_run(run: RunConfig) -> None:
-    """Check how a run names the saved run that it starts from, before that one completes its config.
+    """Check the settings that name a saved run, before the saved run completes the config.
 
     Raises:
-        ConfigError: it does not go with the mode, or the name is empty.
+        ConfigError: a name is missing or empty, or does not go with the mode.
     """
     for name, value in (("resume", run.resume), ("checkpoint", run.checkpoint), ("low.checkpoint", run.low.checkpoint)):
         if value == "":
@@ -136,7 +136,7 @@ def _words_by_setting(words: Sequence[str]) -> dict[str, str]:
 def check_effects_on(problem: ProblemFacts, config: Config, words: Sequence[str]) -> None:
     """Refuse words of a command line that would change nothing on a problem.
 
-    Yaml files may set the same, since they serve several selectors and learners.
+    Yaml files may set the same values, because they serve several selectors and learners.
 
     Args:
         problem: the facts about the problem.
@@ -166,7 +166,7 @@ def check_effects_on(problem: ProblemFacts, config: Config, words: Sequence[str]
 def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
     """Return a warning for each word whose setting counts only with another value of another setting.
 
-    It is no mistake if one command line serves several values, such as those of a sweep.
+    A warning is enough: in a sweep, one command line serves several values of the other setting.
 
     Args:
         config: config of the run.
@@ -201,11 +201,14 @@ def check_problem(config: Config, facts: ProblemFacts) -> None:
         ConfigError: a rule is broken; the message names the settings to change.
     """
     acting = with_acting_learners(config, facts)
-    _check((rule(acting, facts) for rule in PROBLEM_RULES), config.run)
+    _refuse_first((rule(acting, facts) for rule in PROBLEM_RULES), config.run)
 
 
 def with_acting_learners(config: Config, facts: ProblemFacts) -> Config:
-    """Return the config without `low` if `low.per_option` names a learner for every option, so that it never acts."""
+    """Return the config without a `low` that never acts, because `low.per_option` names a learner for every option.
+
+    The learner of the first option takes its place.
+    """
     if not config.low_of:
         return config
     names = _option_names(config, facts)
@@ -242,7 +245,8 @@ def with_selector(config: Config, problem: ProblemFacts, words: Sequence[str] = 
     return replace(config, high=Component("high", "none", None, {}))
 
 
-def _check(complaints: Iterable[str | None], run: RunConfig) -> None:
+def _refuse_first(complaints: Iterable[str | None], run: RunConfig) -> None:
+    """Raise an error with the first complaint, if there is one."""
     complaint = next((complaint for complaint in complaints if complaint is not None), None)
     if complaint is None:
         return
@@ -258,9 +262,9 @@ def _levels(config: Config) -> list[Component]:
 
 
 def _memory(component: Component) -> str | None:
-    """Return what a level remembers by, `stack` or `gru`; None if nothing."""
+    """Return the kind of a level's memory, `stack` or `gru`; None if the level has no memory."""
     memory = component.settings.get("memory")
-    return str(memory) if memory in ("stack", "gru") else None  # a bandit's memory is another thing
+    return str(memory) if memory in ("stack", "gru") else None  # the setting of a bandit says which returns count
 
 
 def _remembers_directions(low: Component) -> bool:
@@ -372,7 +376,7 @@ def what_counts_trips_has_trips(config: Config) -> str | None:
     return None
 
 
-def sessions_are_played_here(config: Config) -> str | None:
+def data_and_frozen_learners_have_single_trips(config: Config) -> str | None:
     """Refuse what takes an episode for a single trip: data sets, and learners that play whole episodes."""
     if not has_trips(config) or config.run.mode == "eval":
         return None
@@ -403,11 +407,11 @@ def _discounting(config: Config) -> list[Component]:
 def forgotten_trips(config: Config, problem: ProblemFacts, *, reveals_directions: bool) -> str | None:
     """Return a warning if the learners of a session remember nothing of earlier trips; None if one does.
 
-    It may be meant so. But then no learner uses on later trips what earlier ones have shown.
+    This may be intended. But then no learner uses in later trips what earlier ones have shown.
 
     Args:
-        config: of the run.
-        problem: what the run must know of the problem.
+        config: config of the run.
+        problem: the facts about its problem.
         reveals_directions: whether the problem reveals where its actions point, which some learners remember by
             themselves.
     """
@@ -427,9 +431,9 @@ def forgotten_trips(config: Config, problem: ProblemFacts, *, reveals_directions
 
 
 def check_directions(config: Config) -> None:
-    """Refuse learners of single options of which only some remember the directions that the problem reveals.
+    """Refuse learners of single options if only some of them remember the directions that the problem reveals.
 
-    That memory would be reset, and see an action, only while an option of these learners is held.
+    Such a memory sees actions, and is reset, only while an option of the learners with a memory is held.
 
     Raises:
         ConfigError: some remember them, and others do not.
@@ -472,7 +476,7 @@ def learners_take_the_exploration(config: Config) -> str | None:
 
 
 def offline_runs_have_data(config: Config) -> str | None:
-    """Require a data set and learners to train with `mode=offline`."""
+    """Require a data set with `mode=offline`."""
     if config.run.mode == "offline" and config.data.cls is None:
         return "mode=offline: data=none leaves nothing to learn from; choose a data set"
     return None
@@ -544,7 +548,7 @@ def selectors_remember_several_decisions(config: Config) -> str | None:
     )
 
 
-def memories_have_values(config: Config) -> str | None:
+def learners_have_the_same_memory(config: Config) -> str | None:
     """Refuse learners that value each other's states by different memories."""
     run = config.run.agent
     settings = "memory", "memory_size", "stack_steps"
@@ -563,7 +567,7 @@ def memories_have_values(config: Config) -> str | None:
 
 
 def collector_fits_the_run(config: Config) -> str | None:
-    """Require of a collector its package, a mode with steps, an equal share for each worker, and the policy needed."""
+    """Require the collector's package, a mode with steps, equal parts for workers, and a current policy if needed."""
     collector, run = config.collector, config.run
     if run.mode == "eval":  # which collects nothing
         return None
@@ -576,7 +580,7 @@ def collector_fits_the_run(config: Config) -> str | None:
     if run.num_envs % num_workers:
         return (
             f"collector.num_workers={num_workers}: must divide num_envs={run.num_envs}, of which each worker "
-            "has an equal share"
+            "gets an equal part"
         )
     if collector.settings.get("ahead", False):
         for low in config.learners:
@@ -635,7 +639,7 @@ def problem_provides_needs(config: Config) -> str | None:
 
 
 def lack_of(need: str, config: Config) -> str | None:
-    """Return why the problem's constructor does not take an argument that levels may need; None if it does."""
+    """Return why the problem does not provide what a level needs, such as `oracle`; None if it does."""
     assert config.env.cls is not None
     facts = facts_of(config)
     is_known = facts is None or getattr(facts, f"has_{need}", True)
@@ -722,7 +726,7 @@ def plans_fit_the_termination(config: Config, problem: ProblemFacts) -> str | No
 
 
 def options_end_where_they_may(config: Config, problem: ProblemFacts) -> str | None:
-    """Refuse options that end inside their episodes if the problem, the selector or the run has no use for it."""
+    """Refuse options that end inside their episodes if the problem, the selector or the run does not support that."""
     termination, high = config.run.agent.termination, config.high
     if termination == "episode":
         return None
@@ -797,7 +801,7 @@ RULES: tuple[Rule, ...] = (
     values_end_where_there_are_trips,
     selector_values_have_a_selector,
     what_counts_trips_has_trips,
-    sessions_are_played_here,
+    data_and_frozen_learners_have_single_trips,
     explorations_have_steps,
     learners_take_the_exploration,
     offline_runs_have_data,
@@ -805,7 +809,7 @@ RULES: tuple[Rule, ...] = (
     n_step_fits_a_batch,
     memories_have_own_steps,
     selectors_remember_several_decisions,
-    memories_have_values,
+    learners_have_the_same_memory,
     compared_learners_have_values,
     collector_fits_the_run,
     workers_get_what_python_passed,

@@ -78,7 +78,7 @@ def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
     # Convert through yaml, like the saved config.
     here = flat_settings(yaml.safe_load(wanted.to_yaml()))
     there = flat_settings(upgraded(saved) if saved else {})
-    names = sorted(differing_settings(here, there), key=_depth)
+    names = sorted(differing_settings(here, there), key=_rank)
     if not names:
         return ""
     more = f" and {len(names) - 1} more" if names[1:] else ""
@@ -86,6 +86,6 @@ def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
     return f"{names[0].removeprefix(_CHOSEN)}={values[0]} for {values[1]}{more}"
 
 
-def _depth(name: str) -> int:
+def _rank(name: str) -> int:
     """Return a number that puts settings before those that may follow from them: choices, values of the run, others."""
     return 0 if name.startswith(_CHOSEN) else 1 + ("." in name)

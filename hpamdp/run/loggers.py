@@ -68,7 +68,7 @@ class Logger(Protocol):
         """Finish; nothing is logged afterwards."""
 
 
-class Guarded:
+class LenientLogger:
     """Pass every call on to a logger. After its first error, warn once and drop all later calls.
 
     Args:
@@ -277,7 +277,7 @@ class WandbLogger:
         project = self.options.project
         self._teardown = wandb.teardown
         run_id = None if earlier is None else _wandb_id(earlier.folder)
-        output_dir.mkdir(parents=True, exist_ok=True)  # wandb goes to a temporary folder where this one is missing
+        output_dir.mkdir(parents=True, exist_ok=True)  # if it is missing, wandb goes to a temporary folder
         _check_wandb_mode()
         try:
             wandb_settings = wandb.Settings(

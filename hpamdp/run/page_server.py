@@ -28,7 +28,7 @@ from hpamdp.json_lines import MAX_LINE_BYTES, LineError, left_out, lines_of, rea
 from hpamdp.messages import one_line, reason_of, warn
 
 DATA_NAME = "data.js"
-EPISODES = "/episodes"
+_EPISODES_PATH = "/episodes"
 _MAX_FILE = 1 << 28  # bytes
 _PATIENCE = 10.0  # s that a connection may keep silent
 _LOCK_PATIENCE = 4.0  # s that an episode waits for the file's lock
@@ -208,7 +208,7 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
     allow_reuse_address = True
-    request_queue_size = 128  # with the usual 5, browsers that come at the same time wait for seconds
+    request_queue_size = 128  # with the default of 5, browsers that connect at the same time wait for seconds
 
     def __init__(
         self, address: tuple[str, int], page: PlayPage, data: Mapping[str, Any], episodes: EpisodeFile
@@ -287,8 +287,8 @@ class _Handler(BaseHTTPRequestHandler):
         length = self.headers.get("Content-Length", "")
         if not self._is_from_here():
             return HTTPStatus.FORBIDDEN, "only the page itself may send episodes"
-        if self.path != EPISODES:
-            return HTTPStatus.NOT_FOUND, f"nothing takes a POST but {EPISODES}"
+        if self.path != _EPISODES_PATH:
+            return HTTPStatus.NOT_FOUND, f"nothing takes a POST but {_EPISODES_PATH}"
         if self.headers.get("Transfer-Encoding") is not None or not (length.isascii() and length.isdecimal()):
             return HTTPStatus.LENGTH_REQUIRED, "a Content-Length is required"
         if len(length) > 10 or int(length) > MAX_LINE_BYTES:
@@ -321,7 +321,7 @@ class _Handler(BaseHTTPRequestHandler):
         name = self.path.partition("?")[0]
         content = self.server.contents.get(name)
         if content is None:
-            is_post = name == EPISODES
+            is_post = name == _EPISODES_PATH
             status = HTTPStatus.METHOD_NOT_ALLOWED if is_post else HTTPStatus.NOT_FOUND
             self._answer(status, "episodes are sent here, not read" if is_post else "there is no such page")
             return

@@ -31,7 +31,7 @@ from hpamdp.metrics_file import (
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.closing_table import SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight
-from hpamdp.run.loggers import EarlierRun, Guarded, Logger
+from hpamdp.run.loggers import EarlierRun, LenientLogger, Logger
 from hpamdp.run.state_checks import SavedPart, check_columns, check_values, checked
 from hpamdp.run.summary import summarise
 from hpamdp.run_files import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
@@ -109,7 +109,7 @@ class Recorder:
         if self._resumed_from is not None:
             earlier = EarlierRun(self._resumed_from, self.metrics.rows())
         chosen, values = self.config.logger, self.config.to_dict()
-        self._logger = Guarded(
+        self._logger = LenientLogger(
             chosen.name, lambda: chosen.build(output_dir=self.output_dir, config=values, earlier=earlier)
         )
 

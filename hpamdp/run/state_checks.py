@@ -22,9 +22,9 @@ from hpamdp.messages import first_line
 from hpamdp.policies.shared.sized_by_data import SizedByData
 from hpamdp.run.tensor_archive import SavedTensor
 
-# Largest whole number up to which a float holds all exactly.
-_MOST = 2**53
-Count = Annotated[int, Field(ge=0, le=_MOST)]
+# A float holds all whole numbers up to this one exactly.
+_LARGEST_COUNT = 2**53
+Count = Annotated[int, Field(ge=0, le=_LARGEST_COUNT)]
 Amount = Annotated[FiniteFloat, Field(ge=0.0)]
 # Settings that training changes in an optimizer, and settings that choose between equivalent implementations.
 _SCHEDULED, _IMPLEMENTATION = ("lr", "weight_decay"), ("foreach", "fused", "capturable", "differentiable")
@@ -123,7 +123,7 @@ def _form(tensor: Tensor | SavedTensor) -> str:
 
 
 def check_values(where: str, value: Tensor, own: Tensor) -> None:
-    """Refuse NaN and inf, unless `own` has them, and integers below -1 and all integers in `own`.
+    """Refuse NaN and inf, unless `own` has them, integers below both -1 and all of `own`, and integers above 2^53.
 
     Raises:
         ValueError: a number is invalid.
@@ -135,9 +135,9 @@ def check_values(where: str, value: Tensor, own: Tensor) -> None:
             raise ValueError(f"{where} holds inf")
     elif value.dtype != torch.bool and value.numel():
         least = min(-1, int(own.min())) if own.numel() else -1
-        if not least <= int(value.min()) <= int(value.max()) <= _MOST:
+        if not least <= int(value.min()) <= int(value.max()) <= _LARGEST_COUNT:
             found = f"{int(value.min())} to {int(value.max())}"
-            raise ValueError(f"{where} holds {found}, but must be from {least} to {_MOST}")
+            raise ValueError(f"{where} holds {found}, but must be from {least} to {_LARGEST_COUNT}")
 
 
 def check_columns(where: str, saved: Any, own: Mapping[str, Any], *, any_rows: bool = False) -> None:
@@ -234,7 +234,9 @@ def check_optimizer(where: str, saved: Any, own: Mapping[str, Any]) -> None:
     """
     state = checked(_OptimizerState, saved)
     if len(state.param_groups) != len(own["param_groups"]):
-        raise ValueError(f"{where} has {len(state.param_groups)} param_groups, but must have 1")
+        raise ValueError(
+            f"{where} has {len(state.param_groups)} param_groups, but must have {len(own['param_groups'])}"
+        )
     for group, own_group in zip(state.param_groups, own["param_groups"], strict=True):
         for name, value in own_group.items():
             if name in group or name not in _MAY_LACK:

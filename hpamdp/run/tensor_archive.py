@@ -22,7 +22,7 @@ from typing import IO, Any
 import torch
 from torch import Tensor
 
-# Number of tensors that may use the bytes of a storage. A state dict names each shared weight several times.
+# How many numbers the tensors of a storage may have together, in sizes of the storage. Shared weights occur repeatedly.
 _MAX_USES = 16
 _DTYPES = {
     "DoubleStorage": torch.float64,
@@ -38,7 +38,8 @@ _DTYPES = {
 }
 _ORDERED_DICT, _REBUILD = object(), object()
 _MAX_DIMS = 16
-# Instructions that any archive may have, and one more for so many bytes. A tensor takes some 25, and 350 bytes or more.
+# Any archive may have the first number of instructions, and one more for each 8 bytes. A tensor takes some 25, and at
+# least 350 bytes.
 _FEW_INSTRUCTIONS, _BYTES_AN_INSTRUCTION = 200_000, 8
 _BLOCK = 2**20
 

@@ -54,7 +54,9 @@ class Trainer:
         wall_s, cpu_s: wall time and CPU time of training so far.
         last_score: score of the last evaluation; None before the first one.
         stop_reason: why a callback has ended training; empty if none has, or if it gave no reason.
+        is_evaluation_due: whether an evaluation began and did not end. A resumed run repeats it.
         resumed_from: folder of the run that is continued, if any.
+        unit: what a frame is, as messages show it after a number, such as ` steps`.
         shows_progress: whether a bar on stderr shows the progress.
     """
 
@@ -80,7 +82,7 @@ class Trainer:
         self.wall_s = 0.0
         self.cpu_s = 0.0
         self.last_score: float | None = None
-        self.is_evaluation_due = False  # whether one was begun and not ended; a resumed run repeats it
+        self.is_evaluation_due = False
         self._saved: checkpoint.Saved | None = None  # what a resumed run continues from
         self.unit = " steps"
         if config.run.mode == "offline":
@@ -104,7 +106,7 @@ class Trainer:
             saved.set_statistics(env)
             return
         self.resumed_from = source.parent
-        # The evaluation that is due writes the row of these frames again.
+        # An evaluation that is due writes the row of these frames again.
         frames = self.frames - 1 if self.is_evaluation_due else self.frames
         both = self.config.run.log_every, progress["config"].get("log_every")
         log_every = max(both) if all(type(every) is int and every > 0 for every in both) else 0
@@ -133,7 +135,7 @@ class Trainer:
     def start(self, *, is_own: bool) -> None:
         """Write the config and start the logger, if the run has a folder.
 
-        These are the first writes, so everything must be checked and built.
+        These are the first writes. So everything must have been checked and built before.
 
         Args:
             is_own: whether the folder holds the continued run. Otherwise an earlier run there is deleted.
@@ -192,7 +194,7 @@ class Trainer:
                 config=self.config, parts=self.parts, frames=self.frames
             )
             try:
-                self.continue_run(collection)
+                self.restore_collection(collection)
                 self._loop(collection, request)
             except KeyboardInterrupt:  # the second signal, perhaps in the middle of an update
                 self.recorder.forget_evaluation()
@@ -224,7 +226,7 @@ class Trainer:
             finally:
                 collection.close()
 
-    def continue_run(self, collection: Collection) -> None:
+    def restore_collection(self, collection: Collection) -> None:
         """Restore the saved state of the collection and the random generators, if there is one."""
         if self._saved is None:
             return
@@ -260,7 +262,7 @@ class Trainer:
             learner.while_compiling = partial(_said_by, bar, "compiling the updates")
         with bar:
             is_new = self.last_score is None and self.frames == 0
-            # First of all, since a resumed run does not add the data again.
+            # Before anything can be saved, because a resumed run does not add the data again.
             if is_new and self._saved is None and self.parts.data is not None:
                 self.parts.agent.add_demonstrations(self.parts.data.batch, self.parts.data.decisions)
             self._call(lambda callback: callback.on_start(self))
@@ -270,7 +272,7 @@ class Trainer:
                 try:
                     num = self._learn(collection)
                 finally:
-                    _tell_notices(collection, bar)
+                    _warn_of_notices(collection, bar)
                 last = self.frames
                 self.frames += num
                 take_time()
@@ -441,7 +443,7 @@ def _said_by(bar: tqdm, text: str) -> Iterator[None]:
         bar.set_description_str(None)
 
 
-def _tell_notices(collection: Collection, bar: tqdm) -> None:
+def _warn_of_notices(collection: Collection, bar: tqdm) -> None:
     for notice in collection.notices():
         bar.clear()
         warn(notice)

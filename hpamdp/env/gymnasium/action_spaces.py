@@ -14,12 +14,12 @@ In a `Tuple` or a `Dict`, the parameters are one of these:
 - a `Tuple` of K parts, one for each discrete action: `Tuple(Discrete(K), Tuple(Box, ...))` is the field's convention. A
   discrete action without parameters has a box of shape `(0,)`. In a `Tuple` K boxes may also follow the `Discrete`
   directly.
-- a `Dict` of K parts, which belong to the discrete actions in the order of the space (Gymnasium sorts the names of a
-  plain dict) or, if all names end in different numbers, in the order of these numbers. K boxes may also be entries
-  beside the `Discrete`: `Dict(mode=Discrete(2), a=Box, b=Box)`, where `a` belongs to the first discrete action.
+- a `Dict` of K parts, which belong to the discrete actions in the order of the space. Gymnasium sorts the names of a
+  plain dict. If all names end in different numbers, the order is that of these numbers. K boxes may also be entries
+  beside the `Discrete`: in `Dict(mode=Discrete(2), a=Box, b=Box)`, `a` belongs to the first discrete action.
 - one `Box` for all discrete actions. With `parameter_dims` its numbers are divided among them, side by side, and the
-  environment always gets the whole box. Without, each discrete action has the whole box: the parameters hold a copy of
-  it for each discrete action, and the environment gets the copy of the chosen one.
+  environment always gets the whole box. Without, each discrete action has the whole box. The parameters then hold a
+  copy of it for each discrete action, and the environment gets the copy of the chosen one.
 
 A part may be any tree of spaces. Its discrete entries become integer parameters: see
 `hpamdp.env.gymnasium.parameter_trees`, which also says how numbers that float32 cannot hold are mapped.

@@ -19,7 +19,7 @@ class ContractCheck(gymnasium.Wrapper):
     assertions of several lines.
 
     Raises:
-        ProblemError: from `reset` and `step`, where these break their contract or end the program.
+        ProblemError: from `reset` and `step`, if these break their contract or end the program.
     """
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

@@ -127,8 +127,8 @@ class Copies:
         has_pictures: whether `pictures` returns some: the `render_mode` is `rgb_array`.
         pictures_per_second: `render_fps` of the environment's metadata, or 4.
         option_names: what the environment calls its options, unchecked.
-        results: what they have last returned.
-        pixels: the pictures that they have last returned, uint8 `[N, num_pixels]`.
+        results: what the copies have last returned.
+        pixels: the pictures that the copies have last returned, uint8 `[N, num_pixels]`.
 
     Raises:
         SettingError: the spaces are not accepted, or differ between copies.
@@ -298,7 +298,7 @@ class Copies:
 
         Args:
             rows: index of the copies' rows.
-            settled: rows whose numbers need no more check.
+            settled: rows whose numbers need no further check.
         """
         observations = self.results.observation
         vectors = observations[rows]

@@ -23,7 +23,7 @@ from hpamdp.env.base import PAMDPEnv, ProblemError, checked_option_names
 from hpamdp.env.errors import closed_on_error
 from hpamdp.env.gymnasium.action_spaces import ActionForm
 from hpamdp.env.gymnasium.copies import Copies, Reading
-from hpamdp.env.gymnasium.form import OwnForm, joined
+from hpamdp.env.gymnasium.form import NativeForm, joined
 from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.masks import MaskSource, as_leaf
@@ -273,9 +273,9 @@ class GymnasiumEnv(PAMDPEnv):
                 "and copies may play the same episodes; call super().reset(seed=seed) and draw from self.np_random"
             )
 
-    def gymnasium_form(self) -> OwnForm:
+    def gymnasium_form(self) -> NativeForm:
         """Return the form of the environment itself."""
-        return OwnForm(self._copies, self.scaling, self._reading())
+        return NativeForm(self._copies, self.scaling, self._reading())
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `success` bool `[M]` if any info so far had it."""

@@ -23,8 +23,8 @@ from hpamdp.env.gymnasium_form import GymnasiumForm, ParameterMap, VectorScaling
 _Shape: TypeAlias = tuple[int, ...]
 
 
-class OwnForm(GymnasiumForm):
-    """The form of any Gymnasium environment.
+class NativeForm(GymnasiumForm):
+    """The form of any Gymnasium environment: its own spaces.
 
     Args:
         copies: the copies of the environment.

@@ -20,9 +20,9 @@ _ADVICE = "an environment with Gymnasium's interface must inherit from gymnasium
 class FourValueEnv(gymnasium.Env):
     """Wrap an environment whose `reset` returns only the observation and whose `step` returns four values.
 
-    Where `done` is true, the step is truncated if the info has a true `TimeLimit.truncated`, else terminated. A seed is
-    passed to the environment's `seed` method or, if it has none, to `reset` if that takes one; else it has no effect.
-    Only the attributes of the spaces are read, so the `gym` package is not needed.
+    If `done` is true, the step is truncated if the info has a true `TimeLimit.truncated`, else terminated. A seed is
+    passed to the environment's `seed` method. Without this method it is passed to `reset`, if that takes a seed. Only
+    the attributes of the spaces are read, so the `gym` package is not needed.
 
     `shimmy` (`GymV21CompatibilityV0`, `GymV26CompatibilityV0`) does the same with `gym` installed, and also wraps the
     environments of `gym` 0.26, whose `step` returns five values.

@@ -70,9 +70,8 @@ class ParameterBounds:
             info: as the environment gives it.
 
         Raises:
-            ProblemError: the bounds are missing, have another structure than the space, are not finite or whole, lie
-                outside the bounds of the space, or the lower one is above the upper one. Or they are in a place that is
-                not read.
+            ProblemError: the bounds are missing, have another structure than the space, or are in a place that is not
+                read. Or a bound is not finite or whole, lies outside the bounds of the space, or crosses the other one.
         """
         source = observation if self.in_observation else info
         given = {name: source.get(name) for name in self.names}

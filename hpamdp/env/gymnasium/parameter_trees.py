@@ -26,11 +26,13 @@ from gymnasium import spaces
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers
 from hpamdp.env.gymnasium_form import ParameterMap
 
-# The largest distance between neighbouring float32 that counts as fine enough, as a fraction of the width of a Box.
+# Largest distance between neighbouring float32 numbers that is fine enough, as a fraction of the width of a Box.
 _RESOLUTION = 1e-6
 _MOST_EXACT = float(1 << 24)  # float32 holds all integers up to this one
 _MOST_WHOLE = 1 << 53  # float64 holds all integers up to this one
 _WHOLE = np.dtype(np.int64)  # stands for all integer dtypes
+_TOO_LARGE = "parameters must have finite bounds, at most 9e15 for whole numbers"
+_CROSSED = "a parameter's lower bound must be less than its upper bound"
 
 # Makes M values of a space from parameters `[M, size]` within their bounds, which are given in each dtype of the space.
 _Build = Callable[[Mapping[np.dtype, np.ndarray]], list[Any]]
@@ -222,13 +224,13 @@ def bounds_of(space: spaces.Space) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     elif isinstance(space, spaces.Box) and space.dtype.kind in "iub":
         low, high = space.low.ravel(), space.high.ravel()
         if not space.is_bounded():
-            raise NotAcceptedError("parameters must have finite bounds, at most 9e15 for whole numbers")
+            raise NotAcceptedError(_TOO_LARGE)
         if not (low < high).all():
-            raise NotAcceptedError("a parameter's lower bound must be less than its upper bound")
+            raise NotAcceptedError(_CROSSED)
     else:
         raise NotAcceptedError(f"has a {type(space).__name__}")
     if any(abs(int(bound)) > _MOST_WHOLE for bound in (*low, *high)):
-        raise NotAcceptedError("parameters must have finite bounds, at most 9e15 for whole numbers")
+        raise NotAcceptedError(_TOO_LARGE)
     return low.astype(np.float64), high.astype(np.float64), low < high
 
 
@@ -237,7 +239,7 @@ def _float_bounds(box: spaces.Box) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if not np.isfinite(box.high.astype(np.float32) - box.low.astype(np.float32)).all():
             raise NotAcceptedError("parameters must have finite bounds, at most 3.4e38 apart")
     if not (box.low < box.high).all():
-        raise NotAcceptedError("a parameter's lower bound must be less than its upper bound")
+        raise NotAcceptedError(_CROSSED)
     return box.low.ravel().astype(np.float64), box.high.ravel().astype(np.float64), np.ones(box.low.size, bool)
 
 

@@ -206,8 +206,8 @@ class ProcessCopies:
         return [value for of_worker in values for value in of_worker]
 
     def _keep(self, tables: Sequence[np.ndarray]) -> None:
-        owns: tuple[np.ndarray, ...] = (self.table, self.pixels)
-        for own, table in zip(owns, tables, strict=False):
+        own_tables: tuple[np.ndarray, ...] = (self.table, self.pixels)
+        for own, table in zip(own_tables, tables, strict=False):  # without pictures, workers send no pixels
             own[:] = table.reshape(-1, table.shape[-1])[: len(own)]
 
     @contextmanager

@@ -24,7 +24,7 @@ from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.messages import one_line
 from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.run.assemble import acting, make_agent, make_env
+from hpamdp.run.assemble import env_and_policy, make_agent, make_env
 from hpamdp.search_path import unprotect_children
 from hpamdp.specs import PAMDPSpecs
 
@@ -186,7 +186,7 @@ class EnvShard:
         if self.low is not None:
             unpack_state(agent.router, self.low)
         env = make_env(self.config, self.num_envs, _CPU, self.env_seed, self.first_env)
-        return acting(env, agent, self.config)[0]
+        return env_and_policy(env, agent, self.config)[0]
 
     def make_policy(self) -> PolicyCopy:
         """Build the policy; `receive` loads its weights later."""
