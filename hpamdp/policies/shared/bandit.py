@@ -114,6 +114,19 @@ class RewardStatistics(nn.Module):
         self.squares.mul_(fade).index_add_(0, options, weights * rewards.square())
 
 
+def check_statistics(state: Mapping[str, Any], specs: PAMDPSpecs) -> None:
+    """Refuse negative counts and decisions for options that do not exist in the state dict of a bandit.
+
+    Raises:
+        ValueError: the state is invalid.
+    """
+    for name, value in state.items():
+        if name.endswith(("counts", "squares")) and (value < 0.0).any():
+            raise ValueError(f"{name} holds {float(value.min())}, but must be at least 0")
+        if name.endswith("recent_options"):
+            check_choices({"option": value[value >= 0]}, specs)
+
+
 class Bandit(Selector):
     """A selector that chooses by the rewards of the options alone, without an observation.
 
@@ -210,11 +223,7 @@ class Bandit(Selector):
         Raises:
             ValueError: the state is invalid.
         """
-        for name, value in state.items():
-            if name.endswith(("counts", "squares")) and (value < 0.0).any():
-                raise ValueError(f"{name} holds {float(value.min())}, but must be at least 0")
-            if name.endswith("recent_options"):
-                check_choices({"option": value[value >= 0]}, self.specs)
+        check_statistics(state, self.specs)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add the rewards of finished decisions, oldest first; return the mean reward of each option."""
