@@ -174,8 +174,9 @@ def test_untried_options_come_first_and_in_random_order(name):
     torch.manual_seed(0)
     bandit = make(name)
     assert 20 <= bandit.select(due(torch.rand(100, 2))).sum().item() <= 80
-    bandit.learn(ended(due(torch.rand(9, 2), option=torch.zeros(9, dtype=torch.long)), torch.full((9,), 5.0)))
-    assert bandit.select(due(torch.rand(100, 2))).all()
+    for reward in (5.0, 1e30):
+        bandit.learn(ended(due(torch.rand(9, 2), option=torch.zeros(9, dtype=torch.long)), torch.full((9,), reward)))
+        assert bandit.select(due(torch.rand(100, 2))).all()
 
 
 @every_bandit

@@ -24,6 +24,11 @@ from hpamdp.settings import OnlyWith, Settings
 from hpamdp.specs import PAMDPSpecs
 
 
+def above_all(noise: Tensor) -> Tensor:
+    """Return numbers above all rewards, float64, in the order of some noise of size 1: values of untried options."""
+    return (1e9 + noise) * 2.0**900
+
+
 class BanditOptions(Settings):
     """Settings of a bandit's memory. Forgetting suits rewards that change while the low level learns."""
 

@@ -17,7 +17,7 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit import BanditOptions, RewardStatistics, check_statistics
+from hpamdp.policies.shared.bandit import BanditOptions, RewardStatistics, above_all, check_statistics
 from hpamdp.settings import Indices, SettingError
 from hpamdp.specs import PAMDPSpecs
 
@@ -185,7 +185,7 @@ class LinearBandit(Selector):
         observation = td.get(keys.OBSERVATION)
         mean, deviation = self.predict(observation.flatten(0, -2))
         # Untried options come first, in random order.
-        first = 1e9 + torch.rand_like(mean)
+        first = above_all(torch.rand_like(mean))
         score = torch.where(self.statistics.is_untried, first, self.sample(mean, deviation))
         score = score.reshape(*observation.shape[:-1], -1)
         return masked_values(score, td.get(keys.OPTION_MASK, None)).argmax(-1)
