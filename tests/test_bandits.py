@@ -93,7 +93,7 @@ def test_greedy_choices_are_the_best_option_everywhere(name, memory):
 
 
 @every_bandit
-@pytest.mark.parametrize("rewards", [[], [5.0], [1.0, 2.0, 3.0, 2.0, 2.0]])
+@pytest.mark.parametrize("rewards", [[], [5.0], [1.0, 2.0, 3.0, 2.0, 2.0], [1e30] * 5])
 def test_untried_options_get_tried(name, rewards):
     torch.manual_seed(0)
     bandit = make(name, **({"epsilon_scale": 1e-3, "epsilon_final": 0.0} if name == "epsilon_greedy" else {}))

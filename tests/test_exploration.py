@@ -20,6 +20,7 @@ from toy_steps import SPECS, one_step_rows, states
 import hpamdp
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Bonus
@@ -412,8 +413,8 @@ def test_exploring_plans_seek_what_is_new_and_greedy_plans_do_not(kind):
         change_scale = torch.ones(2)
         is_predicted = torch.ones(2)
 
-        def split(self, state):
-            return None, state
+        def scaled_change(self, state, discrete, next_state):
+            return next_state - state
 
         def forward(self, state, discrete, own, *_):
             from hpamdp.policies.shared.planning import Prediction
@@ -442,6 +443,38 @@ def test_exploring_plans_seek_what_is_new_and_greedy_plans_do_not(kind):
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         greedy = policy(TensorDict(td, [64]))[keys.DISCRETE]
     assert (greedy == action).float().mean() < (0.1 if kind is PETS else 0.9)
+
+
+@pytest.mark.parametrize("kind", [DLPA, PETS])
+def test_a_bonus_in_plans_has_the_scale_of_the_rewards(kind):
+    weights = []
+    for reward_scale in (1.0, 0.01):
+        torch.manual_seed(0)
+        learner = kind(PAMDPSpecs(2, (), (1, 1), (-1.0, -1.0), (1.0, 1.0)), reward_scale=reward_scale)
+        learner.take_bonus(Bonus(3.0, lambda state: torch.ones_like(state[..., 0])))
+        weights.append(learner.policy.bonus.weight)
+    assert weights == [3.0, pytest.approx(0.03)]
+
+
+def test_the_members_disagreement_is_the_same_wherever_an_action_points():
+    torch.manual_seed(0)
+    learner = PETS(PAMDPSpecs.from_env(BoatDockEnv(1, controller="congruent")))
+    model, frame = learner.model, learner.model.frame
+    assert frame.turns
+    model.change_scale.copy_(torch.rand(len(model.change_scale)) + 0.01)
+    model.is_predicted[frame.y] = 0.0  # as where steps hardly lead aside
+    learner.take_bonus(Bonus(1.0, None))
+    turned = torch.rand(1, 50, len(model.change_scale)).expand(model.num_members, -1, -1)
+    bonuses = []
+    for action in range(frame.directions.shape[1]):
+        discrete = torch.full(turned.shape[:-1], action)
+        state = frame.turn_back(turned, frame.direction(turned, discrete))
+        ahead = model(state, discrete, torch.ones(*discrete.shape, 1))
+        change = model.scaled_change(state, discrete, ahead.next_state)
+        bonuses.append((change.std(0, correction=0) * model.is_predicted).sum(-1))
+    assert bonuses[0].min() > 0.0
+    for other in bonuses[1:]:
+        torch.testing.assert_close(other, bonuses[0], rtol=1e-3, atol=1e-5)
 
 
 def test_settings_of_networks_have_no_effect_on_an_ensemble_and_a_line_says_so(capfd):

@@ -12,9 +12,13 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import read_saved
 from hpamdp.policies.low_level.hppo import HPPO
 from hpamdp.policies.low_level.paddpg import PADDPG
+from hpamdp.run.compatibility import check
 
 WORDS = [*SMALL, "env=platform", "+env.grouping=default", *QUICK_CRITIC, "low=hppo", *SHORT["hppo"]]
 PER_OPTION = "+low.per_option={jump: {name: paddpg, hidden_dims: [16], warmup_steps: 10, batch_size: 16}}"
+
+
+STEPS = ["agent.termination=steps", "agent.option_length=2"]
 
 
 def test_learners_of_two_classes_train_side_by_side(tmp_path):
@@ -81,9 +85,49 @@ def test_the_learner_of_an_option_gets_the_recipe_of_the_problem_and_the_length_
             ["+low.per_option={jump: random}", "agent.sharing=shared"],
             "low.per_option: agent.sharing=shared has one learner for all; use agent.sharing=per_option",
         ),
+        (
+            ["+low.per_option={jump: random}", *STEPS],
+            "low.per_option: with agent.termination=steps low=hppo asks the next option's learner for a value, but "
+            "low=random has none; use another learner for this option",
+        ),
+        (
+            ["+low.per_option={jump: dlpa}", *STEPS],
+            "low.per_option: with agent.termination=steps low=hppo asks the next option's learner for a value, but "
+            "low=dlpa has none without low.end_values=true",
+        ),
+        (
+            ["+low.per_option={jump: pets}", *STEPS],
+            "low.per_option: with agent.termination=steps low=hppo asks the next option's learner for a value, but "
+            "low=pets has none without low.end_values=true",
+        ),
+        (
+            ["+low.per_option={jump: {name: paddpg, reward_scale: 0.01}}", *STEPS],
+            "low.per_option: with agent.termination=steps learners value each other's states, but reward_scale is 1 of "
+            "low=hppo and 0.01 of low=paddpg; set the same for all",
+        ),
+        (
+            ["+low.per_option={jump: {name: paddpg, reward_scale: 0.01}}", "high=value"],
+            "low.per_option: high=value compares the learners' values, but reward_scale is 1 of low=hppo and 0.01 of "
+            "low=paddpg; set the same for all",
+        ),
     ],
 )
 def test_a_learner_that_an_option_cannot_have_is_told_in_one_line(words, complaint, tmp_path):
+    of_critic = [word for word in WORDS if word in QUICK_CRITIC] if "high=value" in words else []
     with pytest.raises(ConfigError) as error:
-        make(make_config([*WORDS, *words]), tmp_path)
+        make(make_config([*(word for word in WORDS if word not in of_critic), *words]), tmp_path)
     assert str(error.value).startswith(complaint) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["+low.per_option={jump: random}"],
+        ["+low.per_option={jump: {name: paddpg, reward_scale: 0.01}}"],
+        ["low=random", "+low.per_option={jump: dlpa}", *STEPS],
+        ["+low.per_option={jump: {name: dlpa, end_values: true}}", *STEPS],
+        ["low=pdqn", "low.reward_scale=0.1", "+low.per_option={jump: {name: paddpg, reward_scale: 0.1}}", *STEPS],
+    ],
+)
+def test_learners_that_ask_each_other_nothing_or_have_values_in_one_unit_go_together(words):
+    check(make_config([*SMALL, "env=platform", "+env.grouping=default", *QUICK_CRITIC, "low=hppo", *words]))

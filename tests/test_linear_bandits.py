@@ -174,8 +174,26 @@ def test_untried_options_come_first_and_in_random_order(name):
     torch.manual_seed(0)
     bandit = make(name)
     assert 20 <= bandit.select(due(torch.rand(100, 2))).sum().item() <= 80
-    bandit.learn(ended(due(torch.rand(9, 2), option=torch.zeros(9, dtype=torch.long)), torch.full((9,), 5.0)))
-    assert bandit.select(due(torch.rand(100, 2))).all()
+    for reward in (5.0, 1e30):
+        bandit.learn(ended(due(torch.rand(9, 2), option=torch.zeros(9, dtype=torch.long)), torch.full((9,), reward)))
+        assert bandit.select(due(torch.rand(100, 2))).all()
+
+
+@every_bandit
+@pytest.mark.parametrize("features", ["polynomial", "random_fourier"])
+def test_a_greedy_choice_takes_no_untried_option_however_low_the_known_rewards_are(name, features):
+    torch.manual_seed(0)
+    bandit = make(name, features=features)
+    probe = torch.rand(100, 2) * 10.0 - 5.0
+    bandit.learn(ended(due(torch.rand(9, 2), option=torch.ones(9, dtype=torch.long)), torch.full((9,), -5.0)))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert bandit.select(due(probe)).all()
+        only_untried = torch.tensor([True, False]).expand(100, 2)
+        assert not bandit.select(due(probe, option_mask=only_untried)).any()
+    exported = bandit.exported()
+    if exported is not None:  # what a page computes of it
+        numbers = bandit.features(probe) @ torch.tensor(exported["coefficients"], dtype=torch.float64).T
+        assert numbers.argmax(-1).all()
 
 
 @every_bandit
@@ -223,6 +241,24 @@ def test_a_copy_made_from_a_state_dict_continues_identically(name, memory):
     expected, _ = play(source, by_sign, 60, 2)
     torch.manual_seed(1)
     assert torch.equal(play(target, by_sign, 60, 2)[0], expected)
+
+
+@every_bandit
+@pytest.mark.parametrize(
+    ("entry", "number", "complaint"),
+    [
+        ("statistics.recent_options", 2, "option holds 2 to 2, but must be 0 to 1"),
+        ("statistics.counts", -1.0, r"statistics\.counts holds -1\.0, but must be at least 0"),
+        ("gram", -1.0, r"gram holds -1\.0 on its diagonal, but must be at least 0 there"),
+    ],
+)
+def test_a_state_that_no_decisions_lead_to_is_refused(name, entry, number, complaint):
+    bandit = make(name, memory="sliding_window", window=5)
+    teach(bandit, 7, at_once=1)
+    state = bandit.state_dict()
+    bandit.check_state(state)
+    with pytest.raises(ValueError, match=complaint):
+        bandit.check_state({**state, entry: torch.full_like(state[entry], number)})
 
 
 def test_the_context_is_the_observation_at_which_the_option_was_chosen():

@@ -8,6 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.pets.policy import MEMBER
 from hpamdp.policies.shared.end_values import EndValueOptions, EndValues
@@ -674,6 +675,15 @@ def test_a_plan_leads_where_its_last_state_is_worth_most_although_no_step_earns_
         with set_exploration_type(exploration):
             found = learner.policy.plan(torch.zeros(20, SPECS.observation_dim))
         torch.testing.assert_close(found.value, torch.zeros(20), atol=0.02, rtol=0.0)
+
+
+@pytest.mark.parametrize("kind", [PETS, DLPA])
+def test_end_values_discount_steps_as_plans_do_however_long_the_steps_take(kind):
+    learner = kind(SPECS, end_values=True, gamma=0.9)
+    batch = random_batch(20, terminated=torch.arange(20) < 5)
+    batch.set(("next", keys.DURATION), torch.full((20, 1, 1), 7.0))
+    discount = learner.transitions(batch)["discount"].flatten()
+    assert discount.tolist() == [0.0] * 5 + [pytest.approx(0.9)] * 15
 
 
 def test_the_copies_of_a_policy_get_the_weights_of_its_end_values():

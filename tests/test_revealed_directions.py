@@ -300,6 +300,7 @@ QUICK = {"low.updates_per_step": 0.5, "low.num_iterations": 1, "low.horizon": 1,
 @pytest.mark.parametrize("second", [{"name": "pets", "augment": False}, {"name": "hppo", "memory": "none"}])
 def test_learners_of_which_only_some_remember_directions_are_refused(second):
     more = {**QUIET, **QUICK, "env.boats": 2, "high": "value", "low.per_option": {"boat_2": second}}
+    more["low.end_values"] = second["name"] == "hppo"  # which asks for the values of the other boat
     with pytest.raises(
         ConfigError, match=r"low\.per_option: env=boatdock_unseen reveals directions, which all learners"
     ):

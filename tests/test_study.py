@@ -105,6 +105,7 @@ def test_a_run_gives_its_evaluations_and_its_played_episodes(tmp_path):
 
 def test_rows_come_back_from_csv_with_numbers_as_numbers_and_gaps_as_gaps(tmp_path):
     rows = [{"low": "hppo", "seed": 0, "reached": 1e6}, {"low": "a, b", "seed": 1, "reached": ""}]
+    rows.append({"low": "64_64", "seed": 2, "reached": 0.5})
     write_tables(tmp_path, {"a": rows})
     assert read_csv(tmp_path / "a.csv") == rows
 

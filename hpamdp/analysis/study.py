@@ -300,6 +300,8 @@ def read_csv(path: Path) -> Rows:
 
 
 def _number(text: str) -> float | str:
+    if "_" in text:  # Python would read 64_64 as 6464
+        return text
     for kind in (int, float):
         try:
             return kind(text)

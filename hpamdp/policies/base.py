@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -53,6 +53,10 @@ class Bonus:
 
     weight: float
     of: Callable[[Tensor], Tensor] | None
+
+    def scaled(self, factor: float) -> Bonus:
+        """Return the same bonus with another weight, for a learner that scales its rewards by this factor."""
+        return replace(self, weight=factor * self.weight)
 
 
 def have_stepped(parts: Mapping[str, Any]) -> bool:

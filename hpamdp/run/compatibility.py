@@ -776,6 +776,51 @@ def per_option_names_options(config: Config, problem: ProblemFacts) -> str | Non
     return None
 
 
+def learners_value_each_other(config: Config, problem: ProblemFacts) -> str | None:
+    """Require values of all learners, in one unit, if the next option may be that of another learner.
+
+    DLPA and PETS without `end_values` have no values to bootstrap from, and ask for none.
+    """
+    run, is_episode = config.run, config.run.agent.termination == "episode"
+    if run.mode != "train" or (is_episode and not has_trips(config)):
+        return None
+    asking = [low for low in config.learners if _bootstraps(low)]
+    lacking = [low for low in config.learners if not _bootstraps(low)]
+    ends = f"the trips of {config.env}" if is_episode else f"agent.termination={run.agent.termination}"
+    if asking and lacking:
+        without = " without low.end_values=true" if "end_values" in lacking[0].settings else ""
+        return (
+            f"low.per_option: with {ends} {asking[0]} asks the next option's learner for a value, but {lacking[0]} has "
+            f"none{without}; use another learner for this option"
+        )
+    if is_episode and run.agent.values_end == "trip":
+        return None
+    return _in_one_unit(asking, f"with {ends} learners value each other's states")
+
+
+def compared_values_have_one_unit(config: Config, problem: ProblemFacts) -> str | None:
+    """Require the same `reward_scale` of all learners if the selector compares their values."""
+    if not getattr(config.high.cls, "asks_learners", False):
+        return None
+    return _in_one_unit(config.learners, f"{config.high} compares the learners' values")
+
+
+def _bootstraps(low: Component) -> bool:
+    return _overrides(low.cls, "value", base="hpamdp.policies.base") and low.settings.get("end_values", True) is True
+
+
+def _in_one_unit(learners: Sequence[Component], why: str) -> str | None:
+    """Return a complaint if the rewards of learners, and so their values, are scaled differently, else None."""
+    scales = {each.settings.get("reward_scale", 1.0): each for each in learners}
+    if len(scales) < 2:
+        return None
+    (scale, low), (other_scale, other), *_ = scales.items()
+    return (
+        f"low.per_option: {why}, but reward_scale is {scale:g} of {low} and {other_scale:g} of {other}; set the same "
+        "for all"
+    )
+
+
 def _overrides(cls: type | None, method: str, base: str) -> bool:
     """Return whether a class overrides a method of the module `base`."""
     owner = next((each for each in getattr(cls, "__mro__", ()) if method in vars(each)), None)
@@ -822,6 +867,8 @@ PROBLEM_RULES: tuple[ProblemRule, ...] = (
     options_end_where_they_may,
     selector_chooses_lengths,
     per_option_names_options,
+    learners_value_each_other,
+    compared_values_have_one_unit,
     workers_fit_the_problem,
     levels_take_pictures,
     data_sets_have_no_pictures,

@@ -15,6 +15,7 @@ from pydantic import PositiveFloat
 from torch import Tensor
 
 from hpamdp.policies.masks import masked_values
+from hpamdp.policies.shared.bandit import above_all
 from hpamdp.policies.shared.session_bandit import SessionBandit, SessionBanditOptions, SessionRewards
 
 
@@ -38,10 +39,10 @@ class Thompson(SessionBandit):
         deviation = self.options.exploration * statistics.deviation / statistics.counts.clamp(min=1e-9).sqrt()
         sampled_means = statistics.means + deviation * noise
         # Untried options come first, in random order.
-        return masked_values(torch.where(statistics.is_untried, 1e9 + noise, sampled_means), allowed).argmax(-1)
+        return masked_values(torch.where(statistics.is_untried, above_all(noise), sampled_means), allowed).argmax(-1)
 
     def session_values(self, rewards: SessionRewards) -> Tensor:
         """Return samples of the mean rewards in each session; untried options come first, in random order."""
         noise = torch.randn_like(rewards.means)
         deviation = self.options.exploration * rewards.deviation / rewards.counts.clamp(min=1.0).sqrt()
-        return torch.where(rewards.is_untried, 1e9 + noise, rewards.means + deviation * noise)
+        return torch.where(rewards.is_untried, above_all(noise), rewards.means + deviation * noise)

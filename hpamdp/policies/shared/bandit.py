@@ -24,6 +24,11 @@ from hpamdp.settings import OnlyWith, Settings
 from hpamdp.specs import PAMDPSpecs
 
 
+def above_all(noise: Tensor) -> Tensor:
+    """Return numbers above all rewards, float64, in the order of some noise of size 1: values of untried options."""
+    return (1e9 + noise) * 2.0**900
+
+
 class BanditOptions(Settings):
     """Settings of a bandit's memory. Forgetting suits rewards that change while the low level learns."""
 
@@ -112,6 +117,19 @@ class RewardStatistics(nn.Module):
         self.counts.mul_(fade).index_add_(0, options, weights)
         self.sums.mul_(fade).index_add_(0, options, weights * rewards)
         self.squares.mul_(fade).index_add_(0, options, weights * rewards.square())
+
+
+def check_statistics(state: Mapping[str, Any], specs: PAMDPSpecs) -> None:
+    """Refuse negative counts and decisions for options that do not exist in the state dict of a bandit.
+
+    Raises:
+        ValueError: the state is invalid.
+    """
+    for name, value in state.items():
+        if name.endswith(("counts", "squares")) and (value < 0.0).any():
+            raise ValueError(f"{name} holds {float(value.min())}, but must be at least 0")
+        if name.endswith("recent_options"):
+            check_choices({"option": value[value >= 0]}, specs)
 
 
 class Bandit(Selector):
@@ -210,11 +228,7 @@ class Bandit(Selector):
         Raises:
             ValueError: the state is invalid.
         """
-        for name, value in state.items():
-            if name.endswith(("counts", "squares")) and (value < 0.0).any():
-                raise ValueError(f"{name} holds {float(value.min())}, but must be at least 0")
-            if name.endswith("recent_options"):
-                check_choices({"option": value[value >= 0]}, self.specs)
+        check_statistics(state, self.specs)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add the rewards of finished decisions, oldest first; return the mean reward of each option."""

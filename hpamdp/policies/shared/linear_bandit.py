@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -17,7 +17,7 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit import BanditOptions, RewardStatistics
+from hpamdp.policies.shared.bandit import BanditOptions, RewardStatistics, above_all, check_statistics
 from hpamdp.settings import Indices, SettingError
 from hpamdp.specs import PAMDPSpecs
 
@@ -150,13 +150,23 @@ class LinearBandit(Selector):
         """Return the polynomials, see `hpamdp.policies.shared.exported_policy`; None for other features."""
         if not self.features.is_polynomial:
             return None
-        theta, _, _ = self._regression()
         return {
             "kind": "polynomial",
             "inputs": self.features.inputs.tolist(),
             "factors": self.features.factors.tolist(),
-            "coefficients": theta.tolist(),
+            "coefficients": self._greedy_coefficients().tolist(),
         }
+
+    def _greedy_coefficients(self) -> Tensor:
+        """Return the coefficients of the greedy choice, `[num_options, num_features]`.
+
+        Those of an untried option predict the lowest finite number everywhere. Its regression predicts 0, which is more
+        than negative rewards.
+        """
+        theta, _, _ = self._regression()
+        lowest = torch.zeros_like(theta)
+        lowest[:, -1] = torch.finfo(theta.dtype).min  # of the constant feature, which comes last
+        return torch.where(self.statistics.is_untried.unsqueeze(-1), lowest, theta)
 
     @abstractmethod
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
@@ -175,17 +185,17 @@ class LinearBandit(Selector):
         observation = td.get(keys.OBSERVATION)
         mean, deviation = self.predict(observation.flatten(0, -2))
         # Untried options come first, in random order.
-        first = 1e9 + torch.rand_like(mean)
+        first = above_all(torch.rand_like(mean))
         score = torch.where(self.statistics.is_untried, first, self.sample(mean, deviation))
         score = score.reshape(*observation.shape[:-1], -1)
         return masked_values(score, td.get(keys.OPTION_MASK, None)).argmax(-1)
 
     def greedy_choice(self) -> Callable[[TensorDictBase], Tensor]:
-        """Return the choice of the allowed option with the highest expected reward."""
-        theta, _, _ = self._regression()
+        """Return the choice of the allowed option with the highest expected reward, an untried one only if all are."""
+        coefficients = self._greedy_coefficients()
 
         def choice(td: TensorDictBase) -> Tensor:
-            mean = self.features(td.get(keys.OBSERVATION)) @ theta.T
+            mean = self.features(td.get(keys.OBSERVATION)) @ coefficients.T
             return masked_values(mean, td.get(keys.OPTION_MASK, None)).argmax(-1)
 
         return choice
@@ -193,6 +203,17 @@ class LinearBandit(Selector):
     def has_updated(self) -> bool:
         """Return whether any reward is known."""
         return bool(self.statistics.counts.any())
+
+    def check_state(self, state: Mapping[str, Any]) -> None:
+        """Refuse negative counts and sums of squares, and decisions for options that do not exist.
+
+        Raises:
+            ValueError: the state is invalid.
+        """
+        check_statistics(state, self.specs)
+        squares = state["gram"].diagonal(dim1=-2, dim2=-1)
+        if (squares < 0.0).any():
+            raise ValueError(f"gram holds {float(squares.min())} on its diagonal, but must be at least 0 there")
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add finished decisions, oldest first; return the mean reward of each option among them."""

@@ -307,9 +307,10 @@ class ReplayLearner(Learner):
         """Return what is stored of a batch `[*B, T]`, with scaled rewards.
 
         `unit` holds the parameters, mapped from their bounds to [-1, 1]. `discount` is 0 if the step terminated;
-        otherwise it is the discount from `step_discounts`.
+        otherwise it is the discount from `step_discounts`, or `gamma` if the learner does not count durations.
         """
         goes_on = (~batch["next", keys.TERMINATED]).float()
+        discount = step_discounts(batch, self.options.gamma) if self.counts_durations else self.options.gamma
         rows = TensorDict(
             {
                 "state": batch[keys.OBSERVATION],
@@ -317,7 +318,7 @@ class ReplayLearner(Learner):
                 "unit": self.specs.to_unit(batch[keys.PARAMETERS], batch),
                 "reward": self.options.reward_scale * batch["next", keys.REWARD].squeeze(-1),
                 "next_state": batch["next", keys.OBSERVATION],
-                "discount": (step_discounts(batch, self.options.gamma) * goes_on).squeeze(-1),
+                "discount": (discount * goes_on).squeeze(-1),
             },
             batch_size=batch.shape,
         )

@@ -170,9 +170,9 @@ class DLPA(ReplayLearner):
             self.optimizers["end_values"] = self.end_values.optimizer()
 
     def take_bonus(self, bonus: Bonus) -> None:
-        """Add a bonus to the rewards of exploring plans."""
+        """Add a bonus to the rewards of exploring plans, scaled as these are."""
         super().take_bonus(bonus)
-        self.policy.bonus = bonus
+        self.policy.bonus = bonus.scaled(self.options.reward_scale)
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the model from windows `[batch_size, horizon]`, and the values from the first step of each."""

@@ -141,7 +141,7 @@ class PETS(ReplayLearner):
             self.optimizers["end_values"] = self.end_values.optimizer()
 
     def take_bonus(self, bonus: Bonus) -> None:
-        """Add a bonus to the rewards of exploring plans, which all members then make together.
+        """Add a bonus, scaled as rewards are, to the rewards of exploring plans, which all members then make together.
 
         Raises:
             SettingError: the bonus is of whole observations, but the model predicts less, or turned ones.
@@ -152,7 +152,7 @@ class PETS(ReplayLearner):
                 "low.augment=false, or exploration=novelty exploration.in_plans=disagreement"
             )
         super().take_bonus(bonus)
-        self.policy.bonus = bonus
+        self.policy.bonus = bonus.scaled(self.options.reward_scale)
         self.policy.samples_posterior = False
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:

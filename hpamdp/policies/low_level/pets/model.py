@@ -177,13 +177,9 @@ class PETSModel(nn.Module):
             precision: of the networks.
         """
         context, state = self.split(state)
-        direction = certainty = None
+        direction, certainty = self._pointing(context, state, discrete)
         if self.frame.is_revealed:
-            assert context is not None
-            direction, certainty = self.frame.revealed_direction(context, discrete)
             context = None
-        elif self.joint is None:
-            direction = self.frame.direction(state, discrete)
         turned = state if direction is None else self.frame.turn(state, direction)
         kind = discrete if direction is None else self.frame.kind[discrete]
         x = self._inputs(turned, self.action_inputs(kind, own, certainty))
@@ -203,6 +199,28 @@ class PETSModel(nn.Module):
             terminating * scale[1] + mean[1],
             logit,
         )
+
+    def scaled_change(self, state: Tensor, discrete: Tensor, next_state: Tensor) -> Tensor:
+        """Return predicted changes in the canonical frame and in units of the usual change, `[E, B, observation_dim]`.
+
+        Args:
+            state: `[E, B, context_dim + observation_dim]`, the context first.
+            discrete: discrete actions, or numbered choices, `[E, B]`.
+            next_state: what `forward` predicts, `[E, B, observation_dim]`.
+        """
+        context, before = self.split(state.float())
+        after = next_state.float()
+        direction, _ = self._pointing(context, before, discrete)
+        if direction is not None:
+            before, after = self.frame.turn(before, direction), self.frame.turn(after, direction)
+        return (after - before) / self.change_scale
+
+    def _pointing(self, context: Tensor | None, state: Tensor, discrete: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """Return where actions point, `[E, B, 2]`, and how certain a revealed direction is, `[E, B, 1]`; else None."""
+        if self.frame.is_revealed:
+            assert context is not None
+            return self.frame.revealed_direction(context, discrete)
+        return (self.frame.direction(state, discrete) if self.joint is None else None), None
 
     def split(self, state: Tensor) -> tuple[Tensor | None, Tensor]:
         """Return contexts and observations, of `[*B, context_dim + observation_dim]`; no contexts without a memory."""

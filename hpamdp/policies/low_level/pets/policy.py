@@ -293,7 +293,7 @@ class PETSPolicy(PlanningPolicy):
                     own = for_members(step.own).flatten(1, 3)
                     ahead = self.model(rows.mT, discrete, own, self.precision)
                     if bonus is not None:
-                        ahead = self._with_bonus(rows.mT, ahead, bonus)
+                        ahead = self._with_bonus(rows.mT, discrete, ahead, bonus)
                     next_rows = ahead.next_state
                     if place < len(steps) - 1 or self.end_value is not None:
                         next_rows = self.perception.imagined(rows.mT, next_rows)
@@ -310,22 +310,22 @@ class PETSPolicy(PlanningPolicy):
 
         return returns
 
-    def _with_bonus(self, state: Tensor, ahead: Prediction, bonus: Bonus) -> Prediction:
+    def _with_bonus(self, state: Tensor, discrete: Tensor, ahead: Prediction, bonus: Bonus) -> Prediction:
         """Return predictions whose rewards, if the step does not terminate, include the bonus of its next state.
 
-        Disagreement is the standard deviation of the members' predicted changes, in units of the usual change, averaged
-        over the predicted entries.
+        Disagreement is the standard deviation of the members' predicted changes in the canonical frame, in units of the
+        usual change there, averaged over the predicted entries.
 
         Args:
             state: `[E, B, F]`, from which each member predicts.
+            discrete: the discrete actions, `[E, B]`.
             ahead: what they predict, `[E, B]`.
             bonus: the bonus.
         """
         model = self.model
         if bonus.of is not None:
             return ahead._replace(continuing=ahead.continuing + bonus.weight * bonus.of(ahead.next_state.float()))
-        before = model.split(state)[1]
-        change = (ahead.next_state.float() - before.float()) / model.change_scale
+        change = model.scaled_change(state, discrete, ahead.next_state)
         spread = (change.std(0, correction=0) * model.is_predicted).sum(-1) / model.is_predicted.sum().clamp(min=1.0)
         return ahead._replace(continuing=ahead.continuing + bonus.weight * spread)
 
