@@ -165,7 +165,8 @@ class HPPO(OnPolicy, Learner):
     takes_pictures = True
     counts_durations = True
     explores_with = frozenset({"actions", "rewards"})
-    progress = Learner.progress | {"log_min_scale", "log_max_scale"}
+    # The extra state is the waiting rows, which another run's policy sampled, maybe on another problem.
+    progress = Learner.progress | {"log_min_scale", "log_max_scale", "_extra_state"}
 
     frames: Tensor
 
