@@ -12,6 +12,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import read_saved
 from hpamdp.policies.low_level.hppo import HPPO
 from hpamdp.policies.low_level.paddpg import PADDPG
+from hpamdp.run.compatibility import check
 
 WORDS = [*SMALL, "env=platform", "+env.grouping=default", *QUICK_CRITIC, "low=hppo", *SHORT["hppo"]]
 PER_OPTION = "+low.per_option={jump: {name: paddpg, hidden_dims: [16], warmup_steps: 10, batch_size: 16}}"
@@ -47,9 +48,43 @@ def test_the_learner_of_an_option_gets_the_recipe_of_the_problem_and_the_length_
     assert read_saved(config.to_dict()) == config
 
 
+STEPS = ["agent.termination=steps", "agent.option_length=2"]
+SCALED = "+low.per_option={jump: {name: paddpg, reward_scale: 0.1}}"
+
+
+def test_learners_that_do_not_ask_each_other_may_scale_rewards_differently():
+    for words in ([SCALED], ["+low.per_option={jump: random}"], [SCALED, *STEPS, "low.reward_scale=0.1"]):
+        check(make_config([*WORDS, *words]))
+
+
+def test_values_on_different_scales_are_not_compared():
+    with pytest.raises(ConfigError) as error:
+        check(make_config([*SMALL, "env=platform", "+env.grouping=default", "low=hppo", "high=value", SCALED]))
+    assert str(error.value) == (
+        "low.per_option: high=value needs the same reward_scale in all learners, whose values it compares; "
+        "low=hppo has 1.0, low=paddpg 0.1"
+    )
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
+        (
+            [SCALED, *STEPS],
+            "low.per_option: agent.termination=steps needs the same reward_scale in all learners, which bootstrap from "
+            "each other; low=hppo has 1.0, low=paddpg 0.1",
+        ),
+        (
+            ["+low.per_option={jump: random}", *STEPS],
+            "low.per_option: agent.termination=steps lets learners bootstrap from each other, but low=random has no "
+            "value",
+        ),
+        (
+            ["+low.per_option={jump: dlpa}", *STEPS],
+            "low.per_option: agent.termination=steps lets learners bootstrap from each other, but low=dlpa has no "
+            "value without end_values=true",
+        ),
+        (["+low.per_option={jump: pets}", *STEPS], "low.per_option: agent.termination=steps lets learners bootstrap"),
         (["+low.per_option={fly: random}"], "low.per_option: env=platform has no option fly; it has run, jump"),
         (["+low.per_option={jump: nothing}"], "low.per_option.jump=nothing: there is no conf/low/nothing.yaml"),
         (

@@ -520,6 +520,50 @@ def compared_learners_have_values(config: Config) -> str | None:
     return None
 
 
+def learners_ask_each_other(config: Config) -> str | None:
+    """Refuse learners that bootstrap from one without a value, or compare values on different scales."""
+    why_ends = _why_options_end(config)
+    is_compared = getattr(config.high.cls, "asks_learners", False)
+    if config.run.mode == "eval" or (why_ends is None and not is_compared):
+        return None
+    without = [low for low in config.learners if not _has_next_value(low)]
+    if why_ends is not None and 0 < len(without) < len(config.learners):
+        setting = _value_setting(without[0])
+        return f"low.per_option: {why_ends} lets learners bootstrap from each other, but {without[0]} has no value" + (
+            "" if setting is None else f" without {setting}=true"
+        )
+    scales = {low.settings.get("reward_scale", 1.0): low for low in reversed(config.learners) if low not in without}
+    if len(scales) > 1:
+        given, why = (f"{config.high}", "whose values it compares")
+        if why_ends is not None:
+            given, why = why_ends, "which bootstrap from each other"
+        (first, low), (second, other), *_ = reversed(scales.items())
+        return (
+            f"low.per_option: {given} needs the same reward_scale in all learners, {why}; {low} has {first}, "
+            f"{other} {second}"
+        )
+    return None
+
+
+def _why_options_end(config: Config) -> str | None:
+    """Return what lets options end inside their episodes, as the beginning of a sentence; None if they do not."""
+    if has_trips(config):
+        return f"{config.env} has trips, and so"
+    termination = config.run.agent.termination
+    return None if termination == "episode" else f"agent.termination={termination}"
+
+
+def _value_setting(low: Component) -> str | None:
+    """Return the setting without which other learners cannot bootstrap from this one; None if there is none."""
+    return getattr(low.cls, "value_setting", None) or ("end_values" if "end_values" in low.settings else None)
+
+
+def _has_next_value(low: Component) -> bool:
+    """Return whether other learners can bootstrap from this one."""
+    setting = _value_setting(low)
+    return _overrides(low.cls, "value", base="hpamdp.policies.base") and (setting is None or low.settings[setting])
+
+
 # Rules about what the levels remember.
 
 
@@ -546,11 +590,10 @@ def selectors_remember_several_decisions(config: Config) -> str | None:
 
 def memories_have_values(config: Config) -> str | None:
     """Refuse learners that value each other's states by different memories."""
-    run = config.run.agent
+    given = _why_options_end(config)
     settings = "memory", "memory_size", "stack_steps"
     memories = {tuple(each.settings[name] for name in settings if _memory(each)) for each in config.learners}
-    if (run.termination != "episode" or has_trips(config)) and len(memories) > 1:
-        given = f"{config.env} has trips, and so" if has_trips(config) else f"agent.termination={run.termination}"
+    if given is not None and len(memories) > 1:
         without = [str(each) for each in config.learners if not _memory(each)]
         return (
             f"low.per_option: {given} needs the same memory, memory_size and stack_steps "
@@ -807,6 +850,7 @@ RULES: tuple[Rule, ...] = (
     selectors_remember_several_decisions,
     memories_have_values,
     compared_learners_have_values,
+    learners_ask_each_other,
     collector_fits_the_run,
     workers_get_what_python_passed,
     problem_provides_needs,
