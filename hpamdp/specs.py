@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 
 from hpamdp import keys
 from hpamdp.components import Components
+from hpamdp.env.errors import ProblemError
 from hpamdp.geometry import PlaneGeometry, Symmetries
 from hpamdp.messages import as_code
 from hpamdp.observation_entries import ObservationEntry, observation_dtype
@@ -302,6 +303,7 @@ class PAMDPSpecs:
         Raises:
             ValueError: it is no `PAMDPEnv`, or the initial parameters, symmetries or geometry do not fit the
                 observation and the action.
+            ProblemError: the bounds of a parameter are equal, crossed or not finite, and no state gives others.
         """
         if not hasattr(env, "parameter_dims"):
             raise ValueError(f"from_env: {as_code(env)} is no PAMDPEnv; hpamdp.make makes one")
@@ -331,6 +333,8 @@ class PAMDPSpecs:
         observed = env.observation_spec_unbatched.keys()
         has_action_mask = keys.ACTION_MASK in observed
         has_parameter_bounds = keys.PARAMETER_LOW in observed
+        low, high = parameters.space.low.flatten(), parameters.space.high.flatten()
+        _check_bounds(env, low, high, have_others=has_parameter_bounds)
         if has_action_mask or has_parameter_bounds or env.option_actions is not None or len(env.component_sizes) > 1:
             symmetries = None  # they do not say how masks, bounds, components and sets of actions are mapped
         if len(env.component_sizes) > 1:
@@ -339,8 +343,8 @@ class PAMDPSpecs:
             observation_dim=observation_dim,
             option_names=tuple(env.option_names) if keys.OPTION in action.keys() else (),
             parameter_dims=tuple(env.parameter_dims),
-            parameter_low=tuple(parameters.space.low.flatten().tolist()),
-            parameter_high=tuple(parameters.space.high.flatten().tolist()),
+            parameter_low=tuple(low.tolist()),
+            parameter_high=tuple(high.tolist()),
             component_sizes=tuple(env.component_sizes) if len(env.component_sizes) > 1 else (),
             integer_parameters=tuple(env.integer_parameters) if any(env.integer_parameters) else (),
             has_parameter_bounds=has_parameter_bounds,
@@ -355,3 +359,22 @@ class PAMDPSpecs:
             geometry=geometry,
             entries=env.observation_entries,
         )
+
+
+def _check_bounds(env: EnvBase, low: Tensor, high: Tensor, *, have_others: bool) -> None:
+    """Refuse bounds `[num_parameters]` of an environment's parameters between which nothing can be scaled.
+
+    Args:
+        env: the environment.
+        low, high: the bounds.
+        have_others: whether states give bounds of their own.
+
+    Raises:
+        ProblemError: the message names the first parameter with such bounds.
+    """
+    is_whole = torch.tensor(env.integer_parameters or [False] * len(low), dtype=torch.bool, device=low.device)
+    is_wrong = ~(low.isfinite() & high.isfinite() & ((low < high) | (is_whole & (low == high))))
+    if is_wrong.any() and not have_others:
+        place = int(is_wrong.nonzero()[0])
+        given = f"{type(env).__name__}: parameter {place}: bounds {low[place]:.6g} and {high[place]:.6g}"
+        raise ProblemError(f"{given}, but the lower must be less than the upper, both finite")

@@ -26,6 +26,7 @@ from hpamdp.data.errors import DataError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.policies.low_level.iql import IQL
+from hpamdp.policies.low_level.td3_bc import TD3BC
 from hpamdp.run.assemble import make_data, make_env
 from hpamdp.specs import PAMDPSpecs
 
@@ -228,6 +229,25 @@ def test_a_wrong_value_in_a_data_set_is_refused_with_its_row(rows, specs, said):
     with pytest.raises(DataError) as refused:
         Demonstrations(rows).check(specs)
     assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_mask_after_the_end_of_an_episode_may_allow_nothing_and_then_allows_everything():
+    rows = masked(2, ("next", keys.ACTION_MASK)).set(keys.OPTION, torch.tensor([0, 0, 1, 1, 1]))
+    rows["next", keys.ACTION_MASK] = torch.tensor([[1, 0, 1], [0, 0, 0], [1, 1, 0], [1, 1, 1], [0, 0, 1]]).bool()
+    rows["next", keys.OPTION_MASK] = torch.zeros(5, 2, dtype=torch.bool)
+    for name, value in ((keys.TERMINATED, True), (keys.TRUNCATED, False)):
+        rows["next", name][[1, 4]] = value
+    given = rows.clone()
+    demonstrations = Demonstrations(rows, decisions=with_option_sums(rows)[[1, 4]])
+    demonstrations.check(replace(MASKED, option_names=("left", "right"), has_option_mask=True))
+    after = demonstrations.batch[0]["next"]
+    assert after[keys.ACTION_MASK][1].all() and after[keys.ACTION_MASK][4].tolist() == [False, False, True]
+    assert after[keys.OPTION_MASK][[1, 4]].all() and not after[keys.OPTION_MASK][[0, 2, 3]].any()
+    assert demonstrations.decisions[0]["next", keys.OPTION_MASK].all()
+    assert (rows == given).all(), "the given rows stay as they are"
+    learner = TD3BC(MASKED, hidden_dims=(8,), batch_size=4)
+    learner.add_demonstrations(demonstrations.batch, torch.ones(1, 5, dtype=torch.bool))
+    assert np.isfinite(learner.update(3)["critic"])
 
 
 def test_a_step_may_take_no_time_as_where_two_signals_of_a_corridor_are_due_at_once():

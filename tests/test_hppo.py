@@ -335,6 +335,15 @@ def test_too_few_rows_wait_for_more_and_are_part_of_the_state_dict():
     assert torch.equal(learner.actor.discrete_head.weight, other.actor.discrete_head.weight)
 
 
+def test_rows_that_wait_in_a_run_are_not_taken_over_by_another_one():
+    learner, other = make(minibatch_size=150), make(minibatch_size=150)
+    batch = random_rows(learner, 50, 2)
+    learner.learn(batch, everything(batch))
+    other.load_networks(learner.state_dict())
+    assert learner.waiting and not other.waiting
+    assert torch.equal(learner.actor.discrete_head.weight, other.actor.discrete_head.weight)
+
+
 @pytest.mark.parametrize("final", [0.01, 1.5])
 def test_a_largest_scale_that_ends_outside_its_range_is_refused(final):
     with pytest.raises(ValueError, match=f"max_scale_final={final}"):

@@ -486,6 +486,21 @@ def test_with_a_window_a_run_that_resumes_without_its_steps_learns_from_the_new_
     assert resumed.updates == earlier.updates + 70
 
 
+def test_with_a_window_a_run_from_another_runs_networks_leaves_its_own_warm_up_out():
+    torch.manual_seed(0)
+    settings = dict(critic_window=400, warmup_steps=200, codec_pretrain_updates=1, updates_per_step=1.0, batch_size=60)
+    earlier, learner = make(**settings), make(**settings)
+    learn(earlier, 1)
+    learn(earlier, 1, 100)
+    learner.load_networks(earlier.state_dict())
+    learn(learner, 1)
+    learn(learner, 1, 100)
+    assert learner.warmup_rows == 200
+    newest = {row.tobytes() for row in learner.buffer[200:300]["state"].numpy()}
+    seen = {row.tobytes() for sample in learner.sample_batches(20) for row in sample["state"].numpy()}
+    assert seen == newest
+
+
 def test_the_noise_falls_with_the_episodes_after_the_warm_up():
     learner = make(
         noise_initial=1.0, noise_episodes=100, parameter_noise=0.1, epsilon_final=0.0, epsilon_steps=0,

@@ -15,6 +15,7 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.high_level.meta_critic import MetaCritic
 from hpamdp.policies.high_level.option_critic import OptionCritic
 from hpamdp.policies.high_level.uniform import Uniform
+from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.specs import PAMDPSpecs
 
 CPU = torch.device("cpu")
@@ -55,6 +56,22 @@ def ending(selector, learners=None) -> HierarchicalAgent:
     """Return an agent whose selector decides where options end."""
     learners = [Stepper(SPECS), Stepper(SPECS)] if learners is None else learners
     return HierarchicalAgent(selector, learners, SPECS, selector_ends_options=True)
+
+
+def test_options_of_a_data_set_last_an_episode_and_are_stored_where_the_selector_ends_options():
+    learners = [PDQN(SPECS.of_option(i), hidden_dims=(8,), warmup_steps=0, batch_size=4) for i in range(2)]
+    agent = ending(Moody(SPECS), learners)
+    env = with_decisions(Toll(6, start=6.0), GAMMA, math.inf)
+    batch = env.rollout(3, agent.policy, break_when_any_done=False)
+    given = batch.select(keys.OBSERVATION, keys.ACTION, keys.IS_DECISION)
+    given["next"] = batch["next"].select(keys.OBSERVATION, keys.REWARD, keys.DONE, keys.TERMINATED, keys.IS_DECISION)
+    given[keys.OPTION] = (torch.arange(6) % 2).unsqueeze(-1).expand(6, 3).clone()
+    agent.add_demonstrations(given)
+    agent.learn(batch)
+    for i, learner in enumerate(learners):
+        stored = learner.buffer[:9]
+        assert (stored["option"] == i).all() and (stored["next_option"] == i).all()
+        assert not stored["option_ended"].any()
 
 
 def collect(agent: HierarchicalAgent, env: Crossing, num_steps: int, batch_steps: int, num_envs: int):

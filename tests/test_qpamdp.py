@@ -517,6 +517,20 @@ def test_rows_of_other_learners_change_nothing():
     assert learners[0].window_episodes == 20
 
 
+@pytest.mark.parametrize("num_envs", [32, 128])
+def test_the_parameter_phase_goes_on_with_another_number_of_environments(num_envs):
+    torch.manual_seed(0)
+    learner = ready(rollouts=500)
+    while learner.phase == SARSA:
+        learn(learner, 1)
+    learn(learner, 1, num_envs=64)
+    before = int(learner.enac.num_episodes)
+    assert learner.phase == PARAMETERS and before > 0
+    learn(learner, 1, num_envs=num_envs)
+    # An episode that was under way is left out, and so is what may be the middle of one.
+    assert learner.enac.num_episodes == before + num_envs
+
+
 def test_a_state_dict_restores_a_learner_that_goes_on_the_same():
     torch.manual_seed(0)
     learner, other = make(), make()

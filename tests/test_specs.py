@@ -6,6 +6,7 @@ import pytest
 import torch
 from test_hppo import make as make_hppo
 from test_hsac import make as make_hsac
+from toy_masks import Forbidden
 from toy_steps import SPECS
 
 from hpamdp.env.platform.environment import PlatformEnv
@@ -42,6 +43,30 @@ def test_initial_parameters_of_a_wrong_shape_are_refused():
         ValueError, match=r"initial_parameters: shapes \[\[3, 8\], \[3\]\], but must be \[\[3, 9\], \[3\]\]"
     ):
         PAMDPSpecs.from_env(Wrong(1))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "place"),
+    [
+        ((-1.0, 0.0, 2.0), (1.0, 0.0, 2.0), "parameter 1: bounds 0 and 0"),
+        ((-1.0, 0.0, 2.0), (1.0, 1.0, 1.0), "parameter 2: bounds 2 and 1"),
+        ((-1.0, 0.0, 2.0), (float("inf"), 1.0, 3.0), "parameter 0: bounds -1 and inf"),
+    ],
+)
+def test_bounds_between_which_nothing_can_be_scaled_are_refused(low, high, place):
+    env = Forbidden(1)
+    env.action_spec = env.make_action_spec(torch.tensor(low), torch.tensor(high))
+    with pytest.raises(ValueError, match=f"{place}, but the lower must be less than the upper, both finite$"):
+        PAMDPSpecs.from_env(env)
+
+
+def test_equal_bounds_of_a_whole_number_are_a_cell():
+    env = Forbidden(1)
+    env.integer_parameters = (False, True, False)
+    env.action_spec = env.make_action_spec(torch.tensor([-1.0, 4.0, -1.0]), torch.tensor([1.0, 4.0, 1.0]))
+    specs = PAMDPSpecs.from_env(env)
+    assert specs.to_unit(torch.tensor([0.0, 4.0, 1.0])).tolist() == [0.0, 0.0, 1.0]
+    assert specs.from_unit(torch.tensor([0.0, 0.7, 1.0])).tolist() == [0.0, 4.0, 1.0]
 
 
 def test_hppo_and_hsac_can_start_at_the_initial_parameters():

@@ -15,7 +15,7 @@ import torch
 from conftest import make_config
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
-from toy_steps import SPECS, sample
+from toy_steps import SPECS, one_step_rows, sample
 
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.catch_point.environment import CatchPointEnv
@@ -263,6 +263,21 @@ def test_schedules_start_again_in_a_learner_that_takes_over_networks():
     assert learner.policy.noise == 1.0
     learner = taken_over(IQL, actor_lr_updates=1000, **small)
     assert learner.actor_updates == 0 and learner.updates == 5000
+
+
+@pytest.mark.parametrize("warmup_steps", [0, 5])
+def test_a_learner_starts_once_with_or_without_a_warm_up(warmup_steps):
+    started = []
+
+    class Started(PDQN):
+        def start(self):
+            started.append(len(self.buffer))
+
+    learner = Started(SPECS, hidden_dims=(8,), batch_size=4, warmup_steps=warmup_steps, updates_per_step=0.25)
+    for _ in range(4):
+        batch = one_step_rows(learner, 4)
+        learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
+    assert started == ([8] if warmup_steps else [4])
 
 
 @pytest.mark.parametrize("name", ["hppo", "iql", "qpamdp"])

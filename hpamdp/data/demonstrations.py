@@ -32,7 +32,8 @@ class Demonstrations:
             `next` `observation`, `reward`, `done`, `terminated`, `truncated` and `is_decision`; shapes and types are
             the environment's. The last row of each episode is `done`, and no other row. Parameters of discrete actions
             that a row does not take may be 0. `action_mask` and `option_mask` are optional, at the root and under
-            `next`; without them learners take all actions and options as allowed.
+            `next`; without them learners take all actions and options as allowed. After the end of an episode a mask
+            may allow nothing.
             `pair_mask`, `parameter_low` and `parameter_high` are required if the environment gives them.
             `("next", "duration")`, finite and at least 0, goes with environments whose steps take different times.
             Without it learners discount all these steps alike.
@@ -58,13 +59,13 @@ class Demonstrations:
     ) -> None:
         device = None if device is None else checked_device(self, device)
         check_transitions(transitions)
-        with_sums = with_option_sums(transitions)
+        with_sums = _with_open_masks(with_option_sums(transitions))
         check_returns(with_sums)
         self.batch = _batch(with_sums, device)
         self.decisions = None
         if decisions is not None:
             check_decisions(decisions)
-            self.decisions = _batch(decisions, device)
+            self.decisions = _batch(_with_open_masks(decisions), device)
 
     def check(self, specs: PAMDPSpecs) -> None:
         """Check that every row is possible in an environment with these specs.
@@ -87,6 +88,19 @@ class Demonstrations:
         if self.decisions is not None:
             raise DataError("its decisions' returns are known only undiscounted; use 1")
         self.batch = with_option_sums(self.batch.squeeze(0), gamma).unsqueeze(0)
+
+
+def _with_open_masks(rows: TensorDict) -> TensorDict:
+    """Return rows `[N]` whose masks after the end of an episode allow everything where they allowed nothing.
+
+    Environments do the same (`PAMDPEnv.check_masks`): the best of no values, -inf, is no value to multiply by 0.
+    """
+    rows = rows.copy()
+    for name, end in ((keys.ACTION_MASK, keys.TERMINATED), (keys.OPTION_MASK, keys.DONE)):
+        mask, is_end = rows.get(("next", name), None), rows.get(("next", end), None)
+        if mask is not None and is_end is not None:
+            rows["next", name] = mask | (is_end & ~mask.any(-1, keepdim=True))
+    return rows
 
 
 def _batch(rows: TensorDict, device: torch.device | None) -> TensorDict:

@@ -538,6 +538,10 @@ class HierarchicalAgent(nn.Module):
         """
         if self.selector is not None and self.pairs is None and "offline" in self.selector.modes:
             self.selector.add_demonstrations(finished_decisions(batch if decisions is None else decisions))
+        if self.next_options is not None and self.next_options.decides_ends:
+            # A row without its option would be stored with option 0, beside the agent's own rows.
+            goes_on = torch.zeros_like(batch.get(("next", keys.DONE)))
+            batch = batch.copy().set(("next", keys.OPTION_ENDED), goes_on)
         for _, learner, rows, mask in self._batches_of_learners(batch):
             learner.add_demonstrations(rows, mask)
 

@@ -39,6 +39,7 @@ from hpamdp.files import regular_size, replacing
 from hpamdp.messages import first_line, reason_of, warn
 from hpamdp.policies.agent import FOR_TRAINING, HierarchicalAgent
 from hpamdp.policies.base import Learner, Level, added_later
+from hpamdp.policies.shared.on_policy import WAITING
 from hpamdp.run.state_checks import (
     Progress,
     SavedPart,
@@ -271,7 +272,10 @@ def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) ->
         for i, learner in enumerate(agent.learners):
             start = f"{i}."
             state = {name.removeprefix(start): own[name] for name in own if name.startswith(start)}
-            states.append(opened.state("agent", state, learner, device))
+            # Rows that wait are of the saved run, whose settings may be others.
+            left_out = WAITING if isinstance(learner, Learner) and WAITING in learner.progress else ""
+            state.pop(left_out, None)
+            states.append(opened.state("agent", state, learner, device, may_lack=left_out))
     for learner, state in zip(agent.learners, states, strict=True):
         assert isinstance(learner, Learner)
         learner.load_networks(state)

@@ -524,6 +524,55 @@ def compared_learners_have_values(config: Config) -> str | None:
     return None
 
 
+def learners_ask_each_other(config: Config) -> str | None:
+    """Refuse learners that bootstrap from one without a value, or compare values on different scales."""
+    why_ends = _why_options_end(config)
+    is_compared = getattr(config.high.cls, "asks_learners", False)
+    if config.run.mode == "eval" or (why_ends is None and not is_compared):
+        return None
+    without = [low for low in config.learners if not _has_next_value(low)]
+    if why_ends is not None and 0 < len(without) < len(config.learners):
+        setting = _value_setting(without[0])
+        return f"low.per_option: {why_ends} lets learners bootstrap from each other, but {without[0]} has no value" + (
+            "" if setting is None else f" without {setting}=true"
+        )
+    scales = {low.settings.get("reward_scale", 1.0): low for low in reversed(config.learners) if low not in without}
+    if len(scales) > 1 and (is_compared or not _values_end_with_trips(config)):
+        given, why = (f"{config.high}", "whose values it compares")
+        if why_ends is not None:
+            given, why = why_ends, "which bootstrap from each other"
+        (first, low), (second, other), *_ = reversed(scales.items())
+        return (
+            f"low.per_option: {given} needs the same reward_scale in all learners, {why}; {low} has {first}, "
+            f"{other} {second}"
+        )
+    return None
+
+
+def _why_options_end(config: Config) -> str | None:
+    """Return what lets options end inside their episodes, as the beginning of a sentence; None if they do not."""
+    if has_trips(config):
+        return f"{config.env} has trips, and so"
+    termination = config.run.agent.termination
+    return None if termination == "episode" else f"agent.termination={termination}"
+
+
+def _values_end_with_trips(config: Config) -> bool:
+    """Return whether only trips end options, and values end with them."""
+    return config.run.agent.termination == "episode" and config.run.agent.values_end == "trip"
+
+
+def _value_setting(low: Component) -> str | None:
+    """Return the setting without which other learners cannot bootstrap from this one; None if there is none."""
+    return getattr(low.cls, "value_setting", None) or ("end_values" if "end_values" in low.settings else None)
+
+
+def _has_next_value(low: Component) -> bool:
+    """Return whether other learners can bootstrap from this one."""
+    setting = _value_setting(low)
+    return _overrides(low.cls, "value", base="hpamdp.policies.base") and (setting is None or low.settings[setting])
+
+
 # Rules about what the levels remember.
 
 
@@ -550,11 +599,10 @@ def selectors_remember_several_decisions(config: Config) -> str | None:
 
 def learners_have_the_same_memory(config: Config) -> str | None:
     """Refuse learners that value each other's states by different memories."""
-    run = config.run.agent
+    given = _why_options_end(config)
     settings = "memory", "memory_size", "stack_steps"
     memories = {tuple(each.settings[name] for name in settings if _memory(each)) for each in config.learners}
-    if (run.termination != "episode" or has_trips(config)) and len(memories) > 1:
-        given = f"{config.env} has trips, and so" if has_trips(config) else f"agent.termination={run.termination}"
+    if given is not None and len(memories) > 1:
         without = [str(each) for each in config.learners if not _memory(each)]
         return (
             f"low.per_option: {given} needs the same memory, memory_size and stack_steps "
@@ -776,51 +824,6 @@ def per_option_names_options(config: Config, problem: ProblemFacts) -> str | Non
     return None
 
 
-def learners_value_each_other(config: Config, problem: ProblemFacts) -> str | None:
-    """Require values of all learners, in one unit, if the next option may be that of another learner.
-
-    DLPA and PETS without `end_values` have no values to bootstrap from, and ask for none.
-    """
-    run, is_episode = config.run, config.run.agent.termination == "episode"
-    if run.mode != "train" or (is_episode and not has_trips(config)):
-        return None
-    asking = [low for low in config.learners if _bootstraps(low)]
-    lacking = [low for low in config.learners if not _bootstraps(low)]
-    ends = f"the trips of {config.env}" if is_episode else f"agent.termination={run.agent.termination}"
-    if asking and lacking:
-        without = " without low.end_values=true" if "end_values" in lacking[0].settings else ""
-        return (
-            f"low.per_option: with {ends} {asking[0]} asks the next option's learner for a value, but {lacking[0]} has "
-            f"none{without}; use another learner for this option"
-        )
-    if is_episode and run.agent.values_end == "trip":
-        return None
-    return _in_one_unit(asking, f"with {ends} learners value each other's states")
-
-
-def compared_values_have_one_unit(config: Config, problem: ProblemFacts) -> str | None:
-    """Require the same `reward_scale` of all learners if the selector compares their values."""
-    if not getattr(config.high.cls, "asks_learners", False):
-        return None
-    return _in_one_unit(config.learners, f"{config.high} compares the learners' values")
-
-
-def _bootstraps(low: Component) -> bool:
-    return _overrides(low.cls, "value", base="hpamdp.policies.base") and low.settings.get("end_values", True) is True
-
-
-def _in_one_unit(learners: Sequence[Component], why: str) -> str | None:
-    """Return a complaint if the rewards of learners, and so their values, are scaled differently, else None."""
-    scales = {each.settings.get("reward_scale", 1.0): each for each in learners}
-    if len(scales) < 2:
-        return None
-    (scale, low), (other_scale, other), *_ = scales.items()
-    return (
-        f"low.per_option: {why}, but reward_scale is {scale:g} of {low} and {other_scale:g} of {other}; set the same "
-        "for all"
-    )
-
-
 def _overrides(cls: type | None, method: str, base: str) -> bool:
     """Return whether a class overrides a method of the module `base`."""
     owner = next((each for each in getattr(cls, "__mro__", ()) if method in vars(each)), None)
@@ -856,6 +859,7 @@ RULES: tuple[Rule, ...] = (
     selectors_remember_several_decisions,
     learners_have_the_same_memory,
     compared_learners_have_values,
+    learners_ask_each_other,
     collector_fits_the_run,
     workers_get_what_python_passed,
     problem_provides_needs,
@@ -867,8 +871,6 @@ PROBLEM_RULES: tuple[ProblemRule, ...] = (
     options_end_where_they_may,
     selector_chooses_lengths,
     per_option_names_options,
-    learners_value_each_other,
-    compared_values_have_one_unit,
     workers_fit_the_problem,
     levels_take_pictures,
     data_sets_have_no_pictures,

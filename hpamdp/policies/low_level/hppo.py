@@ -46,7 +46,14 @@ from hpamdp.policies.shared.hybrid_actor import RAW, HeadOptions, HybridActor, H
 from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.policies.shared.memory import MemoryOptions
 from hpamdp.policies.shared.networks import InitialParameters, OutputLinear
-from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, generalised_advantages, mean_scalars, normalised
+from hpamdp.policies.shared.on_policy import (
+    WAITING,
+    OnPolicy,
+    OnPolicyOptions,
+    generalised_advantages,
+    mean_scalars,
+    normalised,
+)
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.sequences import sequence_starts
 from hpamdp.settings import Fraction, LearningRate, Widths
@@ -165,7 +172,8 @@ class HPPO(OnPolicy, Learner):
     takes_pictures = True
     counts_durations = True
     explores_with = frozenset({"actions", "rewards"})
-    progress = Learner.progress | {"log_min_scale", "log_max_scale"}
+    # Waiting rows are of the run that sampled them, maybe on another problem.
+    progress = Learner.progress | {"log_min_scale", "log_max_scale", WAITING}
 
     frames: Tensor
 

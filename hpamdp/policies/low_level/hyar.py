@@ -405,6 +405,8 @@ class HyAR(ReplayLearner):
         if self.buffer.write_count == 0:  # also in a resumed run whose checkpoint has no stored transitions
             self.warmup_rows.zero_()
         super().store(batch, mask)
+        if self.frames < self.options.warmup_steps:
+            self.warmup_rows.fill_(self.buffer.write_count)
 
     def _codec_sample(self) -> TensorDictBase:
         """Return a sample of all stored transitions for an update of the codec."""
@@ -574,7 +576,6 @@ class HyAR(ReplayLearner):
         for _ in range(self.options.codec_pretrain_updates):
             self._update_codec(self._codec_sample())
         self.fit_latent_range()
-        self.warmup_rows.fill_(self.buffer.write_count)
 
     def steps_to_update(self) -> dict[str, int]:
         """Return the length of the warm-up, with a batch after it if the critics learn from no earlier steps."""

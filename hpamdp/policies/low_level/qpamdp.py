@@ -336,13 +336,18 @@ class NaturalActorCritic(SizedByData):
             num_regressors: number of coefficients of the new regression.
             is_fresh: where the next row begins an episode, bool `[N]`.
         """
-        self.is_fresh = is_fresh.clone()
-        self.is_whole = torch.zeros_like(is_fresh)
-        self.regressors = self.regressors.new_zeros(len(is_fresh), num_regressors)
-        self.returns = self.returns.new_zeros(len(is_fresh))
         self.gram = self.gram.new_zeros(num_regressors, num_regressors)
         self.moment = self.moment.new_zeros(num_regressors)
         self.num_episodes.zero_()
+        self._forget_open_episodes(len(is_fresh))
+        self.is_fresh = is_fresh.clone()
+
+    def _forget_open_episodes(self, num_envs: int) -> None:
+        """Discard the episodes that have not ended; the next rows may be in the middle of others."""
+        self.is_fresh = self.is_fresh.new_zeros(num_envs)
+        self.is_whole = self.is_whole.new_zeros(num_envs)
+        self.regressors = self.regressors.new_zeros(num_envs, len(self.moment))
+        self.returns = self.returns.new_zeros(num_envs)
 
     def collect(self, rows: TensorDict, ended_before: Tensor | None = None, value_before: float | Tensor = 0.0) -> None:
         """Add the episodes that end in a batch, or ended with the one before, to the regression.
@@ -353,6 +358,8 @@ class NaturalActorCritic(SizedByData):
             ended_before: where an episode ended with the batch before, as this one shows, bool `[N]`. If None, nowhere.
             value_before: what to add to their returns, `[N]`.
         """
+        if len(self.is_whole) != len(rows):  # a run that goes on with another number of environments
+            self._forget_open_episodes(len(rows))
         ended = torch.zeros_like(self.is_whole) if ended_before is None else ended_before & self.is_whole
         ended_regressors = [self.regressors[ended]]
         ended_returns = [(self.returns + value_before)[ended]]

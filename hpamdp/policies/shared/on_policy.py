@@ -15,6 +15,9 @@ from hpamdp.policies.stored_rows import check_choices
 from hpamdp.settings import LearningRate, Settings
 from hpamdp.specs import PAMDPSpecs
 
+# PyTorch's name of an extra state in a state dict: the waiting rows. A saved learner for a new run is read without it.
+WAITING = "_extra_state"
+
 
 class OnPolicyOptions(Settings):
     """Settings of proximal policy optimisation."""
@@ -69,7 +72,7 @@ class OnPolicy(nn.Module):
         Raises:
             ValueError: the rows are invalid.
         """
-        waiting, columns = state["_extra_state"], self.empty_rows()
+        waiting, columns = state.get(WAITING, []), self.empty_rows()
         if not isinstance(waiting, list) or not all(isinstance(rows, dict) for rows in waiting):
             raise ValueError("the waiting rows are no list of dicts")
         num = 0

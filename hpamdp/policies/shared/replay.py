@@ -161,7 +161,7 @@ class ReplayLearner(Learner):
         self.frames = self.frames + num_steps
         if steps < warmup:
             return {}
-        if before < warmup and int(self.updates) == 0:  # a learner of an earlier run has started already
+        if before < max(1, warmup) and int(self.updates) == 0:  # a learner of an earlier run has started already
             self.start()
         self.on_progress(steps - warmup)
         if self.catches_up and before < warmup:
