@@ -79,6 +79,10 @@ def test_values_on_different_scales_are_not_compared():
             "low.per_option: agent.termination=steps lets learners bootstrap from each other, but low=dlpa has no "
             "value without end_values=true",
         ),
+        (
+            ["+low.per_option={run: {name: hyar, latent_dim: 4}, jump: {name: hyar, latent_dim: 6}}"],
+            "low.per_option: latent_dim must be the same in all learners, as steps hold one size, but is 4 and 6",
+        ),
         (["+low.per_option={jump: pets}", *STEPS], "low.per_option: agent.termination=steps lets learners bootstrap"),
         (["+low.per_option={fly: random}"], "low.per_option: env=platform has no option fly; it has run, jump"),
         (["+low.per_option={jump: nothing}"], "low.per_option.jump=nothing: there is no conf/low/nothing.yaml"),

@@ -555,6 +555,7 @@ class Learner(Level, nn.Module):
         memory_lasts_an_episode: whether that memory remembers the whole episode, and not the option alone.
         remembers_directions: whether the learner remembers the directions of actions that a problem reveals, unless it
             has another memory or `augment=false`.
+        step_sizes: settings that give the sizes of what the policy writes into steps, beside the action.
         needs_current_policy: whether each batch must be of the policy after the last update. A collector that collects
             ahead is refused.
         counts_durations: whether discounts are those of `step_discounts`. A run warns if the environment writes
@@ -583,6 +584,7 @@ class Learner(Level, nn.Module):
     memory_key: str | None = None
     memory_lasts_an_episode: bool = False
     remembers_directions: ClassVar[bool] = False
+    step_sizes: ClassVar[tuple[str, ...]] = ()
     needs_current_policy: ClassVar[bool] = False
     counts_durations: ClassVar[bool] = False
     exploring_keys: ClassVar[frozenset[str]] = frozenset()

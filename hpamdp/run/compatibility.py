@@ -611,6 +611,16 @@ def learners_have_the_same_memory(config: Config) -> str | None:
     return None
 
 
+def learners_write_the_same_sizes(config: Config) -> str | None:
+    """Refuse learners whose policies would write the same entry of a step in different sizes."""
+    for name in dict.fromkeys(name for low in config.learners for name in getattr(low.cls, "step_sizes", ())):
+        values = list(dict.fromkeys(low.settings[name] for low in config.learners if name in low.settings))
+        if len(values) > 1:
+            given = " and ".join("null" if value is None else str(value) for value in values)
+            return f"low.per_option: {name} must be the same in all learners, as steps hold one size, but is {given}"
+    return None
+
+
 # Rules about the collector.
 
 
@@ -858,6 +868,7 @@ RULES: tuple[Rule, ...] = (
     memories_have_own_steps,
     selectors_remember_several_decisions,
     learners_have_the_same_memory,
+    learners_write_the_same_sizes,
     compared_learners_have_values,
     learners_ask_each_other,
     collector_fits_the_run,

@@ -313,6 +313,7 @@ class HyAR(ReplayLearner):
     takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
     may_be_nan: ClassVar[frozenset[str]] = frozenset({LATENT})
+    step_sizes: ClassVar[tuple[str, ...]] = ("embedding_dim", "latent_dim")
     progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"episodes", "warmup_rows"}
 
     options: HyAROptions
