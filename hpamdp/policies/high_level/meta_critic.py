@@ -46,7 +46,7 @@ class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
     num_members: PositiveInt = 3
     """Number of critics in the ensemble."""
     exploration: Literal["epsilon", "ucb"] = "epsilon"
-    """A random option with a decaying probability, or the option with the highest upper confidence bound."""
+    """`epsilon`: a random option with a decaying probability. `ucb`: the option with the highest upper bound."""
     epsilon_decisions: Annotated[NonNegativeInt, OnlyWith("exploration", "epsilon")] = 1000
     """Finished decisions, after the warm-up, over which the probability of a random option falls.
 
@@ -198,7 +198,7 @@ class MetaCritic(RemembersDecisions):
         return unpacked_states(sample_with_past(self.buffer, size, num_past), self.specs)
 
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
-        """Return what is stored of decisions `[*B]`: states as the critics see them, unless the memory is recurrent."""
+        """Return what is stored of decisions `[*B]`; states are features if `stores_features`, else observations."""
         after = decisions.get("next")
         rows = {
             "state": after.get(keys.DECISION_OBSERVATION),
