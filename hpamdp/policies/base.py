@@ -107,7 +107,7 @@ def finished_decisions(steps: TensorDictBase) -> TensorDictBase:
 
 
 class NextOptions(Protocol):
-    """Which options follow the one that ended, and what they are worth; the agent gives it to its learners.
+    """Which options follow the one that ended, and their values; the agent gives it to its learners.
 
     If an option has ended in a state, the value of that state is its value under the next option, by that option's
     own learner. Learners reach one another in this way only. Observations are in the form that the asking learner sees.
