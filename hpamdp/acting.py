@@ -13,8 +13,8 @@ _turn = threading.RLock()
 def acting(exploration: ExplorationType) -> Iterator[None]:
     """Have policies explore or act greedily inside the block. Blocks of other threads wait until it ends.
 
-    TorchRL has one exploration type for all threads. Without the lock an evaluation in one thread would make the steps
-    greedy that another thread collects, and two blocks that overlap could leave the type of one of them behind.
+    TorchRL has one exploration type for all threads. Without the lock, an evaluation in one thread would make another
+    thread collect greedy steps. Two blocks that overlap could leave the type of one of them behind.
     """
     with _turn, set_exploration_type(exploration):
         yield

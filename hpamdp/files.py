@@ -41,8 +41,8 @@ def replacing(path: Path) -> Iterator[Path]:
     after an hour.
 
     Raises:
-        OSError: the disk is full, `path` is a folder, a pipe, a socket or a device, or the folder around it is gone or
-            cannot be written to. The error names `path`, also where it is about the file beside it.
+        OSError: the disk is full, or `path` is a folder, a pipe, a socket or a device. Or the folder around it is gone
+            or cannot be written to. The error names `path`, even if it is about the file beside it.
     """
     with suppress(FileNotFoundError):
         kind = stat.S_IFMT(path.lstat().st_mode)

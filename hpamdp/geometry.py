@@ -19,8 +19,8 @@ class Contexts:
 
     Attributes:
         num_contexts: number of contexts; 1 if the effects are always the same.
-        context_entry: entry of the observation with the context's number, negative while the context is open; None if
-            there is no such entry.
+        context_entry: entry of the observation with the context's number, negative while none is chosen; None if there
+            is no such entry.
         one_hot_entry: first entry of the one-hot context in the observation; None if there is none.
     """
 
@@ -29,7 +29,7 @@ class Contexts:
     one_hot_entry: int | None = None
 
     def context(self, observation: Tensor) -> Tensor:
-        """Return the contexts, int64 `[*B]`, of observations `[*B, observation_dim]`; 0 while the context is open."""
+        """Return the contexts, int64 `[*B]`, of observations `[*B, observation_dim]`; 0 while none is chosen."""
         if self.one_hot_entry is not None:
             end = self.one_hot_entry + self.num_contexts
             return observation[..., self.one_hot_entry : end].argmax(-1)

@@ -99,7 +99,7 @@ def rows_up_to(frames: float, path: Path) -> list[dict[str, float]]:
 def what_is_lost(
     rows: Iterable[Mapping[str, float]], path: Path, frames: int, log_every: int, batch: int
 ) -> str | None:
-    """Return which rows of a `metrics.csv` are lost, as part of a sentence; None if none is missed.
+    """Return which rows of a `metrics.csv` are lost, as part of a sentence; None if no row is lost.
 
     Args:
         rows: what could be read of it.

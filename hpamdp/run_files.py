@@ -22,7 +22,7 @@ CONFIG_NAME = "config.yaml"
 METRICS_NAME = "metrics.csv"
 # Folders that a run's logger writes to.
 TENSORBOARD_NAME, WANDB_NAME = "tensorboard", "wandb"
-# Endings of the pictures in the folder. The environment chooses their names.
+# Lists the names of the pictures in the folder, which the environment chooses.
 FIGURES_NAME = ".figures"
 # All other files that a run writes.
 DIVERGED_NAME = "checkpoint.diverged.zip"

@@ -38,8 +38,8 @@ class PAMDPSpecs:
         integer_parameters: whether each parameter is a whole number; empty if none is.
         has_parameter_bounds: whether the environment writes bounds of the current state, `parameter_low` and
             `parameter_high`.
-        bounds_place: place in the observation from which the lower and then the upper bounds of all parameters stand,
-            both on one scale. None if they are not there.
+        bounds_place: place in the observation where the lower bounds of all parameters begin, followed by the upper
+            bounds on the same scale. None if the observation does not hold them.
         initial_weight: rows `[num_parameters, observation_dim]` of the linear map from an observation to the published
             initial parameters in [-1, 1]; None if the problem has none.
         initial_bias: bias of this map, `num_parameters` entries.

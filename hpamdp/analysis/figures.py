@@ -80,7 +80,7 @@ def _series(rows: list[dict[str, float]], name: str) -> tuple[np.ndarray, np.nda
 def learning_curves(
     rows: list[dict[str, float]], summary: Mapping[str, Any], metrics: tuple[Metric, ...]
 ) -> Figure | None:
-    """Return one panel per metric that was logged, or None if none was."""
+    """Return a figure with one panel per metric that was logged, or None if none was."""
     logged = {name for row in rows for name in row}
     shown = [metric for metric in metrics if {EVALUATION + metric.name, "train/" + metric.name} & logged]
     if not shown:

@@ -33,7 +33,7 @@ DEFAULT_METRIC = "eval/score"
 TABLE_NAME, FIGURE_NAME = "report.csv", "report.png"
 _BEGINNING = b"configuration,folder,seed,state,"  # of a table
 _FORMULA = ("=", "+", "-", "@")  # how a formula of a spreadsheet begins
-# Of more configurations than this with one seed each, such as the trials of a search, only the highest are shown.
+# If more than _MANY configurations have one seed each, as the trials of a search do, only the highest are shown.
 _MANY, _MOST_TRIALS = 20, 10
 _LEAST_FOR_INTERVAL = 5  # seeds
 _MOST_NAMES, _LONGEST_NAME = 40, 60  # of the metrics that an error lists

@@ -43,8 +43,8 @@ T = TypeVar("T")
 
 MIN_SEEDS = 10  # smallest number of seeds for an interquartile mean and a bootstrap interval
 FEWEST_SEEDS = 3  # seeds that a cell needs for a place in a table
-# Seeds from here on are those of the protocol: they run once, with settings that were frozen before. Those of earlier
-# runs informed settings.
+# Seeds from here on are those of the protocol: they run once, with settings that were frozen before. Runs with smaller
+# seeds informed the settings.
 FIRST_PROTOCOL_SEED = 100
 PLAN_NAME = "cells.csv"  # beside a file of runs: the seeds that the protocol plans for each cell of a table
 _MOST_FOLDERS = 100_000  # a link may lead to the whole disk
@@ -101,7 +101,7 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
 
 
 def fault_of(summary: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
-    """Return why the seed of a run, or whether it is finished, is not known, or None.
+    """Return why it is not known which seed a run has or whether it is finished; None if both are known.
 
     Args:
         summary: the run's `summary.json`; empty if there is none.
@@ -410,8 +410,8 @@ def merged_tables(
             new ones follow.
 
     Raises:
-        SystemExit: the first table has no new rows, has a run twice, or has a run whose steps are not those of the run
-            that it repeats, or of its cell.
+        SystemExit: the first table has no new rows, or has a run twice. Or the steps of a run differ from those of the
+            run that it repeats, or of the other runs of its cell.
     """
     first, *_ = tables
     if not tables[first]:
@@ -490,7 +490,7 @@ def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
 
     The plain percentile interval of a few seeds is too narrow. The expanded interval is as wide as Student's t
     interval, within the sample's range. With fewer than `MIN_SEEDS` values it is too narrow, too, so `middle_half`
-    omits both. The bounds are NaN if the values do not vary, as in `mean_interval`.
+    omits mean and interval. The bounds are NaN if the values do not vary, as in `mean_interval`.
 
     Sources: Agarwal et al. 2021, arXiv 2108.13264, for one task; Hesterberg 2015, *What teachers should know about the
     bootstrap*, arXiv 1411.5279.

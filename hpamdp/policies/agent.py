@@ -41,8 +41,8 @@ def with_option(rows: TensorDictBase, num_options: int) -> TensorDictBase:
 def ended_with_trips(batch: TensorDictBase) -> TensorDictBase:
     """Return a shallow copy of steps `[*B]` in which a trip's last step is `done` and `terminated`.
 
-    What is learned from them counts no reward of later trips. Memories go on, since they begin where `is_decision` or
-    `episode_steps` says so.
+    Values that are learned from these steps count no reward of later trips. Memories go on, since they begin where
+    `is_decision` or `episode_steps` says so.
     """
     trip_ended = batch.get(("next", keys.TRIP_ENDED))
     batch = batch.copy()
@@ -61,7 +61,7 @@ class OptionRouter(TensorDictModuleBase):
         learners: one for each option, or a single one.
         specs: of the problem as the environment states it.
         is_shared: whether the single learner observes the option.
-        explorations: what stands beside each learner; empty for nothing.
+        explorations: the exploration beside each learner; empty if there is none.
 
     Attributes:
         state_keys: the keys of the policies' state.
@@ -146,8 +146,8 @@ class OptionValues(nn.Module):
         num_options: how many options there are.
 
     Attributes:
-        memory_key: key of what the learners remember of the episode, and value states by; None if they remember
-            nothing, or nothing from before an option.
+        memory_key: key of the learners' memory of the episode, on which their values depend. None if they have no
+            memory, or one that begins anew with each option.
     """
 
     def __init__(self, learners: Sequence[Learner], num_options: int) -> None:
@@ -161,7 +161,7 @@ class OptionValues(nn.Module):
     def forward(self, observation: Tensor, action_mask: Tensor | None = None, memory: Tensor | None = None) -> Tensor:
         """Return the values `[N, num_options]` of observations `[N, observation_dim]`.
 
-        While exploring, the value is infinite if its learner has made no update yet.
+        While exploring, an option's value is infinite if its learner has made no update yet.
 
         Args:
             observation: of the states.
@@ -232,6 +232,12 @@ class HeldOption(TensorDictModuleBase):
         return td.set(keys.OPTION, option if mask is None else allowed_or_first(option, mask))
 
 
+def _at_decision(states: TensorDictBase) -> TensorDictBase:
+    """Return a shallow copy of states `[N]` in which a decision is due."""
+    is_decision = torch.ones(len(states), 1, dtype=torch.bool, device=states.get(keys.OBSERVATION).device)
+    return states.copy().set(keys.IS_DECISION, is_decision)
+
+
 class AgentNextOptions:
     """The `NextOptions` of an agent: its selector chooses them, and its learners give their values.
 
@@ -300,16 +306,14 @@ class AgentNextOptions:
         """Return the probabilities of the options `[N, num_options]`, see `NextOptions.probabilities`."""
         if not self.sees_observation_alone:
             return None
-        return self._probabilities(
-            TensorDict({keys.OBSERVATION: self._without_option(observation)}, [len(observation)])
-        )
+        seen = {keys.OBSERVATION: self._without_option(observation)}
+        return self._probabilities(TensorDict(seen, [len(observation)]))
 
     def _probabilities(self, td: TensorDictBase) -> Tensor | None:
         """Return the probabilities of the options `[N, num_options]` in what the selector reads of states, or None."""
         if self.decides_ends:
             return None
-        is_decision = torch.ones(len(td), 1, dtype=torch.bool, device=td.get(keys.OBSERVATION).device)
-        td = td.copy().set(keys.IS_DECISION, is_decision)
+        td = _at_decision(td)
         if self.pairs is None:
             return self.selector.option_probabilities(td)
         probabilities = self.selector.option_probabilities(self.pairs.with_pairs(td))
@@ -323,8 +327,7 @@ class AgentNextOptions:
             td: the entries that the selector reads of the states `[N]`, without `is_decision`.
             held: the options before, `[N]`.
         """
-        is_decision = torch.ones(len(td), 1, dtype=torch.bool, device=td.get(keys.OBSERVATION).device)
-        td = td.copy().set(keys.IS_DECISION, is_decision).set(keys.OPTION, held)
+        td = _at_decision(td).set(keys.OPTION, held)
         with acting(ExplorationType.DETERMINISTIC):
             if self.pairs is not None:
                 return self.pairs.split(self.selector.choose(self.pairs.with_pairs(td))[keys.OPTION])[0]
@@ -350,22 +353,22 @@ class AgentNextOptions:
     def with_steps_before(self, batch: TensorDictBase) -> TensorDictBase:
         """Return a batch `[*B, T]` behind the steps before it, `[*B, T + 1]`, for a selector that decides on ends.
 
-        The batch shows whether an option ended with the step before it. What is known of this step is the choice that
-        was held and, in the first root of the batch, what followed. All steps get these entries only.
+        The batch shows whether an option ended with the step before it. Two things are known of this step: the choice
+        that was held, and what followed, which is the first root of the batch. All steps get these entries only.
         """
         root = batch[..., :1]
         after = root.select(*batch.get("next").keys(True, True), strict=False)
-        # Where an episode begins, the one before it was reported as finished, or was given up.
+        # Where an episode begins, the episode before it was reported as finished, or was given up.
         goes_on = root.get(keys.EPISODE_STEPS) > 0
         after.set(keys.IS_DECISION, root.get(keys.IS_DECISION) & goes_on)
         before = root.get(keys.HELD).copy().set("next", after)
         return torch.cat([before, batch.select(*before.keys(True, True))], -1)
 
     def with_next_option(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return a shallow copy of a batch `[*B, T]` in which `("next", "option")` holds in the next state, `[*B, T]`.
+        """Return a shallow copy of a batch `[*B, T]` with the options that hold in the next states, `[*B, T]`.
 
-        If an option ends, that is the option of the next step. If the next step is not in the batch, it is the
-        selector's greedy option or, if its policy is stochastic, one drawn from that policy.
+        They are under `("next", "option")`. If an option ends, the option of the next step follows. If the next step is
+        not in the batch, the selector's greedy option follows, or one drawn from its policy if that is stochastic.
         """
         option = batch.get(keys.OPTION)
         is_ended = batch.get(("next", keys.OPTION_ENDED)).squeeze(-1)
@@ -394,8 +397,8 @@ class HierarchicalAgent(nn.Module):
         selector: the high level; None if the environment leaves no choice.
         learners: one for each option, or a single one.
         specs: of the problem as the environment states it.
-        is_shared: whether the single learner observes the option. Its own specs then count the one-hot option as part
-            of the observation.
+        is_shared: whether the single learner observes the option. The learner's specs then count the one-hot option as
+            part of the observation.
         is_frozen: whether the learners stay as they are.
         uniform_option_steps: number of steps at the beginning with uniform exploring choices; of decisions, if the
             learners are frozen. The selector learns from them.
@@ -403,16 +406,16 @@ class HierarchicalAgent(nn.Module):
         option_lengths: the lengths that the selector chooses from together with an option, in steps. The selector's
             `specs` then list the pairs as options (`PAMDPSpecs.with_option_lengths`). If empty, it chooses options
             alone.
-        explorations: what stands beside each learner; empty for nothing.
+        explorations: the exploration beside each learner; empty if there is none.
 
     Attributes:
         policy: writes `option`, if there is a selector, and the action leaves.
         router: the low level's part of `policy`.
         pairs: the pairs of options and lengths; None if the selector chooses options alone.
         values_end_with_trips: whether the learners' values end with a trip, if episodes are sessions of trips. The run
-            sets it, and the next one.
-        selector_values_end_with_trips: whether the selector's values do.
-        frames: how many steps (decisions) the agent has learned from.
+            sets this and the next attribute.
+        selector_values_end_with_trips: whether the selector's values end with a trip.
+        frames: how many steps the agent has learned from; how many decisions, if the learners are frozen.
 
     Raises:
         ValueError: the selector's `specs` list other options than the pairs.
@@ -614,10 +617,10 @@ class HierarchicalAgent(nn.Module):
     def exported(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to act greedily; None if a part cannot be exported.
 
-        Agents that choose lengths cannot.
+        An agent that chooses the lengths of options cannot be exported.
 
         `selector` is None if there is nothing to choose. `learners` has one entry for each option, or a single one.
-        With `is_shared` that one observes the one-hot option at the end of the observation.
+        With `is_shared` the single learner observes the one-hot option at the end of the observation.
         """
         learners = [learner.exported() for learner in self._learners()]
         selector = None if self.selector is None else self.selector.exported()

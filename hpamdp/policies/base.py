@@ -84,18 +84,17 @@ def known_ends(batch: TensorDictBase) -> Tensor:
 def added_later(module: nn.Module) -> set[str]:
     """Return the names of the entries of a state dict that checkpoints of earlier versions lack.
 
-    Modules list theirs in `added_later`. If they are missing, they stay as they are.
+    Modules list theirs in `added_later`. An entry that a checkpoint lacks keeps its initial value.
     """
     parts = module.named_modules(remove_duplicate=False)
     return {f"{prefix}.{name}".lstrip(".") for prefix, part in parts for name in getattr(part, "added_later", ())}
 
 
 def step_discounts(batch: TensorDictBase, gamma: float) -> float | Tensor:
-    """Return `gamma`, or if the environment writes durations, its power for each step, `[*B, T, 1]`.
+    """Return `gamma`; if the environment writes durations, `gamma ** duration` of each step, `[*B, T, 1]`.
 
     With one discount per step, an agent could put off costs by taking many short steps, which discount the future more.
-    H-PPO and the learners with a replay buffer count durations; Q-PAMDP, planning by a model
-    and selectors do not.
+    H-PPO and the learners with a replay buffer count durations. Q-PAMDP, learners that plan and selectors do not.
     """
     duration = batch.get(("next", keys.DURATION), None)
     return gamma if duration is None else gamma**duration
@@ -108,7 +107,7 @@ def finished_decisions(steps: TensorDictBase) -> TensorDictBase:
 
 
 class NextOptions(Protocol):
-    """Which options follow the one that ended, and what they are worth; the agent gives it to its learners.
+    """Which options follow the one that ended, and their values; the agent gives it to its learners.
 
     If an option has ended in a state, the value of that state is its value under the next option, by that option's
     own learner. Learners reach one another in this way only. Observations are in the form that the asking learner sees.
@@ -156,7 +155,8 @@ class NextOptions(Protocol):
     def probabilities(self, observation: Tensor) -> Tensor | None:
         """Return with which probability the selector would choose each option now, `[N, num_options]`.
 
-        None if it would take one for sure, decides where options end, or needs more than the observation: see `choose`.
+        None if its choice is certain, if it decides where options end, or if it needs more than the observation. Then
+        see `choose`.
 
         Args:
             observation: of the states in which an option has ended, `[N, observation_dim]`.
@@ -175,9 +175,9 @@ class Level:
             argument are refused. Append the keys to `in_keys`.
         guarded_settings: settings that can run code, read files or reach servers.
         may_be_nan: the columns of the replay buffer that may hold NaN.
-        export_refusal: why its greedy policy cannot be exported to ONNX, if it cannot.
-        takes_pictures: whether observations may have pictures: they go through `policies.shared.perception`, or nothing
-            reads observations. Others are refused, since a picture is flattened only if the user asks for it.
+        export_refusal: why its greedy policy cannot be exported to ONNX. If None, it can.
+        takes_pictures: whether observations may have pictures, because they go through `policies.shared.perception` or
+            nothing reads them. If not, pictures are refused: they are flattened only if the user asks for it.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
@@ -256,7 +256,7 @@ class Selector(Level, TensorDictModuleBase):
     A decision is due if an episode begins or the previous option has ended. `forward` holds the options between
     decisions. A subclass writes `select` and, if it learns, `learn`::
 
-        class GreedyMean(Selector):  # epsilon-greedy by the mean rewards of the options, all of which are allowed
+        class GreedyMean(Selector):  # epsilon-greedy by the options' mean rewards; no option may be forbidden
             def __init__(self, specs: PAMDPSpecs, *, epsilon: Fraction) -> None:
                 super().__init__(specs)
                 self.epsilon = epsilon
@@ -286,7 +286,7 @@ class Selector(Level, TensorDictModuleBase):
     `[*B, observation_dim]`, `is_decision` bool `[*B, 1]` and, if the problem forbids options, `option_mask` bool
     `[*B, num_options]`. Forbidden options must neither be chosen nor count in a target. `forward` writes `out_keys`:
     `option` int64 `[*B]`. If `learn` needs to know more about a choice, such as its log-probability, append a key to
-    `out_keys` and return it from `choose` and `choose_uniformly`, first dimensions `[*B]`. The key is held with the
+    `out_keys`. Return it from `choose` and `choose_uniformly`, with first dimensions `[*B]`. The key is held with the
     option and is in the batch that `learn` gets.
 
     State: the same module acts in training and evaluation, with different numbers of environments. So the state of an
@@ -296,21 +296,21 @@ class Selector(Level, TensorDictModuleBase):
 
     Attributes:
         asks_learners: whether the selector needs `option_values`.
-        option_values: maps observations `[N, observation_dim]`, the states' action masks and what the learners remember
-            of the steps before, each or None, to the learners' values of each option, `[N, num_options]`. The agent
-            gives it if `asks_learners`.
+        option_values: the learners' values of each option, `[N, num_options]`, as a function. Its arguments are
+            observations `[N, observation_dim]`, the states' action masks or None, and what the learners remember of the
+            steps before or None. The agent gives it if `asks_learners`.
         gamma: discount of an environment step, whatever the length of the options. It discounts `option_return` and
             the value of the next decision, see `next_discount`.
         ends_options: whether the selector can decide where options end, by `ends`.
         decides_ends: whether it does so in this run (`agent.termination=learned`). The agent sets it.
         lengths_refusal: why the selector cannot choose pairs of an option and its length (`agent.termination=chosen`).
-            If None, it can: its `specs` then list the pairs as options. If it `needs` the environment's entries or
-            `asks_learners`, the run knows that it cannot.
+            If None, it can: its `specs` then list the pairs as options. A selector with `needs`, or that
+            `asks_learners`, is refused in any case.
         is_bandit: True if the selector uses an option's return as its full value, that is, does not bootstrap. Its
             options must last as long as their episodes or trips; others are refused.
         modes: what the selector can learn from: its own choices (`train`), or a data set of other choices (`offline`).
             A data set lacks keys that a selector adds to `out_keys`, so such a selector usually has `train` alone.
-        memory_key: under which the selector's memory of earlier decisions lies in a step, if it has one.
+        memory_key: key of the selector's memory of earlier decisions in a step; None if it has no memory.
         is_uniform: bool scalar, a buffer that the agent sets. It is true for the first `agent.uniform_option_steps`
             steps of a run. Exploring choices then come from `choose_uniformly`, so that every learner gets data.
         pending: how many decisions for each option have not yet reached `learn`, int64 `[num_options]`. The agent sets
@@ -537,9 +537,8 @@ class Learner(Level, nn.Module):
       `out_keys`. The key is in the batch that `learn` gets.
     - The policy gets only the environments whose option is its learner's, so their number changes from step to step. It
       also acts in evaluation. So the module must not remember anything about an episode. State that the policy needs
-      from step to step travels in the tensordict, under a key `[*B, ...]` that is among both its `in_keys` and its
-      `out_keys`. The key is missing before the first step. If `is_decision` is true, its value is left over from an
-      earlier option.
+      from step to step travels in the tensordict: its key `[*B, ...]` is among both `in_keys` and `out_keys`. The key
+      is missing before the first step. If `is_decision` is true, its value is left over from an earlier option.
     - The policy may run as a copy in another process, which receives its parameters and buffers only. So whatever
       changes during training, such as an exploration rate, must be one of them.
 
@@ -575,7 +574,7 @@ class Learner(Level, nn.Module):
         progress: the buffers, by the last part of their names, that count the steps of a run, or follow from such
             counters. They are reset if a new run takes over the learner.
         next_options: which options follow one that ended, and their values. The agent sets it.
-        while_compiling: gives a context for updates that are compiled first, which takes seconds. The run sets it.
+        while_compiling: makes a context for updates that are compiled first, which takes seconds. The run sets it.
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train",)
@@ -632,7 +631,8 @@ class Learner(Level, nn.Module):
     def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
         """Return the values `[N]` of states for a target; arguments as for `value`.
 
-        They are those of `value`. Override it if a target needs others, as with the target smoothing of TD3.
+        By default they are those of `value`. Override it if a target needs other values, as with the target smoothing
+        of TD3.
         """
         given = [] if action_mask is None else [action_mask]
         return self.value(observation, *given, **memory)
@@ -648,7 +648,7 @@ class Learner(Level, nn.Module):
         """Learn with a reward for new states from now on; an exploration calls it. Override it if plans need it.
 
         Raises:
-            SettingError: the learner cannot use this one.
+            SettingError: the learner cannot use this bonus.
         """
         self.bonus = bonus
 
@@ -708,7 +708,7 @@ class Learner(Level, nn.Module):
             state: the `state_dict` of that learner.
 
         Raises:
-            RuntimeError: it is of another class or size.
+            RuntimeError: the state is of a learner of another class or size.
         """
         own = self.state_dict()
         fresh = {name: value for name, value in own.items() if name.rpartition(".")[2] in self.progress}

@@ -21,7 +21,6 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector
-from hpamdp.specs import PAMDPSpecs
 
 # The lengths of the source, if `agent.option_lengths` is not set.
 DEFAULT_LENGTHS = (1, 2, 4, 8, 16, 32, 64, 128)
@@ -49,10 +48,6 @@ class OptionLengths(nn.Module):
     def extra_repr(self) -> str:
         """Return the lengths as text."""
         return str(self.lengths.tolist())
-
-    def specs_of_pairs(self, specs: PAMDPSpecs) -> PAMDPSpecs:
-        """Return the specs of a selector whose options are the pairs."""
-        return specs.with_option_lengths(self.lengths.tolist())
 
     def with_pairs(self, rows: TensorDictBase) -> TensorDictBase:
         """Return a shallow copy of steps or decisions `[*B]` in the form that the selector sees."""

@@ -56,14 +56,14 @@ class Callback:
 
         Args:
             trainer: the running training.
-            row: the new row of metrics. Names of evaluated figures begin with `eval/`.
+            row: the new row of metrics. Names of the evaluation's metrics begin with `eval/`.
         """
 
     def on_end(self, trainer: Trainer) -> None:
         """Act after the last batch, before the agent is saved."""
 
     def metrics(self, trainer: Trainer) -> Mapping[str, float]:
-        """Return figures for the next row of metrics, in which `own/` precedes their names."""
+        """Return numbers by their names for the next row of metrics, in which `own/` precedes the names."""
         return {}
 
     def state(self) -> dict[str, Any]:
@@ -219,7 +219,7 @@ class TimeLimit(Callback):
 
 
 class OwnMetrics(Callback):
-    """Add a function's figures to each row of metrics.
+    """Add a function's numbers to each row of metrics.
 
     Args:
         function: gets the trainer and returns finite numbers by their names.
@@ -231,7 +231,7 @@ class OwnMetrics(Callback):
         self._function = function
 
     def metrics(self, trainer: Trainer) -> Mapping[str, float]:
-        """Return the function's figures."""
+        """Return the function's numbers."""
         return self._function(trainer)
 
 

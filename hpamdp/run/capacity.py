@@ -25,7 +25,7 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
 from hpamdp.specs import PAMDPSpecs
 
-# Fewer steps or episodes than this need no estimate of their memory, which takes building an environment.
+# The memory of fewer steps or episodes than this is not estimated, because the estimate has to build an environment.
 _MANY = 1_000_000
 # Each weight takes four numbers: itself, its gradient and two moments of Adam.
 _BYTES_A_WEIGHT = 16

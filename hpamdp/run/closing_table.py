@@ -14,8 +14,7 @@ from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 
 WITHOUT_UPDATE = "without_update"  # names of the levels that made no update
 SHORT_SIGHT = "short_sight"  # lines about learners that look far less ahead than episodes last
-# An episode is far longer than a learner looks ahead if it has more than this many times the steps.
-_FAR = 4.0
+_FAR = 4.0  # times the steps that a learner looks ahead; longer episodes count as far longer
 
 
 def _number(value: float) -> str:
@@ -29,10 +28,9 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     """Return a plain aligned table of this agent beside the references.
 
     Args:
-        summary: the agent's figures by their names, `references`, `mode`, `frames`, `wall_s`,
-            `without_update` and `short_sight`.
-            Rows that the agent has no figure for are left out, and so are columns without any.
-        metrics: the rows.
+        summary: the agent's metrics by their names, `references`, `mode`, `frames`, `wall_s`, `without_update` and
+            `short_sight`.
+        metrics: the rows. Rows without a value for the agent are left out, and so are columns without any value.
     """
     titles = {name: title for name, (title, _, _) in REFERENCES.items()}
     beside = summary.get("references", {})
@@ -40,13 +38,13 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     columns = {"this agent": summary, **columns}
     rows = [metric for metric in metrics if _is_known(summary.get(metric.name))]
     columns = {
-        title: figures
-        for title, figures in columns.items()
-        if any(_is_known(figures.get(metric.name)) for metric in rows)
+        title: measured
+        for title, measured in columns.items()
+        if any(_is_known(measured.get(metric.name)) for metric in rows)
     }
     cells = [["", *columns]] if rows else []
     for metric in rows:
-        values = [figures.get(metric.name) for figures in columns.values()]
+        values = [measured.get(metric.name) for measured in columns.values()]
         cells.append([metric.title, *(_WRITE[metric.kind](value) if _is_known(value) else "" for value in values)])
     widths = [max(len(cell) for cell in column) for column in zip(*cells, strict=True)]
     lines = []

@@ -135,8 +135,9 @@ class Evaluation:
 
     def _film(self, states: list[dict[str, Tensor]] | None) -> None:
         """Append the current state of the filmed episodes to `states`."""
-        is_short = states is not None and (self.filmed_steps is None or len(states) <= self.filmed_steps)
-        if states is not None and is_short and self.num_filmed > 0:
+        if states is None or self.num_filmed == 0:
+            return
+        if self.filmed_steps is None or len(states) <= self.filmed_steps:
             states.append(self.problem.film_state(self.num_filmed))
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -162,10 +163,10 @@ class Evaluation:
         if "option_scores" not in played:
             return means
         held, score = played["option_scores"], played["score"]
-        shares = np.bincount(played["option"], minlength=held.shape[1]) / len(score)
+        frequencies = np.bincount(played["option"], minlength=held.shape[1]) / len(score)
         means["regret"] = float((held.max(1) - score).mean())
         means["choice_gain"] = float(score.mean() - held.mean(0).max())
-        means["choice_entropy"] = float(-(shares * np.log(np.maximum(shares, 1e-12))).sum())
+        means["choice_entropy"] = float(-(frequencies * np.log(np.maximum(frequencies, 1e-12))).sum())
         scores = zip(self.env.option_names, held.mean(0), strict=True)
         return means | {f"score_{name}": float(mean) for name, mean in scores}
 
@@ -176,7 +177,8 @@ def _chosen_length(td: TensorDictBase, over: Tensor) -> Tensor | None:
     return None if length is None else _unless(over | ~td.get(keys.IS_DECISION).squeeze(-1), length)
 
 
-def _unless(over: Tensor, position: Tensor | None) -> Tensor | None:
-    if position is None:
+def _unless(is_left_out: Tensor, values: Tensor | None) -> Tensor | None:
+    """Return values `[N, ...]` with NaN in the rows that are left out, bool `[N]`; None without values."""
+    if values is None:
         return None
-    return torch.where(over.reshape(-1, *[1] * (position.ndim - 1)), torch.nan, position)
+    return torch.where(is_left_out.reshape(-1, *[1] * (values.ndim - 1)), torch.nan, values)

@@ -36,7 +36,7 @@ class LoadedAgent:
         config: config of the agent and its problem.
         agent: the agent, with the weights of its checkpoint if there is one.
         env: one environment, which scales observations as the agent's own did.
-        progress: what the checkpoint tells of its run; empty without one.
+        progress: what the checkpoint tells of its run; empty without a checkpoint.
     """
 
     config: Config

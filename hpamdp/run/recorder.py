@@ -48,7 +48,7 @@ class _State(SavedPart):
 
 
 class Recorder:
-    """Collect a run's figures and write them to its output folder and its logger.
+    """Collect a run's metrics and write them to its output folder and its logger.
 
     Args:
         config: config of the run.

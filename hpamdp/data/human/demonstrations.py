@@ -27,7 +27,7 @@ class PeoplesOptions(Settings):
     successes: bool = False
     """Take only episodes that ended in the dock."""
     best_people: PositiveInt | None = None
-    """Take only episodes of this many people with the highest mean scores. If None, of all people."""
+    """Take only episodes of this many people with the highest mean scores. If null, of all people."""
     rest_to_rest: bool = True
     """Convert interrupted presses to rest-to-rest presses, the only presses that the environment has."""
 
@@ -36,9 +36,9 @@ class HumanOptions(PeoplesOptions):
     """Settings of `HumanDemonstrations`."""
 
     path: str | None = None
-    """The released file. If None, the path in $HPAMDP_HUMAN_DATA, or else the downloaded file."""
+    """The released file. If null, the path in $HPAMDP_HUMAN_DATA, or else the downloaded file."""
     checksum: str | None = SHA256
-    """The SHA-256 that the file must have, by default the released file's. If None, any file is accepted."""
+    """The SHA-256 that the file must have, by default the released file's. If null, any file is accepted."""
     complete: bool = False
     """Take only episodes with a complete log of presses."""
 

@@ -47,19 +47,19 @@ class BoatDockOptions(Settings):
     slip: Fraction = 0.0
     """Probability that a uniformly random key is pressed instead."""
     boats: Annotated[tuple[str, ...], Field(min_length=1), FromList] | None = None
-    """Controllers to choose from, named as in `controllers`. If None, incongruent (with `keymap`) and congruent."""
+    """Controllers to choose from, named as in `controllers`. If null, incongruent (with `keymap`) and congruent."""
     controllers: dict[str, Degrees] = CONTROLLER_DEGREES
     """For each controller the directions in which its three keys push, in degrees: 0 to the right, 90 down.
 
     Add one with +env.controllers.NAME=[0,120,240], and name it in `boats`.
     """
     switch_cost: Annotated[float, Field(ge=0.0, le=TANK)] | None = None
-    """Seconds of fuel for changing the controller at a press. If None, it is kept for the episode.
+    """Seconds of fuel for changing the controller at a press. If null, it is kept for the episode.
 
     It goes with agent.termination=steps, learned or chosen.
     """
     recording: str | None = None
-    """A file of `hpamdp play`, whose figures replace people's in tables and curves. If None, people's."""
+    """A file of `hpamdp play`, whose figures replace people's in tables and curves. If null, people's."""
     compile_rules: bool = False
     """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 

@@ -44,7 +44,7 @@ class ReleasedBoatDockOptions(Settings):
     test_mode: Literal[0, 1, None] = None
     """If 1, only layouts with a bearing within 30 degrees of the incongruent controller's directions.
 
-    If 0, only the other layouts. If None, all layouts.
+    If 0, only the other layouts. If null, all layouts.
     """
     frozen_layouts: bool = True
     """Keep the layout of the first reset for all episodes, as released. If false, every episode has a new layout."""

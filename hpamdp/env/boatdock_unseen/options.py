@@ -34,7 +34,7 @@ class UnseenBoatsOptions(Settings):
     spread: Annotated[float, Field(ge=0.0, le=0.5), OnlyWith("family", "strength")] = 0.3
     """With `family=strength`: speed and glide are up to this fraction above or below those of people's boats."""
     fleet_size: Annotated[int, Field(ge=1, le=2**24)] | None = None
-    """Number of different boats in training. If None, each session draws new ones."""
+    """Number of different boats in training. If null, each session draws new ones."""
     fleet_seed: Annotated[int, Field(ge=0, lt=2**32), OnlyWith("fleet_size")] = 0
     """With a `fleet_size`: which boats these are."""
     scored_boats: Literal["new", "training"] = "new"

@@ -74,12 +74,12 @@ class CircuitOptions(Settings):
     floor: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
     """With `reward=gain`: the score from which the gain counts. Local maxima below it are not rewarded.
 
-    If None, the score of no gates.
+    If null, the score of no gates.
     """
     target_number: NonNegativeInt | None = None
     """With random targets: number of the one target of all episodes, as in the published runs.
 
-    If None, each episode has its own.
+    If null, each episode has its own.
     """
     begin: Literal["empty", "known", "near_target"] = "empty"
     """How training episodes begin. `empty`: without gates, as evaluation always does.
@@ -100,7 +100,7 @@ class CircuitOptions(Settings):
     observe_depth: bool = False
     """Whether the observation ends in the depth of each wire, as a fraction of the limit."""
     max_steps: PositiveInt | None = None
-    """Actions after which a circuit is finished. If None, twice the number of wires times the depth limit.
+    """Actions after which a circuit is finished. If null, twice the number of wires times the depth limit.
 
     No circuit reaches that.
     """

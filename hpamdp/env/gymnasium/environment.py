@@ -60,7 +60,7 @@ class GymnasiumOptions(Settings):
     kwargs: dict[str, Any] | None = None
     """Arguments of the environment's constructor, as in `env.kwargs={size:5}`."""
     max_steps: PositiveInt | None = None
-    """Steps after which an episode is truncated. If None, the limit of the `TimeLimit` wrapper or of the spec."""
+    """Steps after which an episode is truncated. If null, the limit of the `TimeLimit` wrapper or of the spec."""
     action_form: ActionForm = "auto"
     """How the action space is read. `auto`: a `Discrete` and boxes beside it can be one choice with its parameters.
 
@@ -68,38 +68,38 @@ class GymnasiumOptions(Settings):
     `OneOf` is then a choice with parameters of its own.
     """
     parameter_dims: list[int] | None = None
-    """How many parameters each discrete action takes of one box for all, as in [1, 1, 0]. If None, the whole box."""
+    """How many parameters each discrete action takes of one box for all, as in [1, 1, 0]. If null, the whole box."""
     option_key: int | str | None = None
-    """The option's name in a `Dict` of actions or its number in a `Tuple`. If None, the entry `option`, if any."""
+    """The option's name in a `Dict` of actions or its number in a `Tuple`. If null, the entry `option`, if any."""
     action_mask: MaskSource | None = None
     """Where the environment says which actions it forbids. `info`: `action_mask` and `option_mask` in each info.
 
-    `ignore`: masks are ignored. If None, the entries `action_mask` and `option_mask` of a `Dict` of observations, if it
+    `ignore`: masks are ignored. If null, the entries `action_mask` and `option_mask` of a `Dict` of observations, if it
     has them. A mask in another place, such as a method `action_masks()`, is refused unless masks are ignored.
     """
     pair_mask: MaskSource | None = None
     """Where the environment says which discrete actions of different components go together, `pair_mask`.
 
-    `info`: in each info; `ignore`: it is ignored. If None, the entry of a `Dict` of observations, if it has one.
+    `info`: in each info; `ignore`: it is ignored. If null, the entry of a `Dict` of observations, if it has one.
     """
     parameter_bounds: MaskSource | None = None
     """Where the environment gives bounds of the current state, `parameter_low` and `parameter_high`.
 
-    `info`: in each info; `ignore`: they are ignored. If None, entries of a `Dict` of observations, if it has them.
+    `info`: in each info; `ignore`: they are ignored. If null, entries of a `Dict` of observations, if it has them.
     """
     observation_keys: list[int | str] | None = None
-    """Entries of a `Tuple` or `Dict` to observe, as in [0] or [position, speed]. If None, all but masks and bounds."""
+    """Entries of a `Tuple` or `Dict` to observe, as in [0] or [position, speed]. If null, all but masks and bounds."""
     observation_scaling: Scaling = "bounds"
     """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not.
 
     Pictures stay as they are; an encoder divides them by 255.
     """
     raw_observations: list[int | str] | None = None
-    """Entries that stay unscaled: names in a `Dict`, numbers in a `Tuple` or of the vector. If None, all are scaled."""
+    """Entries that stay unscaled: names in a `Dict`, numbers in a `Tuple` or of the vector. If null, all are scaled."""
     reward_scaling: PositiveFraction | None = None
     """Divide rewards in training by the running standard deviation of the return with this discount.
 
-    If None, rewards are not scaled.
+    If null, rewards are not scaled.
     """
     out_of_bounds: OutOfBounds = "refuse"
     """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""

@@ -31,7 +31,7 @@ class LunarLanderOptions(LanderRules):
     reward_scaling: PositiveFraction | None = None
     """Divide rewards in training by the running standard deviation of the return with this discount.
 
-    If None, rewards are not scaled.
+    If null, rewards are not scaled.
     """
     num_workers: NonNegativeInt = 0
     """Processes that step the environments in parallel. If 0, this process steps them."""

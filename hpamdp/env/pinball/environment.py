@@ -38,7 +38,7 @@ class PinballOptions(Settings):
     training_start: Literal["map", "anywhere", "both"] | None = None
     """Where the episodes of training begin; with `both`, half of them at the start of the map and half `anywhere`.
 
-    If None, they begin where those of evaluation do, see `start`.
+    If null, they begin where those of evaluation do, see `start`.
     """
     max_steps: PositiveInt = 600
     """Steps after which an episode is truncated."""

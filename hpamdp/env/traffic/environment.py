@@ -56,7 +56,7 @@ class TrafficOptions(Settings):
     reward_scaling: PositiveFraction | None = None
     """Divide rewards in training by the running standard deviation of the return with this discount.
 
-    If None, rewards are not scaled.
+    If null, rewards are not scaled.
     """
     num_workers: NonNegativeInt = 0
     """Worker processes that call the simulations. If 0, this process calls one after another.

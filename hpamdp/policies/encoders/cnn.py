@@ -5,7 +5,7 @@ Espeholt et al. 2018, *IMPALA*, arXiv 1802.01561, figure 3, the deep network wit
 
 Differs from the sources:
 - weights are orthogonal at the start, as in the implementations of PPO;
-- channels and features can be set. The sources' are the defaults.
+- channels and features can be set. The defaults are those of the sources.
 
 `nature` is TorchRL's ConvNet. TorchRL has no residual blocks, so `impala` is written out here.
 """

@@ -5,8 +5,8 @@ Exploration for Deep Reinforcement Learning*, 2017, arXiv 1611.04717, section 2.
 hash was counted n times has the bonus n^-1/2.
 
 Differs from the source:
-- a state's cell is its observation, multiplied by `resolution` and rounded. Random projections suit pictures; they
-  mix places with what the agent holds;
+- a state's cell is its observation, multiplied by `resolution` and rounded. The source's random projections suit
+  pictures. Of a vector, they would mix entries of different meaning, such as a place and what the agent holds;
 - learners with a replay buffer add the bonus when they sample, and learners that plan add it in exploring plans, as
   with `novelty`.
 """
@@ -135,13 +135,13 @@ class Counts(RewardsNewStates):
             raise SettingError(f"resolution={given}: must have a number for each of {num_entries} entries")
         super().__init__(learner, options.weight)
         self.options = options
-        self.table = VisitTable(learner.specs.observation_dim, self.options)
+        self.table = VisitTable(num_entries, self.options)
         self.to(checked_device(self, device))
         learner.take_bonus(Bonus(self.options.weight, self.table.bonus))
 
     def acting_policy(self, learner: Learner) -> TensorDictModuleBase:
         """Return the learner's policy, with the table if its plans need it."""
-        return NoveltyPolicy(learner.policy, self.table) if self.plans else learner.policy
+        return NoveltyPolicy(learner.policy, self.table) if self.adds_to_plans else learner.policy
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> Explored:
         """Count the states that were reached; return the bonus of the steps, if it is due."""

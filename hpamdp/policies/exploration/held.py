@@ -111,10 +111,8 @@ class HeldPolicy(TensorDictModuleBase):
         if begins is not None:
             is_new = begins == 0 if self.begins_key == keys.EPISODE_STEPS else begins
             steps = steps.masked_fill(is_new.reshape(shape), 0)
-        allowed, pair_mask = (
-            self.specs.allowed(observation, td.get(keys.ACTION_MASK, None)),
-            td.get(keys.PAIR_MASK, None),
-        )
+        allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
+        pair_mask = td.get(keys.PAIR_MASK, None)
         discrete = random_discrete(self.specs, shape, allowed, device, pair_mask)
         unit = 2.0 * torch.rand(*shape, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
         begins_hold = torch.rand(shape, device=device, dtype=torch.float32) < self.epsilon

@@ -48,14 +48,14 @@ class RewardsNewStates(Exploration):
             raise SettingError("low.augment=true: maps states to others that were never visited; use low.augment=false")
         self.weight = weight
         self.adds_to_reward = learner.novelty_by == "reward"
-        self.plans = learner.novelty_by == "plan"
+        self.adds_to_plans = learner.novelty_by == "plan"
 
     def explored(self, bonus: Tensor, mask: Tensor, scalars: dict[str, float]) -> Explored:
         """Return what `learn` returns.
 
         Args:
             bonus: of the learner's own steps `[N]`, not weighted.
-            mask: which steps are its own, bool `[*B, T]`.
+            mask: which steps are the learner's own, bool `[*B, T]`.
             scalars: to log beside the mean bonus.
         """
         scalars = {"bonus": bonus.mean().item(), **scalars}

@@ -72,8 +72,8 @@ class NoveltyOptions(Settings):
     in_plans: Literal["auto", "disagreement", "distillation"] = "auto"
     """Bonus of learners that plan: an ensemble's `disagreement` about the next state, or random network `distillation`.
 
-    `auto` takes the disagreement if there is such an ensemble. It has no bonus where simple dynamics are known already
-    in places that nobody has seen.
+    `auto` takes the disagreement if there is such an ensemble. The disagreement gives no bonus in new places whose
+    simple dynamics the ensemble predicts already.
     """
 
 
@@ -175,12 +175,12 @@ class Novelty(RewardsNewStates):
 
     def acting_policy(self, learner: Learner) -> TensorDictModuleBase:
         """Return the learner's policy, with the network if its plans need it."""
-        if not self.plans or self.network is None:
+        if not self.adds_to_plans or self.network is None:
             return learner.policy
         return NoveltyPolicy(learner.policy, self.network)
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> Explored:
-        """Learn which states are no longer new; return the bonus of the steps as they were before, if it is due."""
+        """Learn which states are no longer new; return the bonus from before this update, if it is due."""
         if self.network is None or not mask.any():
             return Explored(None, {})
         observation = batch.get(("next", keys.OBSERVATION))[mask]

@@ -56,7 +56,7 @@ class ActorOptions(SelectorMemoryOptions, OnPolicyOptions):
     epochs: Annotated[int, Field(ge=1, le=1000)] = 4
     """Passes over the collected decisions in an update."""
     minibatch_size: PositiveInt = 64
-    """Decisions in an optimisation step, and the least number of decisions that an update waits for."""
+    """Decisions in a gradient step, and the least number of decisions that an update waits for."""
     entropy: NonNegativeFloat = 0.1
     """Weight of the entropy bonus. With 0.02 the policy settles on the option whose learner improves first."""
 

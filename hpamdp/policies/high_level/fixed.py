@@ -26,7 +26,7 @@ class Fixed(Selector):
     """Choose the same option at every decision; if it is forbidden, the first allowed one.
 
     Raises:
-        ValueError: the problem has no such option.
+        SettingError: the problem has no such option.
     """
 
     Options = FixedOptions

@@ -3,8 +3,8 @@
 Source: Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 3.2. Exploration by the upper confidence
 bounds of an ensemble: Chen, Sidor, Abbeel and Schulman 2017, arXiv 1706.01502.
 
-If the selector decides when options end, it interrupts an option as soon as another one is worth more (section 4 of the
-first source).
+If the selector decides when options end, it interrupts an option as soon as another one has a higher value (section 4
+of the first source).
 
 Differs from the sources:
 - values do not bootstrap past the end of an episode, also if a time limit ended it;
@@ -46,7 +46,7 @@ class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
     num_members: PositiveInt = 3
     """Number of critics in the ensemble."""
     exploration: Literal["epsilon", "ucb"] = "epsilon"
-    """A random option with a decaying probability, or the option with the highest upper confidence bound."""
+    """`epsilon`: a random option with a decaying probability. `ucb`: the option with the highest upper bound."""
     epsilon_decisions: Annotated[NonNegativeInt, OnlyWith("exploration", "epsilon")] = 1000
     """Finished decisions, after the warm-up, over which the probability of a random option falls.
 
@@ -140,7 +140,7 @@ class MetaCritic(RemembersDecisions):
 
     @torch.no_grad()
     def ends(self, td: TensorDictBase) -> Tensor:
-        """Return where another option is worth more than the held one, bool `[*B]`; exploring, also at random.
+        """Return where another option has a higher value than the held one, bool `[*B]`; exploring, also at random.
 
         If the option with the highest Q never ended, the other options would collect no data.
         """
@@ -198,7 +198,7 @@ class MetaCritic(RemembersDecisions):
         return unpacked_states(sample_with_past(self.buffer, size, num_past), self.specs)
 
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
-        """Return what is stored of decisions `[*B]`: states as the critics see them, unless the memory is recurrent."""
+        """Return what is stored of decisions `[*B]`; states are features if `stores_features`, else observations."""
         after = decisions.get("next")
         rows = {
             "state": after.get(keys.DECISION_OBSERVATION),

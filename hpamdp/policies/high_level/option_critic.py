@@ -13,7 +13,7 @@ Differs from the sources:
 - the value of a state is max_o Q(s, o), without the random choices;
 - values do not bootstrap past the end of an episode, also if a time limit ended it;
 - beta is learned by logistic regression, weighted by the size of the advantage. Its gradient has the sign of the
-  source's, but does not vanish if beta is close to 0 or 1 and wrong, as early values can make it;
+  source's. It does not vanish where wrong early values have driven beta close to 0 or 1;
 - while exploring, beta is mixed with `initial_termination`, by the probability of a random option;
 - if the policy is greedy, an option ends where beta is above 1/2.
 """
@@ -174,12 +174,12 @@ class OptionCritic(RemembersDecisions):
         return {**scalars, "epsilon": self.epsilon}
 
     def _rows(self, batch: TensorDictBase) -> TensorDict:
-        """Return what is stored of a batch `[*B, T]`, states as the networks see them; `discount` is 0 at its ends."""
+        """Return what is stored of a batch `[*B, T]`; states are features, `discount` is 0 where an episode ends."""
         after = batch.get("next")
         done = after.get(keys.DONE).squeeze(-1)
         held = self.held(batch)
         state = self.perception(batch.get(keys.OBSERVATION), held)
-        if held is not None:  # which has seen the observation of a decision already
+        if held is not None:  # at a decision, the memory has seen the observation already
             at_decision = self.perception(batch.get(keys.OBSERVATION), held, has_seen=True)
             state = torch.where(batch.get(keys.IS_DECISION), at_decision, state)
         rows = {

@@ -47,7 +47,7 @@ class ValueOptions(Settings):
 class Value(Selector):
     """Choose the option with the highest value; while exploring, some options are random.
 
-    With `untried_first`, which options its session has tried travels in the tensordict, as the choice does.
+    With `untried_first`, the options that a session has tried travel in the tensordict, as the choice does.
     """
 
     Options = ValueOptions

@@ -14,9 +14,9 @@ Differs from the source:
   faster than the mean moves. This limit, the learning rate and the entropy bonus are annealed over `anneal_steps`, and
   so is an upper limit, if `max_scale_final` is set.
 - With `vector_products` actors and critic also see products of the vectors that the problem declares.
-- Where an exploration has taken another action than the policy's (`is_overruled`), the step counts in the values and in
-  the advantages of the steps before it, but not in the surrogates. That is the policy gradient of the return that is
-  earned with these actions among the policy's own: their probability does not depend on the policy.
+- Where an exploration has taken another action than the policy's (`is_overruled`), the step has no part in the
+  surrogates. It counts in the values, and in the advantages of the steps before it. That is the policy gradient of the
+  return under both kinds of actions: the probability of the exploration's actions does not depend on the policy.
 - With `memory` actors and critic share a memory of the history. A recurrent one is trained on whole sequences, each
   from the state that was stored at its first step.
 
@@ -85,7 +85,7 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     max_scale: PositiveFloat = 1.0
     """Largest standard deviation at the start."""
     max_scale_final: PositiveFloat | None = None
-    """Largest standard deviation after `anneal_steps`; the limit falls from `max_scale` to this value. None keeps it.
+    """Largest standard deviation after `anneal_steps`; the limit falls from `max_scale` to it. If null, it stays.
 
     Where noise on a parameter costs little, its standard deviation stays large. Then the means are never tried alone,
     but evaluations use them alone.
@@ -97,8 +97,7 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     gae_lambda: Fraction = 0.95
     """Lambda of the generalised advantages: 0 bootstraps after one step, 1 at the end of the episode."""
     least_deviation: NonNegativeFloat = 0.0
-    """Advantages are divided by their standard deviation, or by this number if it is larger. Its unit is that of the
-    scaled rewards.
+    """Lower limit of the standard deviation by which advantages are divided, in the unit of the scaled rewards.
 
     While nothing is rewarded, all advantages are errors of the critic. Divided by their own small deviation, they move
     the policy as much as rewards would: its noise and its entropy fall before it has found anything.
@@ -129,10 +128,10 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     max_grad_norm: PositiveFloat = 1.0
     """Largest gradient norm, of actors and critic together."""
     credit: Credit = "joint"
-    """Advantage of each component of an action. `joint`: the advantage of the action.
+    """Advantage of each component of an action. `joint`: the advantage of the whole action.
 
     `summed` and `mixed` subtract what the other components contributed to it. A critic learns the contributions, whose
-    sum (`summed`) or monotonic function (`mixed`) is the advantage of the action.
+    sum (`summed`) or monotonic function (`mixed`) is the advantage of the whole action.
     """
     greedy_discrete: Literal["most_probable", "sampled"] = "most_probable"
     """Discrete action of the greedy policy; its parameters are the means. `sampled` draws it, as in the published code.
@@ -352,8 +351,8 @@ class HPPO(OnPolicy, Learner):
         """Return the generalised advantages and the targets of V, each `[*B, T]`; only the rows in `mask` are valid.
 
         Bootstrapping stops where the episode terminates; the trace stops at truncations, too. If options end inside
-        their episodes, the trace goes on through the rows of the options that follow, each with the value of its own
-        learner. If they last as long as their episodes, the rows of other learners are treated as zeros.
+        their episodes, the trace goes on through the rows of the options that follow. Each row has the value of its own
+        learner. If options last as long as their episodes, the rows of other learners are treated as zeros.
         """
         after = batch.get("next")
         if keys.OPTION_ENDED in after.keys():
@@ -455,7 +454,7 @@ class HPPO(OnPolicy, Learner):
             ValueError: it cannot be traced, or this machine cannot compile.
         """
         self.perception.check_traceable()
-        # Minibatches differ in size where other options take their share of the steps.
+        # Minibatches differ in size if other options take some of the steps.
         self.descent.compile(self.frames.device, any_size=True, while_compiling=lambda: self.while_compiling())
 
     def lower_precision(self) -> None:

@@ -70,7 +70,7 @@ from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.settings import LearningRate, OnlyWith
 from hpamdp.specs import PAMDPSpecs
 
-# Largest squashed parameter that is kept of an executed action, whose inverse tanh is finite.
+# Squashed parameters of executed actions are clamped to this number, whose inverse tanh is finite.
 _LARGEST_EXECUTED = 1.0 - 1e-6
 
 
@@ -105,7 +105,7 @@ class HSACOptions(HeadOptions, ReplayMemoryOptions, ActorCriticOptions, TargetRa
     component_samples: Annotated[int, Field(ge=2, le=64)] = 4
     """Actions sampled in each state to estimate its soft value, if an action has several components.
 
-    With `autoregressive` only in targets: the actor's loss values all choices of one component in each state.
+    With `autoregressive`, only targets use samples: the actor's loss values all choices of one component in each state.
     """
 
 

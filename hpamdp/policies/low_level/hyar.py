@@ -16,20 +16,20 @@ with the highest Q are taken. It costs a pass of the critics for each discrete a
 Differs from the source:
 - discrete actions may take different numbers of parameters, which lie side by side; the encoder sees only the chosen
   action's own, and the decoder is trained on those alone;
-- the change of the state is predicted in units of its standard deviation over the warm-up data, so that no entry
-  dominates the reconstruction loss by its scale;
+- the change of the state is predicted in units of its standard deviation over the warm-up data. So no entry dominates
+  the reconstruction loss by its scale;
 - random actions have no latent action of their own: they are encoded when they are sampled from the replay buffer, as
   the representation-shift correction does for outdated ones;
 - the correction compares the error of a stored action with a running mean of the codec's error, over its last hundred
-  or so updates, instead of its error after the last update (`correction_error=latest`);
+  or so updates. The source compares it with the error after the last update (`correction_error=latest`);
 - with `parameter_tolerance` the correction asks whether z still decodes to the executed parameters, which are stored.
   The source asks whether the change of the state that z predicts is the one that followed. Where changes are hard to
   predict, the two hardly agree: see `experiments/domains`;
 - with `layer_norm` the critics' layers are normalised, which bounds the values of latent actions far from all that were
   tried (Ball et al. 2023, arXiv 2302.02948);
 - with `greedy_samples` the greedy policy also values variations of z and takes the best of them;
-- with `search_samples` the actor is also drawn to the best of random latent actions, weighted by their gain in value,
-  and `preactivation_penalty` keeps it from the bounds; both as in P-DQN;
+- with `search_samples` the actor is also drawn to the best of random latent actions, weighted by their gain in value.
+  `preactivation_penalty` keeps it from the bounds. Both are as in P-DQN;
 - the codec concatenates its inputs, which the published code multiplies (`codec_inputs`); its predicted change has no
   bound, there it is a tanh (`predicted_change`); its loss sums, there it averages (`codec_loss`);
 - tanh bounds the actor's output; the published code also multiplies the gradient by the range that is left
@@ -39,7 +39,7 @@ Differs from the source:
 - the critics learn from the random steps, too; in the published code only the codec does (`critic_window`).
 
 TorchRL's TD3Loss would fit the latent actor and critics, but an update takes 1.5 times as long with it (8.0 instead of
-5.3 ms of CPU time, batches of 256), because it runs the networks as functional calls under vmap.
+5.3 ms of CPU time, batches of 256). It runs the networks as functional calls under vmap.
 """
 
 from __future__ import annotations
@@ -118,18 +118,19 @@ class HyAROptions(CodecOptions, TargetRateOptions, SearchingActorOptions):
     noise_initial: PositiveFloat | None = None
     """Scale of the exploring noise after the warm-up; it falls to `parameter_noise`. If null, it is constant."""
     noise_episodes: Annotated[PositiveInt, OnlyWith("noise_initial")] = 1000
-    """The learner's own episodes, after its warm-up, within which this scale falls linearly."""
+    """The learner's own episodes, after its warm-up, within which the scale of the noise falls linearly."""
     correction_factor: Annotated[PositiveFloat, OnlyWith("parameter_tolerance", None)] = 5.0
     """Encode a stored z again if the error of its predicted change is this many times the codec's error."""
     correction_error: Annotated[Literal["mean", "latest"], OnlyWith("parameter_tolerance", None)] = "mean"
     """The codec's error: its mean over the last hundred or so updates of the codec, or the `latest`, as published.
 
-    The latest is that of the 4,096 stored transitions from which the range of z was estimated last.
+    The latest error is that of the 4,096 stored transitions from which the range of z was estimated last.
     """
     parameter_tolerance: NonNegativeFloat | None = None
-    """Instead, encode a stored z again if its decoded parameters differ from the executed ones by more than this.
+    """Encode a stored z again if its decoded parameters differ from the executed ones by more than this.
 
-    If null, the predicted change decides. Where the next state is hard to predict, the parameters are the surer sign.
+    If null, the predicted change decides (`correction_factor`). If the next state is hard to predict, the parameters
+    are the surer sign.
     """
     relabelling: Literal["mean", "sample"] = "sample"
     """Latent action in place of an outdated or random one: the encoder's mean, or a sample as published.
@@ -507,11 +508,11 @@ class HyAR(ReplayLearner):
     def corrected_latent(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return latents that the codec still decodes to the executed actions, and which of them were corrected, `[B]`.
 
-        This is the representation-shift correction: e is replaced by the discrete action's embedding where it no longer
-        decodes to that action; z is encoded again if the predicted change of the state is off by more than
-        `correction_factor` times the codec's error (`correction_error`) or, if `parameter_tolerance` is given, where
-        the decoded parameters are off by more than that. With `relabelling="sample"` the new e carries noise, and the
-        new z is a sample of the encoder's distribution instead of its mean.
+        This is the representation-shift correction. If e no longer decodes to the discrete action, it is replaced by
+        that action's embedding. If z is no longer current, it is encoded again: if the error of its predicted change is
+        above `correction_factor` times the codec's error (`correction_error`). With `parameter_tolerance`, the errors
+        of its decoded parameters count instead. With `relabelling="sample"` the new e carries noise, and the new z is a
+        sample of the encoder's distribution instead of its mean.
 
         Latents are `[B, embedding_dim + latent_dim]`.
         """
@@ -537,7 +538,7 @@ class HyAR(ReplayLearner):
     def _is_current(self, batch: TensorDictBase, z: Tensor) -> Tensor:
         """Return whether stored z `[B, latent_dim]` in [-1, 1] still stand for what was executed, bool `[B]`.
 
-        A random action's z is NaN; comparisons with it are false, so it never does.
+        A random action's z is NaN. Comparisons with NaN are false, so it is never current.
         """
         state, discrete = batch["state"], batch["discrete"]
         z = self.codec.z_from_unit(z)
@@ -609,8 +610,8 @@ class HyAR(ReplayLearner):
             self.codec.set_change_scale(scale_of(sample["next_state"] - state))
         with torch.no_grad():
             mean, log_variance = self.codec.encode(state, discrete, sample["unit"])
-            # Samples, not means: in a dimension that the codec does not use, all means are alike, and mapping their
-            # narrow range onto [-1, 1] would blow up differences that mean nothing.
+            # Samples, not means: in a dimension that the codec does not use, all means are alike. Mapping their narrow
+            # range onto [-1, 1] would blow up differences that mean nothing.
             z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
             if self.options.correction_error == "latest" or has_new_unit:
                 change = self.codec.scaled_change(state, sample["next_state"])

@@ -63,15 +63,15 @@ class CodecOptions(Settings):
     codec_pretrain_updates: PositiveInt = 2000
     """Updates of the codec alone at the end of the warm-up."""
     codec_every: Annotated[PositiveInt, OnlyWith("codec_episodes", None)] = 10
-    """Critic updates for each update of the codec after that."""
+    """Critic updates for each update of the codec, after the warm-up."""
     codec_episodes: PositiveInt | None = None
-    """Instead, the learner's own episodes, after its warm-up, for each update of the codec."""
+    """The learner's own episodes, after its warm-up, for each update of the codec. If null, `codec_every` decides."""
     codec_first_episode: Annotated[NonNegativeInt, OnlyWith("codec_episodes")] = 0
     """The learner's own episodes, after its warm-up, before `codec_episodes` begins to count."""
     latent_coverage: PositiveFraction = 0.96
     """Central fraction of the encoded z that the actor can reach: the latent-space constraint of the paper."""
     latent_range_every: PositiveInt = 100
-    """Updates of the codec for each new estimate of this range, from 4,096 stored transitions."""
+    """Updates of the codec for each new estimate of the range of z, from 4,096 stored transitions."""
 
 
 class HybridCodec(nn.Module):
@@ -130,7 +130,8 @@ class HybridCodec(nn.Module):
     def of_allowed(self, proposals: Tensor, allowed: Tensor | None) -> Tensor:
         """Return latent actions whose e stands for an allowed discrete action, `[B, N, embedding_dim + latent_dim]`.
 
-        Where it does not, e is the embedding of the nearest allowed one; gradients pass as if it were as it was.
+        If e stands for a forbidden discrete action, it is replaced by the embedding of the nearest allowed one. The
+        gradient passes as if e was unchanged.
         """
         if allowed is None:
             return proposals

@@ -60,7 +60,7 @@ class PADDPGOptions(ActorCriticOptions, TargetRateOptions, TwinCriticOptions, Ep
     twin: bool = False
     """Train as in TD3, which makes it PATD3: the lower of two critics counts, with smoothing and a delayed actor."""
     target_smoothing: Annotated[NonNegativeFloat, OnlyWith("twin")] = 0.1
-    """With `twin`: standard deviation of the noise on scores and parameters in the target; 0: none."""
+    """With `twin`: standard deviation of the noise on scores and parameters in the target; 0 is none."""
     target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("twin"), OnlyWith("target_smoothing")] = 0.2
     """With `twin`: largest size of this noise."""
     policy_delay: Annotated[PositiveInt, OnlyWith("twin")] = 2
@@ -107,7 +107,7 @@ class PADDPGActor(nn.Module):
 
 
 def with_lowest_scores(output: Tensor, allowed: Tensor | None) -> Tensor:
-    """Return an actor's outputs with the lowest score for forbidden discrete actions, so that critics know no other.
+    """Return an actor's outputs with the lowest score for forbidden discrete actions, the only one that critics see.
 
     Args:
         output: scores and parameters, `[*B, num_discrete + num_parameters]` in [-1, 1].
@@ -122,7 +122,7 @@ def with_lowest_scores(output: Tensor, allowed: Tensor | None) -> Tensor:
 def with_best(scores: Tensor, discrete: Tensor, components: Components) -> Tensor:
     """Return scores `[*B, num_discrete]` in which the chosen discrete action of each component has the highest one.
 
-    It has changed scores with the action that had it.
+    It swaps scores with the action that had the highest one.
     """
     places = components.places(discrete)
     best = components.places(components.best(scores))

@@ -97,7 +97,7 @@ class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
     n_step: PositiveInt = 1
     """Rewards summed before bootstrapping. A sum also ends with its batch, so long sums need long batches."""
     bounding: Literal["tanh", "inverting_gradients"] = "tanh"
-    """How the parameters are kept within their bounds."""
+    """How the parameters are kept within their bounds: by `tanh`, or clipped, with `inverting_gradients`."""
     initial_parameters: InitialParameters = "domain"
     """Initial parameters: `domain` adds the problem's own by a frozen layer, if it has any; `none` adds nothing."""
     actor_tau: PositiveFraction = 0.01
@@ -405,8 +405,8 @@ class PDQN(ReplayLearner):
             is_fixed: the parameters that have a single value there, bool `[B, num_parameters]`. If None, none.
 
         Returns:
-            For each parameter, by how much the best of its discrete action is better than the actor's, at least 0, and
-            the squared distance to it, `[B, num_parameters]` each.
+            For each parameter, the gain in value of the best random parameters of its discrete action, at least 0. Then
+            the squared distance to these. Both are `[B, num_parameters]`.
         """
         shape = len(state), self.options.search_samples, self.specs.num_parameters
         with torch.no_grad():

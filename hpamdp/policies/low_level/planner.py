@@ -30,7 +30,7 @@ class PlannerPolicy(TensorDictModuleBase):
 
         A plan has one parameter, which is written for every discrete action; only the planned action's own counts.
         """
-        # One plan for each option, `[*B, num_options]`; a single one where there is no choice.
+        # One plan for each option, `[*B, num_options]`; a single one if the problem has no options.
         planned_discrete = td.get(keys.ORACLE_DISCRETE)
         planned_parameter = td.get(keys.ORACLE_PARAMETERS)
         option = td.get(keys.OPTION) if self.specs.num_options else torch.zeros_like(planned_discrete[..., 0])

@@ -22,7 +22,7 @@ Differs from the source:
   whatever the sign of the change. The temperature is constant, also in the parameter phases, and sigma decays.
   The settings of Bester et al.'s code on Platform: step_scaling=true, step_bound=non_increasing, temperature=1,
   temperature_decay=0.995, samples_in_parameter_phase=false, sigma_decay=1. The settings below call these published.
-  There each phase of Sarsa restarts at the initial temperature, and the discount counts ticks. Their code on Goal has
+  In that code each phase of Sarsa restarts at the initial temperature, and the discount counts ticks. On Goal it has
   no bound, a constant temperature, alpha 0.01, gradients of unit norm and a baseline of three features.
 - Parameters are in units where their bounds are [-1, 1], and sigma is a standard deviation. eNAC's returns are not
   discounted, and the divergence from the old policy bounds its step.
@@ -47,13 +47,11 @@ from hpamdp.devices import checked_device
 from hpamdp.policies.base import ActionFeature, Learner, known_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
+from hpamdp.policies.shared.hybrid_actor import RAW
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters
 from hpamdp.policies.shared.sized_by_data import SizedByData
 from hpamdp.settings import Fraction, FromList, OnlyWith, PositiveFraction, SettingError, Settings
 from hpamdp.specs import PAMDPSpecs
-
-# The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].
-RAW = "raw_parameters"
 
 # Coefficients in eNAC's regression, whose normal equations are a square of them: 2 GB.
 MAX_REGRESSORS = 16_384
@@ -387,8 +385,8 @@ class NaturalActorCritic(SizedByData):
         """Solve the regression.
 
         Returns:
-            The first `num_weights` coefficients, which are the natural gradient, and the divergence that a step of
-            size 1 along them causes, in nats an episode, `[]`.
+            The first `num_weights` coefficients, which are the natural gradient. Then the divergence that a step of
+            size 1 along it causes, in nats an episode, `[]`.
         """
         identity = torch.eye(len(self.gram), dtype=torch.float32).to(self.gram)
         penalty = self.ridge * self.gram.diagonal().mean() * identity

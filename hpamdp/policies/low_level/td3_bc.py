@@ -11,8 +11,8 @@ Differs from the sources:
   them; the source takes the mean. With n parameters the distance weighs n times as much.
 - The actor increases the minimum of both critics, not the first one's value.
 - States are not normalised, as problems scale their observations.
-- By default the values weigh twice as much: `behaviour_weight` is 1 / alpha, 0.2 where the source has alpha = 2.5, that
-  is 0.4.
+- By default the values weigh twice as much: `behaviour_weight`, which is 1 / alpha, is 0.2. The source has 0.4, from
+  alpha = 2.5.
 
 TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, without a discrete choice.
 """
@@ -54,7 +54,7 @@ class TD3BCOptions(ActorCriticOptions, TargetRateOptions, SmoothedTargetOptions,
     It is 1 / alpha of the paper, which has 0.4.
     """
     discrete_threshold: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.3
-    """Discrete actions less probable in the data than this fraction of the most probable one are never taken."""
+    """Discrete actions are never taken if their probability in the data is below this fraction of the largest one."""
     target_smoothing: NonNegativeFloat = 0.05
     """Standard deviation of the noise on the parameters in the target."""
     target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("target_smoothing")] = 0.1

@@ -1,7 +1,7 @@
 """What P-DQN and HyAR share: a deterministic actor that also follows the best of the actions that its critics value.
 
 The gradient of the critics alone stays on the hill that the actor began on. So the actor's loss may also draw it to the
-best of random actions, and the greedy policy may choose among variations of the actor's actions.
+best of random actions. The greedy policy may choose among variations of the actor's actions.
 
 Source: Neumann et al. 2023, *Greedy Actor-Critic*, arXiv 1810.09103 (towards the best of random actions); Andrychowicz
 et al. 2017, arXiv 1707.01495, appendix A (penalty on preactivations).

@@ -25,7 +25,7 @@ from hpamdp.specs import PAMDPSpecs
 
 
 def above_all(noise: Tensor) -> Tensor:
-    """Return numbers above all rewards, float64, in the order of some noise of size 1: values of untried options."""
+    """Return values of untried options, float64: above all rewards, and in the order of `noise`, whose size is 1."""
     return (1e9 + noise) * 2.0**900
 
 
@@ -35,9 +35,9 @@ class BanditOptions(Settings):
     memory: Literal["all", "discounted", "sliding_window"] = "discounted"
     """Which rewards count: `all` equally, recent ones more (`discounted`), or the last ones only (`sliding_window`)."""
     discount: Annotated[float, Field(gt=0.0, lt=1.0), OnlyWith("memory", "discounted")] = 0.999
-    """Weight of a reward for each decision of its age; used with `discounted` only."""
+    """With `memory=discounted`: factor on the weight of a reward for each later decision."""
     window: Annotated[PositiveInt, OnlyWith("memory", "sliding_window")] = 2000
-    """Number of decisions that count; used with `sliding_window` only."""
+    """With `memory=sliding_window`: number of decisions that count."""
 
 
 class RewardStatistics(nn.Module):

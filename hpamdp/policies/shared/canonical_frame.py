@@ -24,7 +24,7 @@ class CanonicalFrame(nn.Module):
 
     Args:
         specs: of the problem.
-        is_used: false: turn nothing, whatever the problem declares.
+        is_used: if false, turn nothing, whatever the problem declares.
         is_revealed: whether directions come from a table of `KnownDirections`, and not from the problem.
     """
 

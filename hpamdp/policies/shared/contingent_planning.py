@@ -1,6 +1,6 @@
 """Plans whose first action may show something, by which the rest is chosen.
 
-A plan that is one sequence of actions gives finding out no value. Here each state comes with M hypotheses of what is
+In a plan that is one sequence of actions, finding out has no value. Here each state comes with M hypotheses of what is
 not known. The first action is the same under all of them. If it shows what is not known, what follows is chosen for
 each hypothesis by itself; otherwise it is the same, too. So the search expects to know the truth after an action that
 shows something (QMDP: Littman, Cassandra and Kaelbling 1995, *Learning policies for partially observable

@@ -23,7 +23,7 @@ from hpamdp.policies.shared.perception import Perception
 from hpamdp.settings import SettingError, Settings
 from hpamdp.specs import PAMDPSpecs
 
-# The raw sample of the parameters, which a learner needs for its likelihood.
+# The raw sample of the parameters, before clipping, which a learner needs for its likelihood.
 RAW = "raw_parameters"
 
 
@@ -160,7 +160,7 @@ class HybridActor(nn.Module):
     def given(
         self, observation: Tensor, discrete: Tensor, raw: Tensor, mask: Tensor | None, pair_mask: Tensor | None
     ) -> HybridDistribution:
-        """Return the distribution whose `log_prob` is that of an action in a state; arguments as for `act`.
+        """Return the distribution whose `log_prob` is that of an action in a state.
 
         Args:
             observation: of the states, `[*B, observation_dim]`.

@@ -108,7 +108,7 @@ class KnownDirections(nn.Module):
         """Return the features `[N, M, num_features]` under M sampled sets of directions that agree with what is known.
 
         An unknown direction is uniform on the circle. If the directions of all actions sum to zero, the last two
-        follow from the others, up to their order, which alternates from one set to the next.
+        follow from the others, up to their order. The order alternates from one set to the next.
 
         Args:
             features: `[N, num_features]`.

@@ -26,9 +26,9 @@ class LinearBanditOptions(BanditOptions):
     """Settings of linear bandits; `memory`, `discount` and `window` say which decisions count."""
 
     inputs: Indices | None = None
-    """Indices of the observation entries that the features use. If None, all."""
+    """Indices of the observation entries that the features use. If null, all."""
     features: Literal["polynomial", "random_fourier"] = "polynomial"
-    """All monomials of the inputs up to `degree`, or `degree` cosines in random directions."""
+    """`polynomial`: monomials of the inputs up to `degree`. `random_fourier`: `degree` cosines in random directions."""
     degree: PositiveInt = 1
     """Degree of the polynomial, or number of the cosines."""
     ridge: PositiveFloat = 1.0
@@ -160,8 +160,8 @@ class LinearBandit(Selector):
     def _greedy_coefficients(self) -> Tensor:
         """Return the coefficients of the greedy choice, `[num_options, num_features]`.
 
-        Those of an untried option predict the lowest finite number everywhere. Its regression predicts 0, which is more
-        than negative rewards.
+        The coefficients of an untried option predict the lowest finite number everywhere, because its regression would
+        predict 0, which is more than negative rewards.
         """
         theta, _, _ = self._regression()
         lowest = torch.zeros_like(theta)

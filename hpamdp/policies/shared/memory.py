@@ -9,8 +9,8 @@ MDPs*, arXiv 1507.06527; Kapturowski et al. 2019, *Recurrent Experience Replay i
 (R2D2: stored states and burn-in). The policy of an option may depend on what happened since the option began: Sutton,
 Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 2.
 
-TorchRL's GRUModule does not fit: it writes the next state under `next`, where neither the router of the options nor
-`Agent.act` looks for what a policy carries from step to step.
+TorchRL's GRUModule does not fit: it writes the next state under `next`. Neither the router of the options nor
+`Agent.act` looks there for what a policy carries from step to step.
 """
 
 from __future__ import annotations

@@ -76,8 +76,8 @@ class EnsembleLinear(nn.Module):
 class EnsembleMLP(nn.Module):
     """`num_members` independent ReLU networks on the same input `[B, in]`, output `[E, B, out]`.
 
-    Two members of 128 x 128 units take 1.2 ms of CPU time for forward and backward on a batch of 256, and 0.46 ms on
-    64; `torch.func.stack_module_state` under vmap and TorchRL's vmapped parameters take 1.6 and 0.83 ms.
+    Forward and backward of two members of 128 x 128 units take 1.2 ms of CPU time on a batch of 256, and 0.46 ms on 64.
+    `torch.func.stack_module_state` under vmap and TorchRL's vmapped parameters take 1.6 and 0.83 ms.
 
     Args:
         num_members: E.

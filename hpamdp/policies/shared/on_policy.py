@@ -25,14 +25,16 @@ class OnPolicyOptions(Settings):
     epochs: Annotated[int, Field(ge=1, le=1000)] = 10
     """Passes over the collected rows in an update."""
     minibatch_size: PositiveInt = 256
-    """Rows in an optimisation step, and the least number of rows that an update waits for."""
+    """Rows in a gradient step, and the least number of rows that an update waits for."""
     clip: PositiveFloat = 0.2
     """The surrogate stops rewarding probability ratios that are further from 1 than this."""
     lr: LearningRate = 3e-4
     """Learning rate of Adam."""
     max_grad_norm: PositiveFloat = 0.5
-    """Largest gradient norm of an optimisation step; longer gradients are scaled down. `high=actor` limits the norms
-    of its policy, its critic and their common perception separately."""
+    """Largest gradient norm of a gradient step; longer gradients are scaled down.
+
+    `high=actor` limits the norms of its policy, its critic and their common perception separately.
+    """
 
 
 class OnPolicy(nn.Module):
@@ -184,5 +186,5 @@ def normalised(advantage: Tensor, weight: Tensor | None = None, *, least: float 
 
 
 def mean_scalars(steps: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
-    """Return the scalars of optimization steps, averaged over the steps."""
+    """Return the scalars of gradient steps, averaged over the steps."""
     return {name: torch.stack([step[name] for step in steps]).mean().item() for name in steps[0]}

@@ -26,7 +26,7 @@ class OptionValueOptions(Settings):
     lr: LearningRate = 1e-3
     """Learning rate of Adam for the option values."""
     tau: PositiveFraction = 0.01
-    """Step of the target network towards the learned one after each update."""
+    """Fraction of the way to the learned network that the target network moves after each update."""
 
     @model_validator(mode="after")
     def _check_sizes(self) -> Self:

@@ -182,15 +182,16 @@ class SequenceSearch:
     """Find good sequences of parameterised actions: each sequence of discrete actions has Gaussians of its own.
 
     At first, every sequence of discrete actions is tried with a few samples of the parameters, spread evenly over
-    their bounds; if there are more than `max_sequences`, so many random ones, in which the first actions occur equally
-    often. Then the best `num_kept` of them are refined. Each later iteration refines half as many. Samples come from a
-    Gaussian for every parameter, whose mean and deviation are those of the elites of the iteration before. Its
-    deviation has a lower bound, which falls from iteration to iteration: where a return is a cliff, such as at the
-    shortest way into a target, the elites' own deviation shrinks before the edge is found. The best sample so far is
-    among the next ones, and the best of the last ones is the plan.
+    their bounds. If there are more than `max_sequences`, so many random sequences are tried, in which the first actions
+    occur equally often. Then the best `num_kept` sequences are refined. Each later iteration refines half as many.
 
-    A discrete action alone does not say what is done next: with a categorical distribution for each step, as in
-    cross-entropy planning over mixed actions, sequences whose parameters should differ share one Gaussian.
+    Samples come from a Gaussian for every parameter, whose mean and deviation are those of the elites of the iteration
+    before. Its deviation has a lower bound, which falls from iteration to iteration. Where a return is a cliff, such as
+    at the shortest way into a target, the elites' own deviation shrinks before the edge is found. The best sample so
+    far is among the next samples, and the best of the last samples is the plan.
+
+    Cross-entropy planning over mixed actions has a categorical distribution for each step instead. There, sequences
+    whose parameters should differ share one Gaussian.
 
     Samples are stratified, one for each of as many equally likely intervals, as in a Latin hypercube: McKay, Beckman
     and Conover 1979, *Technometrics* 21(2).
@@ -221,8 +222,8 @@ class SequenceSearch:
     def sequences(self, num_states: int, device: torch.device, allowed: Tensor | None = None) -> list[Tensor]:
         """Return the discrete actions of the first iteration's sequences, int64 `[N, Q_h]` for each step.
 
-        If all are tried, there is one first step for each discrete action, one second step for each two, and so on,
-        forbidden ones among them. Otherwise random allowed actions stand in the place of forbidden ones.
+        If all are tried, there is one first step for each discrete action, one second step for each two, and so on.
+        Forbidden actions are among them. Otherwise random allowed actions take the place of forbidden ones.
         """
         if self.tries_all:
             each = torch.arange(self.num_discrete, device=device)

@@ -53,8 +53,10 @@ class ReplayOptions(BufferOptions):
     updates_per_step: PositiveFloat = 0.25
     """Updates for each step that the learner collects."""
     augment: Literal["auto"] | bool = False
-    """Map each sampled transition by a random symmetry that the problem declares. `auto` does so if there is any and
-    the learner has no memory."""
+    """Map each sampled transition by a random symmetry that the problem declares.
+
+    `auto` does so if there is any and the learner has no memory.
+    """
     gamma: PositiveFraction = 0.99
     """Discount of a step."""
     reward_scale: PositiveFloat = 1.0

@@ -25,14 +25,14 @@ class SelectorStackOptions(StackOptions):
     """Settings of a selector's memory of the last decisions."""
 
     memory: Literal["none", "stack"] = "none"
-    """What the networks see beside the observation. `none`: nothing; `stack`: those at the last decisions."""
+    """What the networks see beside the observation. `none`: nothing; `stack`: observations at the last decisions."""
 
 
 class SelectorMemoryOptions(MemoryOptions):
     """Settings of a selector's memory."""
 
     memory: Literal["none", "stack", "gru"] = "none"
-    """What the networks see beside the observation. `none`: nothing; `stack`: those at the last decisions.
+    """What the networks see beside the observation. `none`: nothing; `stack`: observations at the last decisions.
 
     `gru`: the state of a GRU that has seen the observations at all decisions of the episode.
     """

@@ -1,7 +1,7 @@
 """The base of bandits that can learn within a session.
 
-With `memory=session`, each session starts a new bandit, which counts only the rewards of the session's own trips, as in
-Auer, Cesa-Bianchi and Fischer 2002 with a round for each trip. Nothing is learned across sessions, so the greedy policy
+With `memory=session`, each session starts a new bandit, which counts only the rewards of the session's own trips. Each
+trip is a round of Auer, Cesa-Bianchi and Fischer 2002. Nothing is learned across sessions, so the greedy policy
 explores, too.
 """
 

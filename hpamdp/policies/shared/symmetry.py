@@ -28,7 +28,7 @@ class RandomSymmetry:
         self.maps: Symmetries = specs.symmetries.to(device)
 
     def __call__(self, rows: TensorDictBase) -> TensorDictBase:
-        """Return rows `[N, *]`, each with states, action and options (where it has any) mapped by one map."""
+        """Return rows `[N, *]`, each with states, action and options (if it has any) mapped by one map."""
         number = torch.randint(len(self.maps), rows.batch_size[:1], device=rows["state"].device)
         shape = rows.batch_size
         number = number.reshape(-1, *[1] * (len(shape) - 1)).expand(shape)

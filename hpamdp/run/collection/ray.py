@@ -31,7 +31,7 @@ class RayOptions(WorkerOptions):
     """Settings of `RayCollection`; the workers are Ray actors, each with a CPU."""
 
     address: str | None = None
-    """Address of a running cluster, as for `ray.init`. If None, Ray runs on this machine for the time of the run."""
+    """Address of a running cluster, as for `ray.init`. If null, Ray runs on this machine for the time of the run."""
 
 
 class RayCollection(WorkerCollection):

@@ -227,7 +227,7 @@ class WorkerCollection(Collection):
                 self._problem.add_statistics(new)
             self._new_statistics[number] = {}
         self._coming = self._begin(policy) if self.options.ahead else []
-        if "coming" in self._state:  # this was it, which a resumed run must not learn from again
+        if "coming" in self._state:  # the batch to return, from which a resumed run must not learn again
             self._state = {name: value for name, value in self._state.items() if name != "coming"}
         self._is_idle = True
         return batch.to(self._device)

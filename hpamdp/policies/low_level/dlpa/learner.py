@@ -15,8 +15,8 @@ Differs from the source:
 - reward and termination have an ensemble of networks; a plan's return is the ensemble's mean minus `pessimism` standard
   deviations;
 - every plan starts from scratch. To start from the previous plan, it would have to be stored with the environments'
-  data. With the true model of this project's benchmark, such a warm start adds 0.002 to 0.005 of the best possible
-  score at 5 iterations, and 0.006 to 0.01 at 3;
+  data. In the true model of this project's benchmark, such a warm start adds little: 0.002 to 0.005 of the best
+  possible score at 5 iterations, and 0.006 to 0.01 at 3;
 - a greedy action is the likeliest one of the plan's final distribution, with mean parameters. The source's code draws
   one of the last elites by their weights, also in evaluations;
 - exploring actions are sampled from the plan's final distribution, a fraction of them uniformly. The source adds noise
@@ -335,8 +335,9 @@ class DLPA(ReplayLearner):
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Fit the model's scales; yield `num_batches` samples of windows that start at any stored step.
 
-        The scales are those of all stored steps: entries of the state that the warm-up saw hardly change, such as those
-        of places far from the start, would else be in the hundreds once the policy gets there.
+        The scales are those of all stored steps. During the warm-up some entries of the state hardly change, such as
+        those of places far from the start. Scaled by the warm-up alone, they would be in the hundreds once the policy
+        gets there.
         """
         stored = self.buffer[:]
         context = stored["memory"][:, : self.model.context_dim] if isinstance(self.perception.memory, Stack) else None

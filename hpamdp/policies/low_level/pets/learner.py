@@ -16,13 +16,13 @@ Differs from the sources:
   network sees where the step would lead by that prediction, and predicts termination and reward: an end, such as at a
   wall or in a target, depends on where a step leads;
 - if the problem declares its geometry, states are turned until the discrete action points along +x before the networks
-  see them, and the lengths of all vectors are among the inputs. For other declared symmetries, the model also learns
-  from the mapped steps (`augment`);
+  see them. The lengths of all vectors are among the inputs. For other declared symmetries, the model also learns from
+  the mapped steps (`augment`);
 - if the problem only reveals where its actions point, states are turned by what the episode's steps have shown. Until
   all is known, plans begin under sampled directions, and count what their first action would show (`hypotheses`,
   `policies.shared.contingent_planning`);
 - if states are not turned, the change is a linear model, fitted by least squares, plus what the networks add to it
-  (`linear_part`), because a few hundred steps teach networks alone little of such a problem;
+  (`linear_part`). A few hundred steps teach networks alone little of such a problem;
 - if states are not turned, exploring plans maximise the mean of all members' returns plus their standard deviation
   (`posterior_sampling`, `optimism`). Every single member predicts no reward for actions that had none so far, so
   planning with one member does not explore;

@@ -31,7 +31,7 @@ class PETSModelOptions(PlanningOptions):
     """Settings of a `PETSModel`."""
 
     augment: Literal["auto"] | bool = "auto"
-    """Use the symmetry and the geometry that the problem declares: `auto` does if there are any, true requires them."""
+    """Use the symmetry and the geometry that the problem declares: `auto` if there are any; true requires them."""
     num_members: PositiveInt = 5
     """Models, each trained on minibatches of its own."""
     transition_dims: Widths = (64, 64)
@@ -43,8 +43,8 @@ class PETSModelOptions(PlanningOptions):
     linear_part: Literal["auto"] | bool = "auto"
     """Predict the change by a linear model, fitted by least squares, plus what the networks add to it.
 
-    It knows where steps lead after some hundred of them. `auto` uses it unless the problem declares a geometry that
-    makes its discrete actions alike.
+    The linear model knows where steps lead after some hundred steps. `auto` uses it unless the problem declares a
+    geometry that makes its discrete actions alike.
     """
 
 
@@ -300,7 +300,7 @@ class PETSModel(nn.Module):
         return self.outcome(joined(seen, next_x, features), precision)
 
     def _change_map(self) -> Tensor:
-        """Return what makes changes of the state of scaled changes, `[observation_dim, observation_dim]`."""
+        """Return the map `[observation_dim, observation_dim]` from scaled changes to changes of the state."""
         return (self.is_predicted * self.change_scale).unsqueeze(-1) * self.derivation
 
     def _changed(self, scaled: Tensor) -> Tensor:
@@ -320,9 +320,9 @@ class PETSModel(nn.Module):
     def features(self, turned: Tensor, next_turned: Tensor) -> Tensor:
         """Return what helps to tell where a step ends, of states before and after it in the canonical frame.
 
-        With vectors of the plane, their lengths before and after the step, the smallest length on the straight way
-        between the two, and how far off the x axis they were, `[*B, 4 V]`; else the squares of all entries, of which
-        lengths are made, `[*B, 2 observation_dim]`.
+        With V vectors of the plane, the features are `[*B, 4 V]`: the lengths before and after the step, the smallest
+        length on the straight way between, and how far off the x axis each vector was. Else they are the squares of all
+        entries before and after the step, `[*B, 2 observation_dim]`, of which lengths are made.
         """
         if not self.frame.num_vectors:
             mean, scale = self.state_mean, self.state_scale

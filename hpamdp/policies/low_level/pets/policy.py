@@ -44,10 +44,11 @@ class PETSPolicyOptions(SequenceSearchOptions, ParameterNoiseOptions, PETSModelO
     posterior_sampling: Literal["auto"] | bool = "auto"
     """Let each exploring environment follow the plans of one member until its episode or option ends.
 
-    If False, plans use all members. With a bonus for new states, plans always use all members.
+    So environments try what members disagree on. If false, plans use all members. With a bonus for new states, plans
+    always use all members.
 
-    So environments try what members disagree on. `auto` does if the problem declares a geometry that makes its discrete
-    actions alike. Elsewhere a single member knows too little for its plans to lead anywhere.
+    `auto` does so if the problem declares a geometry that makes its discrete actions alike. Elsewhere a single member
+    knows too little for its plans to lead anywhere.
     """
     optimism: NonNegativeFloat = 1.0
     """Without posterior sampling: standard deviations of the members' returns that exploring plans add to the mean."""
@@ -76,8 +77,8 @@ class PETSPolicy(PlanningPolicy):
 
     When exploring with posterior sampling, plan with the one member that the environment follows.
 
-    Acts uniformly at random until the stored steps differ in their rewards or in whether they terminate: before, all
-    plans have the same value.
+    The policy acts uniformly at random until the stored steps differ in their rewards or in whether they terminate:
+    before, all plans have the same value.
 
     Attributes:
         bonus: a reward of exploring plans for new states; None for none.
@@ -172,11 +173,11 @@ class PETSPolicy(PlanningPolicy):
         return None if is_greedy() else self.bonus
 
     def plan(self, state: Tensor, member: Tensor | None = None, allowed: Tensor | None = None) -> PlannedAction:
-        """Plan from states `[N, F]`, each with its own member `[N]`. If None, with the mean of all.
+        """Plan from N states.
 
         Args:
-            state: the features of where the plans begin. Without a memory they are the observations.
-            member: of each of them.
+            state: the features of where the plans begin, `[N, F]`. Without a memory they are the observations.
+            member: the member that each plan follows, `[N]`. If None, plans use the mean of all members.
             allowed: the numbered choices that each step may take, bool `[N, horizon, J]`. If None, all.
         """
         memory = self.perception.memory
@@ -313,8 +314,8 @@ class PETSPolicy(PlanningPolicy):
     def _with_bonus(self, state: Tensor, discrete: Tensor, ahead: Prediction, bonus: Bonus) -> Prediction:
         """Return predictions whose rewards, if the step does not terminate, include the bonus of its next state.
 
-        Disagreement is the standard deviation of the members' predicted changes in the canonical frame, in units of the
-        usual change there, averaged over the predicted entries.
+        Disagreement is the standard deviation of the members' predicted changes, averaged over the predicted entries.
+        It is measured in the canonical frame, in units of the usual change there.
 
         Args:
             state: `[E, B, F]`, from which each member predicts.
