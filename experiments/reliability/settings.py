@@ -131,7 +131,7 @@ def _is_number(value: Any) -> bool:
 def main() -> None:
     """Print the cases that were not refused in one line, and the counts."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=300, help="all hand-written ones, the rest drawn from the generated ones")
+    parser.add_argument("--cases", type=int, default=300, help="hand-written ones first, then generated ones")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     others = generated()
