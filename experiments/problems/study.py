@@ -1,4 +1,4 @@
-"""Gather, draw and tabulate results on Pinball, Office, circuits, traffic lights and primitives, beside those of others.
+"""Gather, draw and tabulate results on Pinball, Office, circuits, traffic lights and primitives, beside others'.
 
 python experiments/problems/study.py FOLDER...    adds the finished runs in these folders to results.csv and curves.csv,
                                                   those of traffic lights to traffic.csv, too, then draws and tabulates
