@@ -266,7 +266,7 @@ def test_options_of_which_none_has_an_allowed_action_are_told_in_one_line():
     problem = Forbidden(20)
     problem.option_names = ()
     problem.group_actions({"only": [0]})
-    expected = r"^environment \d+: its action_mask leaves none of the options an action; give them more actions$"
+    expected = r"^environment \d+: no option has an action that its action_mask allows; give the options more actions$"
     with pytest.raises(ProblemError, match=expected):
         with_decisions(problem, 1.0, 3).reset()
 

@@ -32,7 +32,7 @@ TABLE = {
     "polygons": [[[0.5, 0.2], [0.55, 0.2], [0.55, 0.8], [0.5, 0.8]]],
 }
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=320", "eval.layouts=4", "eval.every=0"]
-each_map = pytest.mark.parametrize("name", maps.OWN_MAPS)
+each_map = pytest.mark.parametrize("name", maps.SOURCE_MAPS)
 
 
 def scripted(env: PinballEnv):

@@ -17,7 +17,7 @@ from hpamdp.env.pinball.environment import PinballEnv
 from hpamdp.env.pinball.rules import DOWN, LEFT, NONE, REACHED, RIGHT, ROLLING, UP, PinballState
 
 FOLDER = Path(os.environ.get("HPAMDP_TRACES", "nowhere")) / "domains"
-each_map = pytest.mark.parametrize("name", maps.OWN_MAPS)
+each_map = pytest.mark.parametrize("name", maps.SOURCE_MAPS)
 
 
 class ScalarTable:

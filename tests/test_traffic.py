@@ -1,4 +1,4 @@
-"""Traffic lights in SUMO: signals, rewards, results and players by hand."""
+"""Traffic lights in SUMO: signals, rewards, results and hand-written players."""
 
 from __future__ import annotations
 

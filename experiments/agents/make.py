@@ -2,7 +2,7 @@
 
 python experiments/agents/make.py                train all of them, one after another
 python experiments/agents/make.py NAME ...       only these
-python experiments/agents/make.py NAME=FOLDER    only put the run in FOLDER there, which was made by NAME's command
+python experiments/agents/make.py NAME=FOLDER    only put the run in FOLDER there, a run of NAME's command
 """
 
 import shutil

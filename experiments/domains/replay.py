@@ -2,10 +2,12 @@
 
 Run: python experiments/domains/replay.py FILE.json [--dtype float32] [--step-by-step] [--tolerance 1e-6]
 
-A file holds episodes that the reference code of a domain played, with every random number that it drew. They run
-through from their first state, or, step by step, each step starts from the recorded state before it. float32 goes step
-by step, since small differences grow. The exit code is 1 if a number differs by more than the tolerance, or an outcome,
-termination or truncation at all, and 2 if the file is no such recording.
+A file holds episodes that the reference code of a domain played, with every random number that it drew. By default an
+episode runs through from its first state. With --step-by-step each step starts from the recorded state before it.
+float32 always goes step by step, since small differences grow.
+
+The exit code is 1 if a number differs by more than the tolerance, or if an outcome, termination or truncation differs.
+It is 2 if the file is no such recording.
 
 `README.md` beside this file describes the files and how to add a domain.
 """

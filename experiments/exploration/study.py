@@ -38,7 +38,7 @@ LEARNERS = ("hppo", "pdqn")
 # A selector over options that last four steps is a kind of exploration, too; on Crossing every row has one.
 OPTIONS = "options"
 KINDS = ("none", "held", "counts", "novelty", OPTIONS)
-# The fraction of greedy episodes that succeed, from which on a problem counts as solved.
+# A problem counts as solved if at least this fraction of greedy episodes succeeds.
 SOLVED = 0.9
 
 

@@ -1,4 +1,4 @@
-"""Score the player that finds out what the keys do, and the best plans of one who knows, by number of the trip.
+"""Score the player that finds out what the keys do, and the best plans with known keys, by number of the trip.
 
 python experiments/generalisation/players.py    writes players.csv: a row for each family, number of boats, player and
                                                 trip. It takes ten minutes.
@@ -27,7 +27,7 @@ EVALUATION_SEED = 99
 
 
 def trip_scores(env: UnseenBoatsEnv) -> Tensor:
-    """Return the scores `[N, trips]` of the player who finds out, one session in every row."""
+    """Return the scores `[N, trips]` of the player that finds out what the keys do, one session in every row."""
     options = env.options
     player = Explorer(
         env.num_envs,

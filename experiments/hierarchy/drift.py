@@ -33,11 +33,11 @@ EVERY = 200  # decisions between two rows
 # Motor noise of the incongruent and the congruent controller in each phase. The congruent one is better in the first.
 NOISE = ((0.15, 0.0), (0.0, 0.15))
 BETTER = (1, 0)  # option, in each phase
-RECOVERED = 0.8  # share of the better controller among the last EVERY decisions
+RECOVERED = 0.8  # fraction of the last EVERY decisions that choose the better controller
 
 
 def play(run: str, high: str, memory: str, seed: int) -> Iterator[dict[str, float | str]]:
-    """Yield a row every `EVERY` decisions: the frequency of the better controller, and the mean reward of each boat."""
+    """Yield a row every `EVERY` decisions: how often the better boat was chosen, and the mean reward of each boat."""
     overrides = [
         f"high={high}",
         f"high.memory={memory}",
@@ -90,9 +90,9 @@ def _mean_reward(rewards: torch.Tensor) -> float | str:
 
 def recovery(rows: Rows) -> float:
     """Return the decisions of the second phase until a run chooses the better controller again; infinity if never."""
-    shares = [row["better"] for row in rows if row["phase"] == 1]
-    for number, share in enumerate(shares, start=1):
-        if share >= RECOVERED:
+    fractions = [row["better"] for row in rows if row["phase"] == 1]
+    for number, fraction in enumerate(fractions, start=1):
+        if fraction >= RECOVERED:
             return number * EVERY
     return np.inf
 
@@ -105,21 +105,21 @@ def table(rows: Rows) -> str:
     ]
     for (high, memory), of_form in groups(rows, "high", "memory").items():
         runs = list(groups(of_form, "seed").values())
-        before = np.mean([_last_shares(run, phase=0) for run in runs])
-        after = np.mean([_last_shares(run, phase=1) for run in runs])
+        before = np.mean([_last_fractions(run, phase=0) for run in runs])
+        after = np.mean([_last_fractions(run, phase=1) for run in runs])
         times = [recovery(run) for run in runs]
         recovered = ", ".join(f"{time:,.0f}" if np.isfinite(time) else "never" for time in times)
         lines.append(f"| {high} | {memory} | {before:.1%} | {after:.1%} | {recovered} |")
     return "\n".join(lines)
 
 
-def _last_shares(rows: Rows, phase: int) -> list[float]:
-    """Return the shares of the better controller in the last five rows of a run's phase."""
+def _last_fractions(rows: Rows, phase: int) -> list[float]:
+    """Return how often the better controller was chosen, in each of the last five rows of a run's phase."""
     return [row["better"] for row in rows if row["phase"] == phase][-5:]
 
 
 def draw(rows: Rows, path: Path) -> None:
-    """Draw the share of the better controller over decisions, a panel for each selector."""
+    """Draw how often the better controller is chosen, over decisions, a panel for each selector."""
     figure = Figure(figsize=(13.0, 3.4), layout="constrained")
     for axes, high in zip(figure.subplots(1, len(SELECTORS), sharey=True), SELECTORS, strict=True):
         for memory, colour in MEMORIES.items():
@@ -127,8 +127,8 @@ def draw(rows: Rows, path: Path) -> None:
             if not of_form:
                 continue
             runs = groups(of_form, "seed").values()
-            shares = np.mean([[row["better"] for row in run] for run in runs], axis=0)
-            axes.plot(EVERY * np.arange(1, len(shares) + 1), shares, color=colour, linewidth=1.4, label=memory)
+            fractions = np.mean([[row["better"] for row in run] for run in runs], axis=0)
+            axes.plot(EVERY * np.arange(1, len(fractions) + 1), fractions, color=colour, linewidth=1.4, label=memory)
         axes.axvline(DECISIONS, color="#8c8c8c", linestyle=":")
         axes.set_title(high, loc="left", fontsize=10, fontweight="bold")
         axes.set_xlabel("decisions")

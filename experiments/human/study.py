@@ -239,7 +239,7 @@ def draw_choices(axes: Axes) -> None:
 
 
 def draw_better_boat(axes: Axes) -> None:
-    """Draw each person's score against the share of episodes with the better controller."""
+    """Draw each person's score against the fraction of episodes with the better controller."""
     rows = load("persons")
     axes.scatter(rows["better_boat"], rows["score"], color=HUMAN, s=18)
     axes.set(xlabel="episodes with the better boat", ylabel="score", title="Choosing well and scoring well, 40 people")

@@ -5,9 +5,10 @@ python experiments/offline/discount.py --show       prints the stored table
 
 A learner is fitted to the presses of some people. Its critic then ranks the presses of the others, who are split into
 folds. The discount whose values rank the held-out presses most like the scores of their episodes is chosen: Spearman's
-rank correlation, mean over the folds. Values of several discounts differ in their scale, but a rank has none. Choosing
-settings of offline learners by fitted values: Paine et al. 2020, *Hyperparameter Selection for Offline Reinforcement
-Learning*, arXiv 2007.09055. They compare the values of initial states, which are comparable under one discount alone.
+rank correlation, mean over the folds. Values of several discounts differ in their scale, but a rank has none.
+
+Paine et al. 2020, *Hyperparameter Selection for Offline Reinforcement Learning*, arXiv 2007.09055, choose settings by
+fitted values, too. They compare the values of initial states, which are comparable under one discount alone.
 
 A clone (`bc`) has no discount in its loss, so none is chosen for it.
 """

@@ -30,7 +30,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 class Curve(hpamdp.Callback):
-    """Keeps the evaluations with the episodes that had ended and the CPU seconds, which include the evaluations."""
+    """Keep each evaluation with the number of episodes that had ended and the CPU seconds, evaluations included."""
 
     def __init__(self) -> None:
         self.rows: list[dict[str, Any]] = []

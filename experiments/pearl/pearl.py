@@ -24,7 +24,7 @@ EVALUATION = {"pinball": 1, "office": 100}
 
 
 class NoWriter:
-    """Stands for TensorBoard's writer, so that logs need no installation and no time."""
+    """Stand in for TensorBoard's writer, so that logs need no installation and no time."""
 
     def __init__(self, **kwargs: Any) -> None:
         pass
@@ -42,7 +42,7 @@ def cpu_seconds() -> float:
 
 
 def keep_curve(name: dict[str, Any], file: Path) -> None:
-    """Have each evaluation of PEARL's code kept in the file; it costs no CPU time of training.
+    """Make PEARL's code write each evaluation to the file. The CPU time of evaluations does not count.
 
     Pictures and tables of values are left out.
     """

@@ -37,8 +37,8 @@ from hpamdp import keys
 def settings() -> tuple[EasyDict, EasyDict]:
     """Return DI-engine's own settings, without CUDA.
 
-    The environments are in the process of the learner (`base`) instead of in a process each (`subprocess`), so that
-    all CPU time is that of one process.
+    The environments run in the learner's process (`base`) instead of in one process each (`subprocess`). So all CPU
+    time is that of one process.
     """
     main, create = deepcopy(main_config), deepcopy(create_config)
     main.policy.cuda = False

@@ -17,7 +17,7 @@ import hpamdp
 
 
 class Clock(hpamdp.Callback):
-    """Scores the agent while it learns, and ends training when its time is over."""
+    """Score the agent while it learns, and end training when its time is over."""
 
     def __init__(self, problem: str, name: Mapping[str, str], file: Path, limit: float) -> None:
         self.given = (problem, name, file, limit)
@@ -38,7 +38,7 @@ class Clock(hpamdp.Callback):
             trainer.stop("the time is over")
 
     def on_end(self, trainer) -> None:
-        """Score the agent that did all its steps."""
+        """Score the agent once more if it ends before its time, and write the file."""
         self.curve.end(trainer.frames)
 
 

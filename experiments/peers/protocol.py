@@ -1,4 +1,4 @@
-"""What every learner of this study has in common: the clock, and the episodes on which it is scored."""
+"""Score the learners of this study on the same episodes, by the same clock."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from hpamdp.run.evaluate import Evaluation
 EPISODES = 1000
 EPISODES_SEED = 2026  # of the evaluations; training has other episodes with any seed
 CPU_LIMIT = 600.0  # seconds of training
-LEAST_PAUSE = 5.0  # CPU seconds of training between two evaluations; later a fraction of the time so far
-PAUSE = 0.15
+LEAST_PAUSE = 5.0  # least CPU seconds of training between two evaluations
+PAUSE = 0.15  # the pause as a fraction of the CPU time so far, once that is longer
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -35,8 +35,8 @@ class Curve:
         problem: the name of the problem.
         policies: the greedy policies of the learner, by their names. A policy writes the discrete action and the
             parameters, in the problem's units, into a tensordict with observations `[N, observation_dim]`.
-        name: what precedes the scores in each row.
-        file: a csv file, which is there as soon as the training is over.
+        name: columns that name the run. They precede the scores in each row.
+        file: the csv file to write once the training is over.
         limit: CPU seconds of training.
     """
 

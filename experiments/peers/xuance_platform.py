@@ -53,11 +53,11 @@ class Platform:
 
 
 class OutOfTimeError(Exception):
-    """Ends the training loop of XuanCe."""
+    """End the training loop of XuanCe."""
 
 
 class Clock(BaseCallback):
-    """Scores XuanCe's agent while it learns."""
+    """Score XuanCe's agent while it learns."""
 
     curve: Curve
 

@@ -1,4 +1,4 @@
-"""Gather, draw and tabulate what learners reach on the problems that people have, beside what others reached.
+"""Gather, draw and tabulate results on Pinball, Office, circuits, traffic lights and primitives, beside others'.
 
 python experiments/problems/study.py FOLDER...    adds the finished runs in these folders to results.csv and curves.csv,
                                                   those of traffic lights to traffic.csv, too, then draws and tabulates
@@ -55,7 +55,7 @@ OF_PROBLEM = {
 }
 CELL = ("problem", "learner", "exploration", "frames")
 RUN = ("problem", "learner", "exploration", "seed")
-# Results of traffic lights that traffic.csv has of the agent and of the players by hand, on the same demands.
+# Results of traffic lights in traffic.csv, of the agent and of the hand-written players on the same demands.
 TRAFFIC = ("delay", "queue", "stops", "throughput")
 AGENT = "agent"
 # What the mean return of a run should reach, by problem, and whose return that is. PEARL's code, with seed 1 of

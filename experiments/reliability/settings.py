@@ -14,11 +14,12 @@ from typing import Any
 import command_line
 import yaml
 
+from hpamdp.config.components import SUPPLIED_ARGUMENTS, defaults_of, load_class, settings_model
 from hpamdp.messages import exit_code
 
 CONF = command_line.REPOSITORY / "conf"
 SMALL = ["num_envs=4", "steps_per_batch=2", "total_frames=16", "eval.layouts=4", "eval.every=0"]
-# Settings with which learners and selectors make an update in so short a run.
+# Values with which learners and selectors make an update in so short a run.
 SHORT = {
     "warmup_steps": 8, "warmup_decisions": 8, "minibatch_size": 8, "updates_per_step": 0.5,
     "updates_per_decision": 0.5, "codec_pretrain_updates": 2,
@@ -80,19 +81,29 @@ BY_HAND = [
 
 
 def generated() -> list[str]:
-    """Return words with a wrong value for each setting of each yaml file."""
+    """Return words with wrong values for each setting of each choice, if the setting is not None by default."""
     words = []
     for file in sorted(CONF.glob("*/*.yaml")):
         group, choice = file.parent.name, file.stem
-        if group in ("experiment", "search") or f"{group}/{choice}" == "collector/ray":
+        if group in ("callback", "experiment", "recipe", "search") or f"{group}/{choice}" == "collector/ray":
             continue
-        for option, value in (yaml.safe_load(file.read_text()) or {}).items():
-            if option == "_target_" or value is None or (group, option) in FREE or isinstance(value, dict):
+        for setting, value in settings_of(file).items():
+            if value is None or (group, setting) in FREE or isinstance(value, dict):
                 continue
             for wrong in WRONG[float if _is_number(value) else type(value)]:
                 with_it = WITH.get(f"{group}/{choice}", [])
-                words.append(" ".join([f"{group}={choice}", *with_it, f"{group}.{option}={wrong}"]))
+                words.append(" ".join([f"{group}={choice}", *with_it, f"{group}.{setting}={wrong}"]))
     return words
+
+
+def settings_of(file: Path) -> dict[str, Any]:
+    """Return the settings of a choice: the defaults of its class, and the values of its yaml file."""
+    values = yaml.safe_load(file.read_text())
+    target = values.pop("_target_")
+    if target is None:
+        return values
+    model = settings_model(load_class(target), SUPPLIED_ARGUMENTS.get(file.parent.name, ()))
+    return {**defaults_of(model), **values}
 
 
 def short(given: list[str]) -> list[str]:
@@ -101,8 +112,8 @@ def short(given: list[str]) -> list[str]:
     words = []
     for group, choice in chosen.items():
         file = CONF / group / f"{choice}.yaml"
-        options = yaml.safe_load(file.read_text()) if choice.isidentifier() and file.is_file() else {}
-        words += [f"{group}.{option}={value}" for option, value in SHORT.items() if option in options]
+        settings = settings_of(file) if choice.isidentifier() and file.is_file() else {}
+        words += [f"{group}.{setting}={value}" for setting, value in SHORT.items() if setting in settings]
     return words
 
 
@@ -120,7 +131,7 @@ def _is_number(value: Any) -> bool:
 def main() -> None:
     """Print the cases that were not refused in one line, and the counts."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=300, help="all of those by hand, the rest drawn of the generated")
+    parser.add_argument("--cases", type=int, default=300, help="hand-written ones first, then generated ones")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     others = generated()

@@ -145,7 +145,7 @@ class Medium(Trivial):
 
 
 class Constant(GymnasiumEnv):
-    """Has the specs of the environment, and always returns the same tensors."""
+    """Return the same tensors at every step, with the specs of the environment."""
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         self.same = super()._reset(tensordict)

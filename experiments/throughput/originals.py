@@ -176,8 +176,8 @@ def goal(random: Random) -> Iterator[list[float]]:
                 turn = math.remainder(math.atan2(to_y, to_x) - angle, 2 * math.pi)
                 if distance <= 1.6:
                     wish_x, wish_y = 0.06 * (aim_x - player[0]) - ball[2], 0.06 * (aim_y - player[1]) - ball[3]
-                    share = 1 - 0.25 * abs(turn) / math.pi - 0.25 * distance / 1.6
-                    push = min(math.hypot(wish_x, wish_y), 2.7 * share)
+                    efficiency = 1 - 0.25 * abs(turn) / math.pi - 0.25 * distance / 1.6
+                    push = min(math.hypot(wish_x, wish_y), 2.7 * efficiency)
                     accelerate(ball, push, math.atan2(wish_y, wish_x), 0.05, 2.7)
                 elif abs(turn) < math.pi / 8:
                     accelerate(player, 0.06, angle, 0.1, 1.0)
@@ -198,9 +198,9 @@ def goal(random: Random) -> Iterator[list[float]]:
                     apart_x, apart_y = one[0] - other[0], one[1] - other[1]
                     apart = math.hypot(apart_x, apart_y)
                     if 0.0 < apart < touch:
-                        share = 0.5 * (touch - apart) / apart
-                        one[:] = [one[0] + apart_x * share, one[1] + apart_y * share, -one[2], -one[3]]
-                        other[:] = [other[0] - apart_x * share, other[1] - apart_y * share, -other[2], -other[3]]
+                        fraction = 0.5 * (touch - apart) / apart
+                        one[:] = [one[0] + apart_x * fraction, one[1] + apart_y * fraction, -one[2], -one[3]]
+                        other[:] = [other[0] - apart_x * fraction, other[1] - apart_y * fraction, -other[2], -other[3]]
                 in_net = 20.0 <= ball[0] <= 22.44 and abs(ball[1]) <= 7.01
                 caught = math.hypot(keeper[0] - ball[0], keeper[1] - ball[1]) < 2.0
                 is_over = in_net or caught or not (0.0 <= ball[0] <= 20.0 and abs(ball[1]) <= 15.0)

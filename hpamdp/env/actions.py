@@ -25,7 +25,7 @@ def check_action_values(
         discrete: integers `[N]`, or `[N, num_components]`.
         parameters: float `[N, sum(parameter_dims)]`, the parameters of all discrete actions side by side.
         parameter_dims: number of parameters of each discrete action.
-        components: of the action; if None, there is one.
+        components: components of the action. If None, it has one.
         names: what the error calls `discrete` and `parameters`.
 
     Raises:

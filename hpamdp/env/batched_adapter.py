@@ -1,11 +1,14 @@
 """Gymnasium environments of any `BatchedEnv`, whose id a problem registers with the path of its class.
 
-Their actions are the field's nested tuples, `(discrete action, (parameters of action 0, ..., of action K-1))`, with the
-option in front if the agent chooses one; batched spaces are Gymnasium's own: every leaf has a leading `[N]`. Only the
+Their actions are the field's nested tuples, `(discrete action, (parameters of action 0, ..., of action K-1))`. If the
+agent chooses an option, it comes first. Batched spaces are Gymnasium's own: every leaf has a leading `[N]`. Only the
 parameters of the chosen action count.
 
-Infos: `outcome` (name), `steps` (actions so far), in sessions of trips `trip_ended`, the masks of problems that forbid
-something, and once the episode is over those of `BatchedEnv.final_infos`, such as `is_success`.
+Infos:
+- always: `outcome` (its name) and `steps` (actions so far);
+- in sessions of trips: `trip_ended`;
+- if the problem forbids something: its masks;
+- once the episode is over: those of `BatchedEnv.final_infos`, such as `is_success`.
 """
 
 from __future__ import annotations
@@ -85,7 +88,7 @@ class BatchedEnvVectorAdapter(GymnasiumVectorAdapter):
 
 
 class TensorRows:
-    """What `KernelRows` is, for a `BatchedEnv` that its tensor functions move: on a GPU, or compiled."""
+    """The methods of `KernelRows`, for a `BatchedEnv` that its tensor functions move: on a GPU, or compiled."""
 
     def __init__(self, env: BatchedEnv) -> None:
         self._env = env

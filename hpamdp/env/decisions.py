@@ -20,7 +20,7 @@ OptionLength: TypeAlias = float | Literal["chosen"] | None
 class DecisionTracker(Transform):
     """Mark the steps at which an option is due and keep the return of the option that runs.
 
-    Keys that it writes, `[*B, 1]` but for the observation:
+    Keys that it writes, `[*B, 1]` unless another shape is given:
 
     - `is_decision`, bool: in a step's root, the agent chooses an option at this step; under `next`, the option ended
       with this step.
@@ -46,7 +46,7 @@ class DecisionTracker(Transform):
             `option_length`, int64 `[*B]`.
         option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`, if options are sets of
             actions and some may be forbidden; else None.
-        components: of the action; if None, there is one.
+        components: components of the action. If None, it has one.
         ends_with_trips: whether options end with the trips inside their episodes, see `PAMDPEnv.has_trips`.
         keeps_observation: whether to write `decision_observation`. Pictures are large, so they are kept only if there
             are options to choose.
@@ -195,7 +195,7 @@ class DecisionTracker(Transform):
             row = int(has_none.flatten().nonzero()[0])
             masks = " and ".join(name for name in (keys.ACTION_MASK, keys.PAIR_MASK) if name in tensordict.keys())
             raise ProblemError(
-                f"environment {row}: its {masks} leaves none of the options an action; give them more actions"
+                f"environment {row}: no option has an action that its {masks} allows; give the options more actions"
             )
         return possible
 

@@ -11,7 +11,8 @@ from typing import Protocol
 
 from hpamdp.messages import one_line
 
-# Frames of these packages are not the environment's own. NumPy's are, but say nothing about where it went wrong.
+# Frames of these packages are left out of an environment's traceback. It may call NumPy itself, but NumPy's frames do
+# not show where the environment went wrong.
 _NOT_THEIRS = ("hpamdp", "gymnasium", "numpy", "torch", "torchrl", "tensordict", "multiprocessing")
 
 

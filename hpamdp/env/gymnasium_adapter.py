@@ -36,7 +36,7 @@ class NumpyEnv(Protocol):
     is_reset: bool
     action_space: spaces.Space
     observation_space: spaces.Space
-    final_infos: tuple[str, ...]  # infos that only episodes have that are over
+    final_infos: tuple[str, ...]  # infos that exist only once an episode is over
 
     @property
     def state(self) -> Any:
@@ -68,10 +68,10 @@ class NumpyEnv(Protocol):
 
 
 class NumpyRows(NumpyEnv):
-    """Environments with NumPy in and out whose rows a kernel moves, or what has the same methods.
+    """Environments with NumPy in and out.
 
     Args:
-        rows: what moves the environments.
+        rows: `KernelRows`, or an object with its methods, which moves the environments.
         batch: `()` for one environment, `(N,)` for many.
     """
 
@@ -162,7 +162,7 @@ class GymnasiumAdapter(gymnasium.Env):
         return observation, self._problem.info()
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Take an action; after the end of the episode everything stays as it is and earns 0."""
+        """Take an action. After the end of the episode the state stays unchanged, and the reward is 0."""
         is_drawn = self.render_mode is not None and not self._problem.is_over[0]
         observations, rewards, terminations, truncations = self._problem.step(action)
         if is_drawn:
@@ -192,7 +192,7 @@ class GymnasiumVectorAdapter(VectorEnv):
 
     Args:
         problem: the environments with NumPy in and out.
-        num_envs: how many they are.
+        num_envs: number of environments N.
         autoreset_mode: when finished episodes start again. With `NextStep` they do in the next step, which ignores
             their actions. With `SameStep` they do in the same step; the last observations and infos are
             `infos["final_obs"]` and `infos["final_info"]`. With `Disabled` they do only by `reset`.

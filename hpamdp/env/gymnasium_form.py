@@ -28,9 +28,9 @@ class VectorScaling:
     """What a vector of numbers goes through before policies see it. All parts are float64 `[dim]`.
 
     Attributes:
-        low, high: to which it is clipped first.
-        centre, width: of the linear map to (x - centre) / width.
-        limit: the largest size of what is left.
+        low, high: bounds to which the vector is clipped first.
+        centre, width: of the linear map (x - centre) / width, which follows.
+        limit: the largest absolute value of the result, to which it is clipped last.
     """
 
     low: np.ndarray
@@ -46,9 +46,9 @@ class ParameterMap:
 
     Attributes:
         low, high: bounds of the space's numbers, float64.
-        shift: what is added to a parameter that is counted from elsewhere, float64.
+        shift: added to a large integer, which the agent counts from the lower bound, float64. Otherwise 0.
         is_unit: whether the agent's parameter lies in [-1, 1] and stands for a place between the bounds, bool.
-        is_many: whether such a parameter has a cell for each integer between the bounds, bool.
+        is_many: whether [-1, 1] is divided into a cell for each integer between the bounds, bool.
         is_whole: whether the space's number is an integer, bool.
     """
 

@@ -183,7 +183,7 @@ def atan2(y: Any, x: Any) -> Any:
 # All kernels share the following: the modes, the first places of the settings, and the last rows of the integers.
 #
 # Each kernel has its own loop over the rows. A factory that closes over the problem's functions would compile the loop
-# again in every process, because Numba's cache on disk never hits for closures over compiled functions.
+# again in every process: Numba's cache on disk never hits for closures over compiled functions.
 ACT, ACT_OR_RESTART, ACT_AND_RESTART, RESTART = range(4)
 SEED, EPISODE_STREAM, NOISE_STREAM, FIRST_ENV, MAX_STEPS, NUM_OPTIONS, OWN = range(7)
 STEPS_ROW, OUTCOME_ROW, EPISODE_ROW = -3, -2, -1

@@ -23,7 +23,7 @@ class OptionChoiceEnv(PAMDPEnv):
     terminates. Its reward is the episode's discounted return, and its observation is that of the episode's last step.
 
     Args:
-        low_policy: writes the action leaves, given `observation` and `option`.
+        low_policy: policy that writes the action leaves, given `observation` and `option`.
         env: an environment in which the agent chooses options.
         gamma: discount of a step of `env`.
 
@@ -125,9 +125,9 @@ class OptionChoiceEnv(PAMDPEnv):
         option = tensordict.get(keys.OPTION)
         td = self._observed(tensordict)
         total = torch.zeros(*self.batch_size, 1, device=self.device, dtype=torch.float32)
-        # What the policy carries from step to step, as a step of the environment alone keeps nothing.
+        # The policy's memory. A step of the environment alone would drop it.
         state_keys = getattr(self._low_policy, "state_keys", [])
-        # Episodes that a partial reset did not start again are over: they stay as they are and earn 0.
+        # Episodes that a partial reset did not start again are over: they stay unchanged, with reward 0.
         with acting(ExplorationType.DETERMINISTIC), torch.no_grad():
             for step in range(self.inner_env.max_steps):
                 acted = self._low_policy(td.set(keys.OPTION, option))

@@ -27,9 +27,9 @@ class PlayPage(Protocol):
         """Return the JSON values that the page's script starts with.
 
         Args:
-            agents: to play beside people: `name`, `title`, `score`, `env` (the options of the problem's yaml), and
+            agents: to play beside people: `name`, `title`, `score`, `env` (the settings of the problem), and
                 `agent`, what `HierarchicalAgent.exported` returns.
-            has_server: whether there is somebody to send episodes to.
+            has_server: whether a server receives the episodes.
 
         Raises:
             EpisodeError: an agent was trained on other rules than those of the page.
@@ -49,4 +49,4 @@ class PlayPage(Protocol):
         """Return a sentence about checked episodes, for the end of the command; an empty text tells nothing."""
 
     def identity(self, episode: Mapping[str, Any]) -> str:
-        """Return what tells a checked episode from all others, so that one that is sent twice is stored once."""
+        """Return a text that identifies a checked episode. An episode that is sent twice is stored once."""

@@ -35,7 +35,7 @@ def register_batched_env(env_id: str, problem: str, **settings: Any) -> None:
     Args:
         env_id: such as `hpamdp/Platform-v0`.
         problem: the environment's class as text, `package.module:Class`.
-        settings: what its constructor takes, where this id fixes it.
+        settings: arguments of the constructor that this id fixes.
     """
     if env_id in gymnasium.registry:
         return

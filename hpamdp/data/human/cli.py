@@ -17,7 +17,16 @@ from hpamdp.data.errors import DataError
 from hpamdp.data.human import minari, played_file, statistics, validation
 from hpamdp.data.human.download import download
 from hpamdp.data.human.episodes import scores_by_person, select
-from hpamdp.data.human.released_file import FILE_NAME, PATH_VARIABLE, QUIRKS, SHA256, HumanData, default_path, read
+from hpamdp.data.human.released_file import (
+    EPISODES_PER_BLOCK,
+    FILE_NAME,
+    PATH_VARIABLE,
+    QUIRKS,
+    SHA256,
+    HumanData,
+    default_path,
+    read,
+)
 from hpamdp.data.human.transitions import NO_PRESS, transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
@@ -202,7 +211,8 @@ def _summary(options: argparse.Namespace) -> None:
     for option, figures in by_controller.items():
         _print_row(harbour.CONTROLLERS[option], figures)
     for block, figures in by_block.items():
-        _print_row(f"episodes {60 * block + 1} to {60 * block + 60}", figures)
+        first = EPISODES_PER_BLOCK * block + 1
+        _print_row(f"episodes {first} to {first + EPISODES_PER_BLOCK - 1}", figures)
     best = int(scores_by_person(data).nan_to_num(nan=-torch.inf).argmax())
     _print_row(f"best person ({best})", by_person[best])
     say("congruent controller chosen, by degrees between the bearing and its nearest direction:")

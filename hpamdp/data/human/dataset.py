@@ -63,8 +63,8 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         buffer_arguments: further arguments of TorchRL's TensorDictReplayBuffer.
 
     Raises:
-        DataError: the file is missing or has another checksum, an argument is of another type or out of range, no
-            episode or no press is left, or `root` has files with other rows.
+        DataError: the file is missing or has another checksum; an argument is of another type or out of range; no
+            episode or no press is left; or `root` has files with other rows.
     """
 
     def __init__(

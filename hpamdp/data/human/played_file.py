@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import EPISODES_PER_BLOCK, TICKS_PER_SECOND, HumanData, table
+from hpamdp.data.human.schema import GAS_SECONDS
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.play import episodes as played
 from hpamdp.env.boatdock.play.episodes import Episode
@@ -46,7 +47,7 @@ def read(path: Path | str, *, practice: bool = False) -> HumanData:
 
 
 def verify(path: Path | str) -> int:
-    """Check every line of a file from its raw events on, as the page's server does, and return the number of episodes.
+    """Check every line of a file by its raw events, as the page's server does, and return the number of episodes.
 
     Raises:
         DataError: the file cannot be read, or a line holds no valid episode or repeats an earlier one.
@@ -105,7 +106,7 @@ def _tables(episodes: list[Episode]) -> HumanData:
             duration=duration,
             speed=_numpy(physics.speed(torch.from_numpy(duration))),
             distance=np.linalg.norm(goal[number] - begun, axis=1),
-            gas=1.0 - elapsed / 5.0,
+            gas=1.0 - elapsed / GAS_SECONDS,
         ),
     )
 

@@ -41,8 +41,8 @@ QUIRKS = (
     "A press's next position is where the next logged press began. The boat may still have been gliding.",
     "An episode's final press has no next position (NaN here). If a single press was logged, `obs` is empty.",
     "Presses that overlapped another are not logged. In some episodes the first or the only press is missing.",
-    "`gas` (1 - sum of x / 5) ignores the missing presses. `tank` (ticks left of 360) counts them.",
-    "`complete` marks the episodes whose log agrees with the tank: |tank + 60 x sum of x - 360| <= 2.5 ticks.",
+    "`gas` (1 - logged seconds / 5) ignores the missing presses. `tank` (ticks left of 360) counts them.",
+    "`complete` marks the episodes whose log agrees with the tank: |tank + 60 x logged seconds - 360| <= 2.5 ticks.",
 )
 
 

@@ -18,7 +18,7 @@ from hpamdp.env.boatdock import harbour, physics, task
 
 SPEED_UNIT = 10.0  # px/s of the column `velocity`
 _DIRECTION_UNIT = 10.0
-_GAS_SECONDS = 5.0
+GAS_SECONDS = 5.0  # logged seconds at which the column `gas` is 0; the tank itself has 6
 _EXACT = 1e-6  # px, s: tolerance for redundant values, which agree up to rounding
 _MAX_OVERBURN = 15.0  # ticks by which the presses may exceed the fuel that the tank lost; 10.9 in the released file
 
@@ -196,7 +196,7 @@ def _press_rules(columns: Columns, episode_of_press: np.ndarray) -> _Rules:
     elapsed = np.cumsum(duration)
     if len(duration):
         elapsed = elapsed - (elapsed - duration)[first[episode_of_press]]
-    gas_error = np.abs(fields["gas"][:, 0] - 1 + elapsed / _GAS_SECONDS)
+    gas_error = np.abs(fields["gas"][:, 0] - 1 + elapsed / GAS_SECONDS)
     yield "a press's gas does not follow from the times", gas_error < _EXACT
     position = positions(columns)
     from_centre = np.linalg.norm(position - fields["center"][episode_of_press], axis=1)

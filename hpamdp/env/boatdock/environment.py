@@ -130,7 +130,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem."""
+        """Return the facts about the problem under these settings."""
         return options.facts(cls.__name__)
 
     def _prepare(self) -> None:
@@ -304,7 +304,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
 
     @property
     def _controller_of_run(self) -> str:
-        """`chosen`, where the agent chooses, else as set."""
+        """`chosen` if the agent chooses, otherwise the setting `controller`."""
         return "chosen" if self.has_choice else self.rules.controller
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
@@ -329,8 +329,8 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         """Return the panels of the learning curves; with `boats`, also how often each controller is chosen."""
         if not summary.get("boats"):
             return cls.curve_metrics
-        shares = (Metric(f"option_{name}", f"{name} chosen", "share") for name in summary["boats"])
-        return (*(metric for metric in cls.curve_metrics if not metric.name.startswith("option_")), *shares)
+        choices = (Metric(f"option_{name}", f"{name} chosen", "share") for name in summary["boats"])
+        return (*(metric for metric in cls.curve_metrics if not metric.name.startswith("option_")), *choices)
 
     @classmethod
     def draw_figures(cls, evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> dict[str, Figure]:
@@ -418,9 +418,9 @@ def _figures_of(recording: str, controller: str) -> dict[str, float]:
 
 
 def _as_one_table(plane: Tensor, tables: list[Tensor], targets: list[Tensor]) -> Tensor | None:
-    """Return which keys the keys become, int64 `[3]`, if a map makes every table the target of its number.
+    """Return which keys the keys become, int64 `[3]`, if a map turns every table into the target of its number.
 
-    If None, a direction becomes none of the targets, or becomes another key with another key map.
+    Return None if a mapped direction is none of the targets, or if the two key maps need different keys.
     """
     if len(tables) != len(targets):
         return None

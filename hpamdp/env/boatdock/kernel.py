@@ -91,7 +91,7 @@ _COS30 = _F(math.sqrt(3.0) / 2.0)
 _SUCCESS, _FAILURE = _F(task.SUCCESS_REWARD), _F(task.FAILURE_REWARD)
 _LENGTH, _SPEED = _F(1.0 / task.HARBOUR_RADIUS), _F(1.0 / task.SPEED_SCALE)
 _CENTRE_X, _CENTRE_Y = _F(task.CENTRE[0]), _F(task.CENTRE[1])
-_PI, _QUARTER, _THREE = _F(math.pi), _F(0.25), _F(3.0)
+_PI, _QUARTER = _F(math.pi), _F(0.25)
 # A third of a float's bits plus this constant are approximately the bits of its cube root.
 _ROOT_BITS = np.int32(709921077)
 

@@ -54,7 +54,7 @@ class BoatDockOptions(Settings):
     Add one with +env.controllers.NAME=[0,120,240], and name it in `boats`.
     """
     switch_cost: Annotated[float, Field(ge=0.0, le=TANK)] | None = None
-    """Seconds of fuel for changing the controller at a press. If null, it is kept for the episode.
+    """Seconds of fuel for changing the controller at a press. If null, the controller is kept for the episode.
 
     It goes with agent.termination=steps, learned or chosen.
     """

@@ -30,7 +30,7 @@ def _num_plans(rules: Rules) -> int:
 
 
 class BoatDockOracle:
-    """Keep the best plan of every option, made at the start of an episode, or where a boat was put.
+    """Keep the best plan of every option, made at the start of an episode, or when a boat is put somewhere.
 
     With noise or a `switch_cost`, the plans are made again before every press.
 
@@ -42,7 +42,7 @@ class BoatDockOracle:
     Attributes:
         option: the best controller, int64 `[N]`.
         keys, durations: keys and durations of the planned presses, `[N, num_plans, MAX_PRESSES]`.
-        planned_at: presses before the plan, int64 `[N]`; not 0 where a boat was put in the middle of an episode.
+        planned_at: presses before the plan, int64 `[N]`; above 0 if a boat was put somewhere within an episode.
     """
 
     def __init__(self, num_envs: int, rules: Rules, device: torch.device) -> None:

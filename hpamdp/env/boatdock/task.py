@@ -23,7 +23,7 @@ def speed(duration: Any) -> Any:
 
 
 # A new outcome, or another rule for docking, also has to be written where the rules are written again:
-# - `physics.press` and `kernel._press`;
+# - `physics.press` and `kernel.press`;
 # - `planner`, which knows only docking at rest, and would give a wrong ceiling without an error;
 # - `play/page/physics.js` (rule and score) and `play/page/game.js` (its words for outcomes);
 # - `play/episodes.py` (`Episode.outcome` and `score`), `figures.py` (colours), `reference.py` (people's figures).

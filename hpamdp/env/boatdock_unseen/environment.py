@@ -90,7 +90,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem."""
+        """Return the facts about the problem under these settings."""
         return options.facts(cls.__name__)
 
     def _prepare(self) -> None:

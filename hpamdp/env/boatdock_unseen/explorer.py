@@ -3,7 +3,7 @@
 The player knows the family of the boats and keeps in mind what each key of each boat did. Before a press it samples
 boats that agree with this. It tries many presses on each of them and takes the one with the best mean value. The value
 after a press is the score of the planner that knows the sampled boat. So the player expects to know the boat from then
-on (QMDP, Littman et al. 1995, *Learning policies for partially observable environments*), apart from a small cost for
+on (QMDP, Littman et al. 1995, *Learning policies for partially observable environments*). It adds only a small cost for
 each key that a plan needs and that no press has shown.
 
 With two boats the player prefers a boat with unknown keys if the remaining trips are worth the trial.

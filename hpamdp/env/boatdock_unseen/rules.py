@@ -91,8 +91,8 @@ class SessionState(NamedTuple):
     """The state of N sessions, columns `[N]`: positions in px, fuel in seconds, int32 integers.
 
     The velocity is the one at the end of the last press, before the glide. `moved` is the displacement by the last
-    press, `last_score` the score of the trip before this one, and `total_score` the sum of the scores of all trips that
-    have ended. `boat` and `last_boat` are the numbers of this trip's boat and of the boat of the last press, or
+    press. `last_score` is the score of the trip before this one, and `total_score` the sum over all trips that have
+    ended. `boat` and `last_boat` are the numbers of this trip's boat and of the boat of the last press, or
     NOT_CHOSEN. `last_key` is -1 before the first press. `trip_ended` is 1 if a trip ended with the last press.
     `frame` is the displacement by the session's first press as it was seen, (0, 0) before. `episode` is the number of
     the session, -1 before the first reset.

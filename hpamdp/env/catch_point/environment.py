@@ -28,8 +28,8 @@ from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_obser
 from hpamdp.observation_entries import ObservationEntry
 from hpamdp.settings import Settings
 
-_TURNS = 8  # of all the turns, so many are declared
-_CEILING = {25: 0.964, 30: 0.997}  # of success, by the limit of steps: who starts too far away cannot arrive
+_TURNS = 8  # turns of the plane that are declared as symmetries
+_CEILING = {25: 0.964, 30: 0.997}  # highest success by `max_steps`: from some starts the target is out of reach
 
 
 class CatchPointOptions(Settings):
@@ -54,7 +54,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 move, 1 catch; `("action", "parameters")` float32 `[N, 1]`:
     the direction of a move in [-1, 1], a fraction of half a turn, clockwise from +y. A move always has full force.
-    Outside its bounds a direction is clipped, NaN and infinity are refused; a catch has no parameter.
+    Directions outside are clipped; NaN and infinity are refused. A catch has no parameter.
 
     The reward is minus the squared distance after each step, plus 20 for a catch within 0.2 of the target, which ends
     the episode. A catch elsewhere is a miss.
@@ -180,7 +180,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         return rules.scripted_action(state)
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return figures of the hand-written player, and the fraction of starts from which the target is in reach."""
+        """Return the hand-written player's figures, and the fraction of starts from which the target is in reach."""
         ceiling = {"ceiling": {"success": _CEILING[self.max_steps]}} if self.max_steps in _CEILING else {}
         is_published = (self.max_steps, self.options.catches, self.options.late_end) == (
             25,

@@ -92,7 +92,7 @@ def observe(state: CatchPointState, *, progress: bool) -> Tensor:
 
 
 def scripted_action(state: CatchPointState) -> tuple[Tensor, Tensor]:
-    """Return the discrete action and the parameter of a scripted player, `[N]` each.
+    """Return the discrete action and the parameter of a hand-written player, `[N]` each.
 
     It catches if the catch will succeed. Otherwise it pushes, in the direction from where the agent would come to rest
     to the target.

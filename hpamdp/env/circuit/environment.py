@@ -68,8 +68,8 @@ class CircuitOptions(Settings):
     ion_costs: Annotated[Costs, OnlyWith("gate_set", "choose", "ion")] = (0.03, 0.05)
     """Costs of an RX or RY and of an XX."""
     reward: RewardName = "final"
-    """`final`: the score, once, at the end. `progress`: its change with each gate, which adds up to the same less a
-    constant. `gain`: how much the final score exceeds `floor`, at least 0, so that trying gates costs nothing.
+    """`final`: the score, once, at the end. `progress`: its change with each gate, which adds up to the final score
+    less a constant. `gain`: how much the final score exceeds `floor`, at least 0, so that trying gates costs nothing.
     """
     floor: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
     """With `reward=gain`: the score from which the gain counts. Local maxima below it are not rewarded.
@@ -182,7 +182,7 @@ class CircuitEnv(BatchedEnv[CircuitState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem."""
+        """Return the facts about the problem under these settings."""
         is_choice = options.gate_set == "choose"
         return ProblemFacts(
             title=cls.__name__,

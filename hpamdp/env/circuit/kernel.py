@@ -35,7 +35,7 @@ _SIDE_BY_SIDE = 16
 _F = np.float32
 _PI, _MATCH = _F(math.pi), _F(rules.MATCH)
 _PROGRESS, _GAIN = rules.REWARDS.index("progress"), rules.REWARDS.index("gain")
-_STOP, _PHASE, _MIX, _TURN, _FLIP = gates.STOP, gates.PHASE, gates.MIX, gates.TURN, gates.FLIP
+_STOP, _PHASE, _MIX, _FLIP = gates.STOP, gates.PHASE, gates.MIX, gates.FLIP
 
 
 def settings_of(design: Design) -> Sequence[float]:
@@ -87,7 +87,7 @@ def _apply(entries: Any, kind: Any, flipped: Any, control: Any, angle: Any, num_
             elif kind == _MIX:
                 entries[one], entries[imaginary + one] = cosine * a + sine * b_i, cosine * a_i - sine * b
                 entries[two], entries[imaginary + two] = cosine * b + sine * a_i, cosine * b_i - sine * a
-            else:
+            else:  # gates.TURN
                 # The lower index of the two has the bit 0.
                 entries[one], entries[imaginary + one] = cosine * a - sine * b, cosine * a_i - sine * b_i
                 entries[two], entries[imaginary + two] = sine * a + cosine * b, sine * a_i + cosine * b_i

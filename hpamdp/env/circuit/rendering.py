@@ -24,9 +24,9 @@ def draw(track: Sequence[CircuitState], design: Design, size: int = 480) -> np.n
     """Return a picture of a circuit, uint8 `[size, size, 3]`.
 
     Args:
-        track: the states of one environment after each gate, columns `[1]`.
+        track: the states of one environment at the start and after each gate, columns `[1]`.
         design: settings of the circuits.
-        size: of the picture.
+        size: px from edge to edge.
     """
     canvas = Canvas.for_shapes(size)
     last = track[-1]

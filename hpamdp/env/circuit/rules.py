@@ -39,8 +39,8 @@ RANDOM_TASKS = ("random_state", "random_unitary")
 OUTCOMES = ("building", "matched", "missed", "time limit")
 BUILDING, MATCHED, MISSED, TIME_LIMIT = range(4)
 MATCH = 0.99  # similarity from which on a finished circuit matches its target
-# Share of training circuits that may lack any number of gates, whatever `begin_episodes` says. In states that a policy
-# never meets it becomes as sure of its actions as it is elsewhere, and then tries no others once it meets them.
+# Fraction of training circuits that may lack any number of gates, whatever `begin_episodes` says. Without them the
+# policy would grow sure of its actions in states that it has not met, and would no longer explore once it meets them.
 ANY_BEGINNING = 0.25
 NEAR_TARGET = 1000  # first of the random numbers of a circuit that begins near its target; targets take lower ones
 

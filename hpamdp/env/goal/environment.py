@@ -42,13 +42,13 @@ class GoalOptions(Settings):
     observation: Literal["scaled", "raw"] = "scaled"
     """`scaled` to [-1, 1], which orientations and the ball can leave, or `raw` positions, velocities and angles."""
     noise: Annotated[float, Field(ge=0.0, le=5.0)] = 1.0
-    """Factor on the published noise of all motions; 0 means no noise. From about 10 on, a run might never end."""
+    """Factor on the published noise of all motions; 0 means no noise. From about 10 on, an action might never end."""
     repaired: Annotated[tuple[Slip, ...], FromList] = ()
-    """Slips of the published code to take out. With any of them, published scores do not compare.
+    """Slips of the published code to take out. With any of them, scores do not compare with published ones.
 
     `kick_to`: a kick to (x, y) goes to (x, x), so that y is never read. `goal_distance`: below the goal and behind its
-    line, the distance is 14.02 too large. `keeper_projection`: this observation is clipped to [-7.01, 14.02] instead of
-    [-7.01, 7.01].
+    line, the distance is 14.02 too large. `keeper_projection`: this entry of the observation is clipped to
+    [-7.01, 14.02] instead of [-7.01, 7.01].
     """
     compile_rules: bool = False
     """Compile the ticks instead of using the kernel, for a GPU; the first action takes about a minute."""
@@ -68,14 +68,18 @@ class HardGoalOptions(GoalOptions):
 class GoalEnv(BatchedEnv[GoalState]):
     """Score against a keeper on `num_envs` half pitches at once.
 
-    Action leaves: `("action", "discrete")` int64 `[N]`: 0 kick to, 1 shoot left, 2 shoot right;
-    `("action", "parameters")` float32 `[N, 4]`: the point to kick to, x in [0, 40] and y in [-15, 15], then for each
-    shot where it crosses the goal line, y in [-7.01, 7.01]. Only the parameters of the chosen action count; outside
-    their bounds they are clipped, NaN and infinity are refused. An action lasts for many ticks: a kick until the ball
-    lies still within reach, a shot until the episode ends. The two shots are the same action.
+    Action leaves:
 
-    The reward is 50 for a goal. An episode that ends otherwise, since the keeper catches the ball or the ball leaves
-    the pitch, or at the time limit, costs the distance of the ball from the goal.
+    - `("action", "discrete")` int64 `[N]`: 0 kick to, 1 shoot left, 2 shoot right;
+    - `("action", "parameters")` float32 `[N, 4]`: the point to kick to, x in [0, 40] and y in [-15, 15]. Then y in
+      [-7.01, 7.01] for each shot, where it crosses the goal line.
+
+    Only the parameters of the chosen action count. Outside their bounds they are clipped; NaN and infinity are refused.
+    An action lasts for many ticks: a kick until the ball lies still within reach, a shot until the episode ends. The
+    two shots are the same action.
+
+    The reward is 50 for a goal. An episode ends otherwise if the keeper catches the ball, if the ball leaves the pitch,
+    or at the time limit. Its last reward is then minus the distance of the ball from the goal.
 
     The rules are those behind all published numbers, with the slips of the published code; `options.repaired` takes
     slips out. Starts are always random. For the constructor's arguments and errors see `BatchedEnv`.
@@ -106,7 +110,7 @@ class GoalEnv(BatchedEnv[GoalState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem; options to begin with are to carry the ball and to shoot."""
+        """Return the facts about the problem under these settings; the default options are `carry` and `shoot`."""
         groups = {"carry": cls.discrete_names[:1], "shoot": cls.discrete_names[1:]}
         return ProblemFacts(title=cls.__name__, default_options=groups)
 
@@ -159,10 +163,10 @@ class GoalEnv(BatchedEnv[GoalState]):
         """Return the published initial parameters, scaled to [-1, 1], as a linear function of the observation.
 
         Kicks go to the ball's front, shots to one metre within each post. P-DQN and its relatives start from them;
-        where they are missing, learners take long to find a goal (Bester et al. 2019, arXiv:1905.04388).
+        without them, learners take long to find a goal (Bester et al. 2019, arXiv:1905.04388).
 
         Returns:
-            Weights `[4, 17]` and bias `[4]`; None where nothing is published.
+            Weights `[4, 17]` and bias `[4]`; None if nothing is published.
         """
         weights = torch.zeros(
             len(rules.PARAMETER_LOW), len(rules.OBSERVATION_NAMES), device=self.device, dtype=torch.float32
@@ -195,7 +199,7 @@ class GoalEnv(BatchedEnv[GoalState]):
         }
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return the shares of episodes that ended in each way but by a goal."""
+        """Return the fractions of episodes that ended without a goal, by how they ended."""
         return {name: float(played[name].mean()) for name in ("caught", "out", "time_limit")}
 
     def draw(self, track: Sequence[GoalState]) -> np.ndarray:
@@ -204,10 +208,10 @@ class GoalEnv(BatchedEnv[GoalState]):
 
     @property
     def symmetries(self) -> Symmetries | None:
-        """The mirror y -> -y, with all slips repaired; each of them breaks it, so that else there is none.
+        """The mirror y -> -y if all slips are repaired, otherwise None: each slip breaks the symmetry.
 
-        An unrepaired kick goes to (x, x), on one side of the pitch; the distance from the goal is wrong on the other
-        side alone, and the keeper's shadow is clipped differently on the two sides.
+        An unrepaired kick goes to (x, x), on one side of the pitch. The distance from the goal is wrong on the other
+        side alone. `keeper_projection` is clipped differently on the two sides.
         """
         if set(self.options.repaired) != set(self.slips):
             return None
@@ -248,10 +252,9 @@ class HardGoalEnv(GoalEnv):
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 kick to, 1 to 5 shoot left, 6 to 10 shoot right, at the
     stretches from y = -7.01 to 7.01; `("action", "parameters")` float32 `[N, 12]` in [-1, 1]: the point to kick to,
-    scaled from x in [0, 40] and y in [-15, 15], then one of each shot: where in its stretch, 1 being the lower end.
+    scaled from x in [0, 40] and y in [-15, 15], then one for each shot: its place in the stretch, 1 for the lower end.
 
     The published code does not clip the shots' parameters; within [-1, 1] that makes no difference.
-
     """
 
     Options = HardGoalOptions

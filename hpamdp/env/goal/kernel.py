@@ -59,8 +59,8 @@ _LANES = 16  # as many as the widest vectors have float32
 # Further columns of the lanes' float32: where the action aims, and the random numbers of a tick.
 _AIM_X, _AIM_Y, _DRAWN = range(_NUM_COLUMNS, _NUM_COLUMNS + 3)
 _NUM_FLOATS = _DRAWN + rules.NUMBERS_PER_TICK
-# Columns of the lanes' int32: the row, or -1 in a lane that has none, whether its action is a kick, the bits of its
-# key, the index of its next random number, and the end.
+# Columns of the lanes' int32: the row (-1 in an empty lane), whether its action is a kick, the bits of its key, the
+# index of its next random number, and the end.
 _ROW, _IS_KICK, _BITS, _INDEX, _END = range(5)
 _NUM_INTEGERS = _END + 1
 _GOING = np.int32(rules._GOING)
@@ -78,7 +78,7 @@ _PLAYER_SPEED, _BALL_SPEED = _F(rules._PLAYER_SPEED), _F(rules._BALL_SPEED)
 _PLAYER_DECAY, _BALL_DECAY = _F(rules._PLAYER_DECAY), _F(rules._BALL_DECAY)
 _KICK = _F(rules._MAX_POWER * rules._BALL_RATE)
 _FACING, _KEEPER_START = _F(rules._FACING), _F(rules._KEEPER_START)
-_OFF_SHARE, _FAR_SHARE = _F(0.25 / math.pi), _F(0.25 / rules.REACH)
+_ANGLE_LOSS, _DISTANCE_LOSS = _F(0.25 / math.pi), _F(0.25 / rules.REACH)
 _SAVED = _F(rules.GOAL_HALF_WIDTH + rules._KEEPER_MARGIN)
 _SHOT_X = _F(rules.LENGTH + rules._SHOT_DEPTH)
 _PLAYERS, _PLAYER_BALL = _F(rules.PLAYER_SIZE + rules.KEEPER_SIZE), _F(rules.PLAYER_SIZE + rules.BALL_SIZE)
@@ -145,8 +145,8 @@ def _play(lanes: Any, j: Any, noise: Any) -> None:
     is_turn = (not in_reach) & (not is_dash)
     wish_x = _COAST * (lanes[_AIM_X * _LANES + j] - player_x) - ball_vx
     wish_y = _COAST * (lanes[_AIM_Y * _LANES + j] - player_y) - ball_vy
-    share = ONE - _OFF_SHARE * off - _FAR_SHARE * distance
-    kick = min(_length(wish_x, wish_y), _KICK * share)
+    efficiency = ONE - _ANGLE_LOSS * off - _DISTANCE_LOSS * distance
+    kick = min(_length(wish_x, wish_y), _KICK * efficiency)
     kick_angle = atan2(wish_y, wish_x)
     pushed_x, pushed_y = _pushed(
         ball_vx if in_reach else player_vx,
@@ -219,8 +219,8 @@ def _collide(lanes: Any, j: Any, one: Any, other: Any, one_v: Any, other_v: Any,
     other_x, other_y = lanes[other * _LANES + j], lanes[(other + 1) * _LANES + j]
     apart_x, apart_y = one_x - other_x, one_y - other_y
     distance = _length(apart_x, apart_y)
-    share = HALF * (touch - distance) / max(distance, _TINY)
-    push_x, push_y = apart_x * share, apart_y * share
+    fraction = HALF * (touch - distance) / max(distance, _TINY)
+    push_x, push_y = apart_x * fraction, apart_y * fraction
     lanes[one * _LANES + j] = one_x + push_x if overlap else one_x
     lanes[(one + 1) * _LANES + j] = one_y + push_y if overlap else one_y
     lanes[other * _LANES + j] = other_x - push_x if overlap else other_x

@@ -367,8 +367,8 @@ def tick(bodies: Bodies, aim_x: Tensor, aim_y: Tensor, numbers: Tensor, noise: f
     Args:
         bodies: the COLUMNS, `[M]` each.
         aim_x, aim_y: point that the players kick to, `[M]`.
-        numbers: random numbers in (-1, 1), `[6, M]`. The first three are for the angle and the push in x and y of the
-            player or the ball, the last three for those of the keeper.
+        numbers: random numbers in (-1, 1), `[6, M]`. The first three are for the player or the ball: its angle, and its
+            push in x and in y. The last three are for the keeper.
         noise: factor on the published noise.
     """
     player_x, player_y, keeper_x, keeper_y, ball_x, ball_y, *velocities, player_angle, keeper_angle = bodies

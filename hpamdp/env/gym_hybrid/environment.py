@@ -28,9 +28,9 @@ class VehicleOptions(Settings):
     max_steps: PositiveInt = rules.PUBLISHED_STEPS
     """Steps after which an episode ends."""
     limit: Literal["truncated", "terminated"] = "truncated"
-    """Whether values bootstrap past this end (`truncated`) or stop there (`terminated`), as in the published code.
+    """If `terminated`, values stop at the time limit, as in the published code; if `truncated`, they bootstrap past it.
 
-    The time is observed, and the end costs 1.
+    The time is observed, and the reward at the limit is -1.
     """
     compile_rules: bool = False
     """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
@@ -104,7 +104,7 @@ class _VehicleEnv(PointEnv[VehicleState]):
         return rules.scripted_action(state)
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return the figures of the hand-written player, who nearly always succeeds."""
+        """Return the figures of the hand-written player, which nearly always succeeds."""
         if self.max_steps != rules.PUBLISHED_STEPS:
             return {}
         return {"scripted": self.scripted_figures, "ceiling": {"success": 1.0}}
@@ -122,11 +122,12 @@ class MovingEnv(_VehicleEnv):
     """Drive to the target and stop there, in `num_envs` fields at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 accelerate, 1 turn, 2 brake; `("action", "parameters")`
-    float32 `[N, 2]`: the acceleration in [0, 1] and the turn in [-1, 1], a fraction of a right angle. Outside its
-    bounds a parameter is clipped, NaN and infinity are refused; braking has none.
+    float32 `[N, 2]`: the acceleration in [0, 1] and the turn in [-1, 1], a fraction of a right angle. Parameters
+    outside are clipped; NaN and infinity are refused. Braking has none.
 
-    The reward is the way made towards the target, less 0.001 a step, plus 1 for stopping within 0.1 of it. Who leaves
-    the field or runs out of time gets -1 instead. An episode terminates at rest in the target and outside the field.
+    The reward is the way made towards the target, less 0.001 a step, plus 1 for stopping within 0.1 of it. Any other
+    step that leaves the field or reaches the time limit has the reward -1 instead. An episode terminates at rest in the
+    target and outside the field.
 
     Only the start is random. For the constructor's arguments and errors see `BatchedEnv`.
     """

@@ -168,14 +168,14 @@ def observation_bounds(max_steps: int) -> tuple[list[float], list[float]]:
     return low, high
 
 
-# Of the scripted player: its travelling speed, the tolerated error of the heading (rad), and the margin for braking.
+# The hand-written player's travelling speed, tolerated error of the heading (rad), and margin for braking.
 _CRUISE = 2.5
 _TOLERANCE = 0.01
 _MARGIN = 0.05
 
 
 def scripted_action(state: VehicleState) -> tuple[Tensor, Tensor]:
-    """Return the discrete action and the parameter of a scripted player, `[N]` each.
+    """Return the discrete action and the parameter of a hand-written player, `[N]` each.
 
     It turns towards the target, accelerates, and brakes in time. It turns only at rest, so it also works in Sliding.
     """

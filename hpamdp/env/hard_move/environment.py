@@ -22,7 +22,7 @@ from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
 from hpamdp.settings import Settings
 
-# Success by the limit of steps and the number of actuators: who starts too far away cannot arrive.
+# Highest success by `max_steps` and the number of actuators: from some starts the target is out of reach.
 _CEILING = {
     30: {4: 0.962, 6: 0.989, 8: 0.993, 10: 0.996},
     25: {4: 0.852, 6: 0.928, 8: 0.948, 10: 0.956},
@@ -64,10 +64,10 @@ class HardMoveEnv(PointEnv[HardMoveState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem.
+        """Return the facts about the problem under these settings.
 
-        Options to begin with are the quadrants that sets push to with a positive parameter. Sets that push nowhere
-        belong to the first one.
+        The default options are the quadrants into which sets push with a positive parameter. Sets that push nowhere
+        belong to the first quadrant.
         """
         quadrants = rules.quadrants(options.n, rounded=options.rounded_directions)
         return ProblemFacts(title=cls.__name__, default_options=quadrants, has_oracle=True)
@@ -94,8 +94,8 @@ class HardMoveEnv(PointEnv[HardMoveState]):
     def symmetries(self) -> Symmetries:
         """Turns by the angle between two actuators and their mirrors.
 
-        With 4 actuators they hold to rounding, with 6, 8 and 10 to 1e-4 of the observation a step, since the published
-        directions have three decimals; without `rounded_directions` to rounding.
+        With 4 actuators, or without `rounded_directions`, they hold to rounding. Otherwise they hold to 1e-4 of the
+        observation a step, because the published directions have three decimals.
         """
         n = self.options.n
         plane = plane_maps(n)

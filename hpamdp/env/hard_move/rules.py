@@ -104,7 +104,7 @@ def observe(state: HardMoveState) -> Tensor:
 
 
 class Script:
-    """A scripted player. It chooses the push after which the agent would come to rest nearest to the target.
+    """A hand-written player. It chooses the push after which the agent would come to rest nearest to the target.
 
     Args:
         motions: motions of the sets, `[2^n, 2]`.

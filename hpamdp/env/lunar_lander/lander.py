@@ -43,8 +43,8 @@ class HybridLunarLander(gymnasium.Wrapper):
 
     Source: Gymnasium's LunarLanderContinuous-v3, whose dynamics, observations and rewards are unchanged.
 
-    Differs from the source: the action is a `Dict` of two choices that are made at once, in place of a `Box` in which
-    -1 to 0 of the main engine and -0.5 to 0.5 of the side engines mean off.
+    Differs from the source: the action is a `Dict` of two choices that are made at once. The source has a `Box`,
+    in which -1 to 0 of the main engine and -0.5 to 0.5 of the side engines mean off.
 
     - `main`: off, or on with a throttle in [0.5, 1];
     - `side`: off, left or right, with a throttle in [0.5, 1] each.

@@ -59,8 +59,8 @@ class OfficeEnv(BatchedEnv[OfficeState]):
     right; with `chooses_goal` also `option` int64 `[N]`: 0 coffee, 1 mail, 2 target. Only the parameter of the chosen
     action counts; outside its bounds it is clipped, NaN and infinity are refused.
 
-    A move costs 1, and one that is refused, because it would touch a wall, costs 2. The step that takes coffee or mail
-    costs nothing. The step that delivers has the reward 1000 instead, and terminates the episode.
+    A move costs 1. A move that would touch a wall is refused, and costs 2. The step that takes coffee or mail costs
+    nothing. The step that delivers has the reward 1000 instead, and terminates the episode.
 
     Only the slips are random. The player of `oracle` is `hpamdp.env.office.player`. For the constructor's arguments and
     errors see `BatchedEnv`.

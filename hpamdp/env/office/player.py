@@ -16,7 +16,7 @@ from hpamdp.env.office import rules
 from hpamdp.env.office.rules import OfficeState
 
 _SIZE = 100  # grid points along an axis
-_BEFORE_START = 5  # of them
+_BEFORE_START = 5  # grid points before the start, along an axis
 # Less than a hundredth, so that no grid point lies on the edge of a wall or of a place, where rounding would decide.
 _SPACING = 0.00999
 _NUM_LENGTHS = 5  # of each move

@@ -32,7 +32,7 @@ class PinballOptions(Settings):
     """Settings of `PinballEnv`."""
 
     map: Annotated[str, Field(min_length=1)] = "simple"
-    """A map of the source, `simple` or `hard`, or the path of a JSON file with a map of one's own."""
+    """A map of the source, `simple` or `hard`, or the path of a JSON file with a map of your own."""
     start: Literal["map", "anywhere"] = "map"
     """Where episodes begin: at the start of the `map`, or `anywhere` between the walls. The ball is at rest."""
     training_start: Literal["map", "anywhere", "both"] | None = None
@@ -68,7 +68,7 @@ class PinballEnv(BatchedEnv[PinballState]):
     Options = PinballOptions
     options: PinballOptions
     guarded_settings: ClassVar[tuple[str, ...]] = ("map",)
-    unguarded_values: ClassVar[Mapping[str, tuple[object, ...]]] = {"map": maps.OWN_MAPS}
+    unguarded_values: ClassVar[Mapping[str, tuple[object, ...]]] = {"map": maps.SOURCE_MAPS}
     discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     parameter_dims = rules.PARAMETER_DIMS
@@ -114,8 +114,8 @@ class PinballEnv(BatchedEnv[PinballState]):
         return torch.stack([self.state.x, self.state.y], -1)
 
     def file_checksums(self) -> dict[str, Tensor]:
-        """Return the number of a map of one's own, `[1]`; none for the maps of the source."""
-        if self.options.map in maps.OWN_MAPS:
+        """Return the checksum of a map that is not the source's, int64 `[1]`; nothing for the source's maps."""
+        if self.options.map in maps.SOURCE_MAPS:
             return {}
         checksum = zlib.crc32(self.map.model_dump_json().encode())
         return {"map_checksum": torch.tensor([checksum], dtype=torch.int64, device=self.device)}

@@ -1,6 +1,6 @@
-"""Maps of Pinball: the two of the source, and the reader of one's own.
+"""Maps of Pinball: the two of the source, and the reader of other maps.
 
-A map is a JSON file with the radius of the ball, where it starts, the hole and the walls, all in the square [0, 1]²:
+A map is a JSON file with the ball's radius, its start, the hole and the walls, all in the square [0, 1]²:
 
     {
       "ball": 0.02,
@@ -30,7 +30,7 @@ from hpamdp.files import read_regular
 from hpamdp.json_lines import key_given_twice
 from hpamdp.messages import one_line, reason_of
 
-OWN_MAPS = ("simple", "hard")
+SOURCE_MAPS = ("simple", "hard")
 _FOLDER = Path(__file__).resolve().parent / "maps"
 _MAX_BYTES = 2**20
 _SHORTEST_EDGE = 1e-6  # of a wall, in units of the square's side; shorter ones are lost to rounding in float32
@@ -107,11 +107,11 @@ def read(name: str) -> PinballMap:
     Raises:
         MapError: the file is missing, too large, no JSON or no map.
     """
-    path = _FOLDER / f"{name}.json" if name in OWN_MAPS else Path(os.path.expanduser(name))
+    path = _FOLDER / f"{name}.json" if name in SOURCE_MAPS else Path(os.path.expanduser(name))
     try:
         data = read_regular(path, _MAX_BYTES)
     except FileNotFoundError as error:
-        raise MapError(f"there is no such file; use {', '.join(OWN_MAPS)} or the path of a JSON file") from error
+        raise MapError(f"there is no such file; use {', '.join(SOURCE_MAPS)} or the path of a JSON file") from error
     except OSError as error:
         raise MapError(reason_of(error)) from error
     try:

@@ -1,8 +1,8 @@
 """A hand-written player of Pinball: it looks up where to roll next, and pushes the ball to roll there.
 
-The table is a grid of cells. Shortest ways to the hole, with a distance to the walls, give each cell the farthest place
-of its way that the ball can reach in a straight line. The player wants to roll there, more slowly where the line is
-short, and pushes along the axis on which the ball's speed differs most.
+The table is a grid of cells. Each cell has a shortest way to the hole that keeps a distance to the walls. Its entry is
+the farthest place of this way that the ball can reach in a straight line. The player wants to roll there, more slowly
+if the line is short, and pushes along the axis on which the ball's speed differs most.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class PlatformEnv(BatchedEnv[PlatformState]):
     """Cross the platforms in `num_envs` courses at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 run, 1 hop, 2 leap; `("action", "parameters")` float32
-    `[N, 3]`: the power of a run in [0, 30] px/s a tick and the distances to hop in [0, 720] px and to leap in
+    `[N, 3]`: the power of a run in [0, 30] px/s a tick, the distance of a hop in [0, 720] px, and that of a leap in
     [0, 430] px. Only the parameter of the chosen action counts; outside its bounds it is clipped, NaN and infinity are
     refused. A run takes a second, a jump lasts until the agent lands.
 
@@ -58,7 +58,7 @@ class PlatformEnv(BatchedEnv[PlatformState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts of the problem. The default options are run and jump."""
+        """Return the facts about the problem under these settings; the default options are run and jump."""
         return ProblemFacts(title=cls.__name__, default_options={"run": ["run"], "jump": ["hop", "leap"]})
 
     def kernel_settings(self) -> Sequence[float]:
@@ -66,7 +66,7 @@ class PlatformEnv(BatchedEnv[PlatformState]):
         return [self.options.noise]
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
-        """Return constants: run 3, hop 10, leap 400."""
+        """Return constants, scaled to [-1, 1]: run 3, hop 10, leap 400, as weights 0 `[3, 9]` and a bias `[3]`."""
         bias = (
             2.0
             * torch.tensor(rules.INITIAL_PARAMETERS, dtype=torch.float32)

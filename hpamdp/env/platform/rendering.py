@@ -21,8 +21,8 @@ def draw(track: Sequence[PlatformState], size: int = 480) -> np.ndarray:
     """Return a picture of an episode, uint8 `[size, size, 3]`.
 
     Args:
-        track: the states of one environment after each action, columns `[1]`.
-        size: of the picture.
+        track: the states of one environment at the start and after each action, columns `[1]`.
+        size: px from edge to edge.
     """
     canvas = Canvas.for_shapes(size)
     for left, right in zip(rules.LEFT, rules.RIGHT, strict=True):

@@ -32,7 +32,7 @@ _GROUPED_PRIMITIVES = {
     "grasp": ["grasp", "close"],
     "pull": ["lift", "drop", "left", "right", "forward", "backward"],
 }
-# In assembly the hand holds a handle, and the ring beside it has to go over a peg: lifts and drops end so far past it.
+# In assembly the hand holds a handle, and the ring beside it has to go over a peg. Lifts and drops end so far past it.
 _CLEARANCE_M = 0.05
 # Places of these vectors in the observation.
 _OBJECT, _GOAL = (slice(first, first + 3) for first in map(OBSERVED.index, ("object_x", "goal_x")))

@@ -53,7 +53,7 @@ class RoomsEnv(BatchedEnv[RoomsState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem: the agent chooses between skates and boots."""
+        """Return the facts about the problem under these settings: the agent chooses between skates and boots."""
         return ProblemFacts(title=cls.__name__, option_names=("skates", "boots"), has_choice=True)
 
     @property

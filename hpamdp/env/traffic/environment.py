@@ -35,13 +35,13 @@ class TrafficOptions(Settings):
     """Settings of `TrafficEnv`."""
 
     network: Literal["crossing", "corridor"] = "crossing"
-    """`crossing`: one; `corridor`: three in a row, whose signals the agent sets in turn."""
+    """`crossing`: a single one; `corridor`: three in a row, whose signals the agent sets in turn."""
     demand: Kind = "rush"
     """`light`: constant; `rush`: a peak, highest on one axis; `shifting`: one axis is busy first, then the other."""
     minutes: PositiveInt = 60
     """Length of an episode in minutes."""
     traffic: Annotated[float, Field(gt=0.0, le=MOST_TRAFFIC)] = 1.0
-    """Factor of all flows."""
+    """Factor on the flows of all arms."""
     reward: Reward = "queue"
     """`queue`: minus the vehicle hours waited since the last decision. `waiting`: minus the change of the waiting time.
 
@@ -50,7 +50,7 @@ class TrafficOptions(Settings):
     whole_seconds: bool = False
     """Whether greens are whole numbers. Otherwise they are continuous, and rounded to the simulator's step of 1 s."""
     strategies: bool = False
-    """Whether what the players by hand would do are discrete actions, too."""
+    """Whether the choices of the hand-written players are discrete actions, too."""
     render: bool = False
     """Draw the network, for films; steps then take longer."""
     reward_scaling: PositiveFraction | None = None
@@ -71,7 +71,7 @@ class TrafficEnv(GymnasiumEnv):
     Action leaves:
 
     - `("action", "discrete")` int64 `[N]`: the next phase; with `strategies` also `webster`, `actuated`, `max_pressure`
-      and `longest_queue`, which do what these players by hand would do now;
+      and `longest_queue`, which do what these hand-written players would do now;
     - `("action", "parameters")` float32 `[N, 4]`: for each phase the seconds of green, in [5, 60].
 
     A step lasts until the next decision. Its `duration` is in units of 10 s, so a discount stands for 10 s. See
@@ -197,7 +197,7 @@ class TrafficEnv(GymnasiumEnv):
         return {name: float(played[name].mean()) for name in _RESULTS if name in played}
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return the results of the players by hand with the demands of the last episodes."""
+        """Return the results of the hand-written players on the demands of the last episodes."""
         figures = {}
         for player in PLAYERS:
             results = self._copies.call("play", player)

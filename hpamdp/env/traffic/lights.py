@@ -23,7 +23,7 @@ class TrafficLights(gymnasium.Env):
     """Choose at each decision which phase of a signal comes next, and for how many seconds it stays green.
 
     In the corridor the agent sets one of three signals at each decision: the one whose green has ended. Between
-    different phases there are 3 s of yellow. An episode is an hour of demand, at whose end it is truncated.
+    different phases there are 3 s of yellow. An episode lasts `minutes`, and is then truncated.
 
     The action is `Tuple(Discrete(4), Tuple(Box, Box, Box, Box))`: the phase, and the green of each phase. With
     `strategies` there are four more discrete actions without parameters: what fixed times by Webster's formula, SUMO's
@@ -36,7 +36,7 @@ class TrafficLights(gymnasium.Env):
         network: `crossing` or `corridor`.
         demand: `light`, `rush` or `shifting`.
         minutes: length of an episode.
-        traffic: factor of all flows.
+        traffic: factor on the flows of all arms.
         reward: `queue` or `waiting`.
         whole_seconds: whether greens are whole numbers.
         strategies: whether the strategies are actions.
@@ -128,7 +128,7 @@ class TrafficLights(gymnasium.Env):
         return self._last.seconds
 
     def play(self, player: str) -> dict[str, float]:
-        """Return the results of a player by hand with the demand of the last episode, whose own end remains unknown."""
+        """Return the results of a hand-written player on the demand of the last episode, whose rest is not played."""
         if self._simulation is None:
             raise gymnasium.error.ResetNeeded("play: call reset first")
         return self._simulation.play(player)

@@ -1,4 +1,7 @@
-"""Players by hand: fixed times by Webster's formula, max-pressure and the longest queue; SUMO has the actuated one."""
+"""Hand-written players: fixed times by Webster's formula, max-pressure and the longest queue.
+
+A fourth player, `actuated`, is SUMO's own program.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ START_S = 3.0
 VEHICLE_S = (0.7, 1.2, 0.7, 1.2)
 """Green (s) of `LongestQueue` for each waiting vehicle, by phase. Phases for left turns have half as many lanes."""
 _SATURATION = 1800.0  # vehicles an hour that a lane discharges at green
-_LOST_S = 4.0  # that a phase loses by its start and its yellow
+_LOST_S = 4.0  # lost time of a phase, by its start and its yellow
 _SHORTEST_CYCLE_S, _LONGEST_CYCLE_S = 40.0, 120.0
 _LARGEST_RATIO = 0.95  # of flow to saturation, for which the formula still has a cycle
 _PERIOD_S = 15  # between two decisions of max-pressure
@@ -30,9 +33,9 @@ _OFFSET_S = 22  # a vehicle's time between two crossings of the corridor
 class Webster:
     """Fixed times: a cycle through all phases, the same for the whole episode, from the mean flows of the demand.
 
-    Source: Webster 1958, *Traffic signal settings*, Road Research Technical Paper 39: with the critical flow ratio y of
-    each phase, their sum Y and the lost time L of a cycle, the cycle is (1.5 L + 5) / (1 - Y), and greens are
-    proportional to y. All crossings of the corridor have the longest of their cycles, and begin it 22 s after their
+    Source: Webster 1958, *Traffic signal settings*, Road Research Technical Paper 39. Let y be the critical flow ratio
+    of each phase, Y their sum, and L the lost time of a cycle (s). The cycle takes (1.5 L + 5) / (1 - Y) s, and greens
+    are proportional to y. All crossings of the corridor have the longest of their cycles, and begin it 22 s after their
     western neighbour.
     """
 

@@ -21,7 +21,7 @@ _PATIENCE_S = 2.0  # until a process that has nothing more to do ends
 
 
 class SimulationProcess:
-    """A `Simulation` that lives in another process. Its methods have the arguments and the results of these names.
+    """A `Simulation` that lives in another process. Its methods are those of `Simulation`.
 
     The process is not one of multiprocessing's, which a worker process may not start. It ends with its parent, and then
     removes its files, also if the parent was killed.

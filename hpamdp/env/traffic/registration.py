@@ -11,6 +11,6 @@ def register() -> None:
     """Register the ids; calling it again changes nothing."""
     for network, env_id in ENV_IDS.items():
         if env_id not in gymnasium.registry:
-            # No max_episode_steps: the environment itself truncates at the end of the hour.
+            # No max_episode_steps: the environment itself truncates after its `minutes`.
             entry_point = "hpamdp.env.traffic.lights:TrafficLights"
             gymnasium.register(env_id, entry_point=entry_point, kwargs={"network": network})

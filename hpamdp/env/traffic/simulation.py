@@ -17,19 +17,18 @@ from xml.etree import ElementTree
 import numpy as np
 
 from hpamdp.env.traffic.demand import Demand, draw, write_vehicles
-from hpamdp.env.traffic.network import ARMS, GREENS, MAX_GREEN, NETWORKS, NUM_LANES, PHASES, YELLOW
+from hpamdp.env.traffic.network import ARMS, GREENS, MAX_GREEN, MIN_GREEN, NETWORKS, NUM_LANES, PHASES, YELLOW
 from hpamdp.env.traffic.players import ACTUATED, LongestQueue, MaxPressure, Webster
 from hpamdp.messages import one_line
 
 Reward = Literal["queue", "waiting"]
 VEHICLES = 20.0
-"""Queues and approaching vehicles are observed in this many vehicles."""
+"""Queues and approaching vehicles are observed in units of this many vehicles."""
 HOUR_S = 3600.0
 FOLDER_PREFIX = "hpamdp-traffic-"
 """The folder of a simulation is named so, and no other is removed."""
 _STANDING = 0.1  # m/s, below which SUMO counts a vehicle as waiting
 _TRIPS = "trips.xml"
-_MIN_GREEN_OF_ACTUATED_S = 5
 
 
 @dataclass(frozen=True)
@@ -193,7 +192,7 @@ class Simulation:
         return self._go_on()
 
     def follow(self, player: str) -> Seen:
-        """Give the signal that is due what a player by hand would, and go on to the next decision."""
+        """Give the signal that is due what a hand-written player would, and go on to the next decision."""
         if player == ACTUATED:
             self._hand_over(self._due)
         else:
@@ -201,7 +200,7 @@ class Simulation:
         return self._go_on()
 
     def play(self, player: str) -> dict[str, float]:
-        """Return the results of a player by hand with the last demand."""
+        """Return the results of a hand-written player on the last demand. An unfinished episode is abandoned."""
         self._start()
         seen = self.follow(player)
         while not seen.is_over:
@@ -237,7 +236,7 @@ class Simulation:
         """Let SUMO's actuated program decide when the next phase of its cycle ends."""
         lamp = self.lamps[number]
         if not lamp.is_actuated:
-            self._set_phase(number, (lamp.phase + 1) % len(PHASES), _MIN_GREEN_OF_ACTUATED_S)
+            self._set_phase(number, (lamp.phase + 1) % len(PHASES), MIN_GREEN)
             lamp.is_actuated = True
         elif lamp.yellow_since is not None:
             lamp.phase = (lamp.phase + 1) % len(PHASES)
@@ -276,7 +275,7 @@ class Simulation:
                 elif lamp.until is None and sumo.trafficlight.getProgram(signal.name) != ACTUATED:
                     sumo.trafficlight.setProgram(signal.name, ACTUATED)
                     sumo.trafficlight.setPhase(signal.name, 2 * lamp.phase)
-                    sumo.trafficlight.setPhaseDuration(signal.name, _MIN_GREEN_OF_ACTUATED_S)
+                    sumo.trafficlight.setPhaseDuration(signal.name, MIN_GREEN)
         sumo.simulationStep()
         self._now += 1
         halting = sum(map(sumo.edge.getLastStepHaltingNumber, self._inward))
