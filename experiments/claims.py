@@ -258,7 +258,7 @@ def table1() -> list[Claim]:
             page("table1"),
             "All {learners:word} learners score above people with both controllers; H-PPO is within "
             "{hppo_below:.2f} of the ceiling, and no learner finds one controller clearly harder. DLPA matches "
-            "people after {dlpa} presses, Q-PAMDP after {qpamdp} million.",
+            "people after {dlpa} presses, Q-PAMDP after {qpamdp} million ({early:word} earlier seeds).",
             numbers,
             holds=above_people and not finds_one_harder,
         ),
