@@ -533,14 +533,14 @@ def learners_ask_each_other(config: Config) -> str | None:
     without = [low for low in config.learners if not _has_next_value(low)]
     if why_ends is not None and 0 < len(without) < len(config.learners):
         setting = _value_setting(without[0])
-        return f"low.per_option: {why_ends} lets learners bootstrap from each other, but {without[0]} has no value" + (
-            "" if setting is None else f" without {setting}=true"
-        )
+        needed = "" if setting is None else f" without {setting}=true"
+        has_none = f"{without[0]} has no value{needed}"
+        return f"low.per_option: {why_ends} lets learners bootstrap from each other, but {has_none}"
     scales = {low.settings.get("reward_scale", 1.0): low for low in reversed(config.learners) if low not in without}
     if len(scales) > 1 and (is_compared or not _values_end_with_trips(config)):
-        given, why = (f"{config.high}", "whose values it compares")
-        if why_ends is not None:
-            given, why = why_ends, "which bootstrap from each other"
+        given, why = why_ends, "which bootstrap from each other"
+        if given is None:
+            given, why = str(config.high), "whose values it compares"
         (first, low), (second, other), *_ = reversed(scales.items())
         return (
             f"low.per_option: {given} needs the same reward_scale in all learners, {why}; {low} has {first}, "
@@ -563,7 +563,7 @@ def _values_end_with_trips(config: Config) -> bool:
 
 
 def _value_setting(low: Component) -> str | None:
-    """Return the setting without which other learners cannot bootstrap from this one; None if there is none."""
+    """Return the setting that lets other learners bootstrap from this one; None if they always can, or never."""
     return getattr(low.cls, "value_setting", None) or ("end_values" if "end_values" in low.settings else None)
 
 

@@ -420,7 +420,7 @@ def _figures_of(recording: str, controller: str) -> dict[str, float]:
 def _as_one_table(plane: Tensor, tables: list[Tensor], targets: list[Tensor]) -> Tensor | None:
     """Return which keys the keys become, int64 `[3]`, if a map turns every table into the target of its number.
 
-    Return None if a mapped direction is none of the targets, or if the two key maps need different keys.
+    Return None if a mapped direction is not among the targets, or if the two key maps need different keys.
     """
     if len(tables) != len(targets):
         return None

@@ -60,7 +60,7 @@ class PADDPGOptions(ActorCriticOptions, TargetRateOptions, TwinCriticOptions, Ep
     twin: bool = False
     """Train as in TD3, which makes it PATD3: the lower of two critics counts, with smoothing and a delayed actor."""
     target_smoothing: Annotated[NonNegativeFloat, OnlyWith("twin")] = 0.1
-    """With `twin`: standard deviation of the noise on scores and parameters in the target; 0 is none."""
+    """With `twin`: standard deviation of the noise on scores and parameters in the target; 0 adds no noise."""
     target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("twin"), OnlyWith("target_smoothing")] = 0.2
     """With `twin`: largest size of this noise."""
     policy_delay: Annotated[PositiveInt, OnlyWith("twin")] = 2

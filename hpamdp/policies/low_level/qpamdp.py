@@ -341,7 +341,7 @@ class NaturalActorCritic(SizedByData):
         self.is_fresh = is_fresh.clone()
 
     def _forget_open_episodes(self, num_envs: int) -> None:
-        """Discard the episodes that have not ended; the next rows may be in the middle of others."""
+        """Discard the episodes that have not ended. The next rows may begin in the middle of other episodes."""
         self.is_fresh = self.is_fresh.new_zeros(num_envs)
         self.is_whole = self.is_whole.new_zeros(num_envs)
         self.regressors = self.regressors.new_zeros(num_envs, len(self.moment))
