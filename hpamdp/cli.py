@@ -30,6 +30,7 @@ from hpamdp.config.hydra_errors import explained, not_understood
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.config.stand_ins import RealImportsNeededError, quick_imports
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError
+from hpamdp.exit_codes import FAILED, INTERRUPTED, MISTAKE
 from hpamdp.limits import limit_in
 from hpamdp.messages import (
     first_line,
@@ -46,7 +47,6 @@ from hpamdp.run.folder import is_about_folder, locked
 from hpamdp.search_path import protect_children, put_working_directory_last, unprotect_children
 from hpamdp.shell import program
 
-_MISTAKE, _INTERRUPTED = 2, 130
 # Further commands, and the modules whose `main` gets the words that follow and a parser.
 _COMMANDS = {"watch": "hpamdp.run.watch", "play": "hpamdp.run.play", "report": "hpamdp.run.report"}
 # Errors that Hydra raises for a wrong command line or yaml file.
@@ -95,13 +95,13 @@ def _main() -> None:
     except EnvironmentFaultError as error:  # of the user's own code: its lines of the traceback help, ours do not
         warn(error.line)
         sys.stderr.write(error.frames)
-        sys.exit(1)
+        sys.exit(FAILED)
     except _LostOutputError as error:
         if isinstance(error.__cause__, BrokenPipeError):  # the reader has seen enough
-            sys.exit(1)
-        _exit_with(f"stdout: {reason_of(error.__cause__)}", 1)
+            sys.exit(FAILED)
+        _exit_with(f"stdout: {reason_of(error.__cause__)}", FAILED)
     except KeyboardInterrupt:
-        sys.exit(_INTERRUPTED)
+        sys.exit(INTERRUPTED)
 
 
 def _parse(conf: Path) -> CommandLine:
@@ -127,7 +127,7 @@ def _limits_explained() -> Iterator[None]:
         while cause is not None:
             limit = limit_in(cause)
             if limit in _NEEDS:
-                _exit_with(f"{first_line(cause) or type(cause).__name__}: the program needs {_NEEDS[limit]}", 1)
+                _exit_with(f"{first_line(cause) or type(cause).__name__}: the program needs {_NEEDS[limit]}", FAILED)
             cause = cause.__cause__ or cause.__context__
         raise
 
@@ -155,7 +155,7 @@ def _run_command(name: str, words: list[str]) -> int:
     except ProblemError as error:
         raise ConfigError(f"env: {first_line(error)}") from error
     except ProgramExitError as error:
-        _exit_with(str(error), 1)
+        _exit_with(str(error), FAILED)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -210,7 +210,7 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         # Once a job has started, such errors are not about the command line.
         if not has_started and isinstance(error, _BEFORE_A_JOB) and not isinstance(error, ConfigError):
             is_mistake = not isinstance(error, OSError) or error.errno not in _OF_THE_MACHINE
-            _exit_with(explained(error, line, conf), _MISTAKE if is_mistake else 1)
+            _exit_with(explained(error, line, conf), MISTAKE if is_mistake else FAILED)
         raise
     finally:
         unprotect_children()
@@ -255,7 +255,7 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
     except OSError as error:
         if not is_about_folder(error, output_dir):
             raise
-        _exit_with(f"{output_dir}: {reason_of(error)}; the run was stopped", 1)
+        _exit_with(f"{output_dir}: {reason_of(error)}; the run was stopped", FAILED)
     if code:
         sys.exit(code)
     return None
@@ -309,7 +309,7 @@ def _stay(directory: str) -> None:
     warn(f"hydra.job.chdir=true: the run stays in {directory}, so that relative paths stay right")
 
 
-def _exit_with(mistake: str, code: int = _MISTAKE) -> NoReturn:
+def _exit_with(mistake: str, code: int = MISTAKE) -> NoReturn:
     warn(one_line(mistake))
     sys.exit(code)
 

@@ -115,6 +115,11 @@ def test_only_decisions_that_are_due_are_sampled(name):
     assert sampled == [50]
 
 
+def test_no_reward_is_logged_for_an_option_that_was_never_tried():
+    names = SPECS.option_names
+    assert make("ucb").learn(paid([1, 1], [-1.0, -2.0])) == {f"reward_{names[1]}": -1.5}
+
+
 def test_epsilon_falls_as_one_over_the_decisions_to_its_lower_bound():
     torch.manual_seed(0)
     bandit = make("epsilon_greedy", epsilon_scale=100.0, epsilon_final=0.05)

@@ -14,9 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-from hpamdp.analysis.study import Rows, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, groups, mean_of, read_csv, spread, write_tables
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -83,14 +81,11 @@ def table(rows: Rows) -> str:
     for (task, collector), runs in groups(rows, "task", "collector").items():
         score = spread([run["score"] for run in runs])
         lines.append(
-            f"| {task} | `{collector}` | {score} | {_mean(runs, 'frames_per_s'):,.0f} | {_mean(runs, 'wall_s'):.1f} | "
-            f"{_mean(runs, 'cpu_s'):.1f} | {_mean(runs, 'whole_s'):.1f} |"
+            f"| {task} | `{collector}` | {score} | {mean_of(runs, 'frames_per_s'):,.0f} | "
+            f"{mean_of(runs, 'wall_s'):.1f} | "
+            f"{mean_of(runs, 'cpu_s'):.1f} | {mean_of(runs, 'whole_s'):.1f} |"
         )
     return "\n".join(lines)
-
-
-def _mean(rows: Rows, column: str) -> float:
-    return float(np.mean([row[column] for row in rows]))
 
 
 def main(words: Sequence[str]) -> None:

@@ -23,6 +23,7 @@ from hpamdp.analysis.study import (
     gathered,
     groups,
     interval_text,
+    mean_of,
     read_csv,
     spread,
     with_enough_seeds,
@@ -137,10 +138,10 @@ def table(results: Rows) -> str:
             spread(rest),
             interval_text(rest),
             spread([later(row, first=4) for row in rows]),
-            f"{_mean(rows, 'ceiling'):.3f}",
-            f"{_mean(rows, 'presses_1'):.1f}",
-            f"{sum(_mean(rows, f'presses_{trip}') for trip in range(3, 9)) / 6:.1f}",
-            f"{_mean(rows, 'cpu_s'):.0f} s",
+            f"{mean_of(rows, 'ceiling'):.3f}",
+            f"{mean_of(rows, 'presses_1'):.1f}",
+            f"{sum(mean_of(rows, f'presses_{trip}') for trip in range(3, 9)) / 6:.1f}",
+            f"{mean_of(rows, 'cpu_s'):.0f} s",
         ]
         lines.append(f"| {' | '.join(map(str, columns))} |")
     return "\n".join(lines)
@@ -152,10 +153,6 @@ def _first(row: dict) -> float:
 
 def _second(row: dict) -> float:
     return row["score_2"]
-
-
-def _mean(rows: Rows, column: str) -> float:
-    return sum(row[column] for row in rows) / len(rows)
 
 
 def key_orders(fleet_size: int, fleet_seed: int) -> str:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
@@ -26,6 +25,7 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
+    mean_of,
     read_csv,
     spread,
     with_enough_seeds,
@@ -96,14 +96,14 @@ def table(results: Rows) -> str:
     cases = groups(results, "low", "problem", "reward").items()
     for (low, problem, reward), runs in sorted(cases, key=_order):
         score = spread([run["score"] for run in runs])
-        success = _mean(runs, "success")
-        presses = _mean(runs, "presses")
-        wall_s = _mean(runs, "wall_s")
-        cpu_s = _mean(runs, "cpu_s")
+        success = mean_of(runs, "success")
+        presses = mean_of(runs, "presses")
+        wall_s = mean_of(runs, "wall_s")
+        cpu_s = mean_of(runs, "cpu_s")
         presses_to_human, seconds_to_human = "-", "-"
         if all(run["presses_to_human"] for run in runs):
-            presses_to_human = f"{_mean(runs, 'presses_to_human'):,.0f}"
-            seconds_to_human = f"{_mean(runs, 'wall_s_to_human'):.0f} s"
+            presses_to_human = f"{mean_of(runs, 'presses_to_human'):,.0f}"
+            seconds_to_human = f"{mean_of(runs, 'wall_s_to_human'):.0f} s"
         lines.append(
             f"| {low} | {problem} | {reward} | {len(runs)} | {score} | {success:.1%} | {presses:,.0f} | "
             f"{wall_s:.0f} s | {cpu_s:.0f} s | {presses_to_human} | {seconds_to_human} |"
@@ -128,10 +128,6 @@ def _order(case: tuple[tuple[Any, ...], Rows]) -> tuple[bool, str]:
     """Return the place of a line: the boats before Platform, the shaped before the sparse reward."""
     (_, problem, reward), _ = case
     return problem not in BOATS, reward
-
-
-def _mean(rows: Rows, column: str) -> float:
-    return float(np.mean([row[column] for row in rows]))
 
 
 def draw(curves: Rows, results: Rows, reward: str, x: str, path: Path) -> None:
@@ -168,9 +164,9 @@ def _draw_learner(axes: Axes, rows: Rows, low: str, x: str) -> float:
 
 def _draw_references(axes: Axes, results: Rows, boat: str) -> None:
     references = {
-        "ceiling": (_mean(results, "ceiling"), "#2b2b2b", "-"),
+        "ceiling": (mean_of(results, "ceiling"), "#2b2b2b", "-"),
         "people": (HUMAN[boat]["score"], "#D98200", "--"),
-        "random": (_mean(results, "random"), "#8c8c8c", ":"),
+        "random": (mean_of(results, "random"), "#8c8c8c", ":"),
     }
     for name, (height, colour, style) in references.items():
         axes.axhline(height, color=colour, linestyle=style, linewidth=1.0, zorder=1)

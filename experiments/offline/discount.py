@@ -19,13 +19,12 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 from scipy import stats
 from tensordict import TensorDict
 from torch import Tensor
 
-from hpamdp.analysis.study import Rows, groups, read_csv, write_tables
+from hpamdp.analysis.study import Rows, groups, mean_of, read_csv, write_tables
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.episodes import score
 from hpamdp.data.human.released_file import read
@@ -90,7 +89,9 @@ def chosen(rows: Rows) -> dict[str, float]:
     """Return the discount with the highest mean rank correlation, by learner."""
     best = {}
     for (name,), of_learner in groups(rows, "learner").items():
-        means = {gamma: _mean(of_fold) for (gamma,), of_fold in groups(of_learner, "gamma").items()}
+        means = {
+            gamma: mean_of(of_fold, "rank_correlation") for (gamma,), of_fold in groups(of_learner, "gamma").items()
+        }
         best[name] = max(means, key=means.__getitem__)
     return best
 
@@ -104,13 +105,11 @@ def table(rows: Rows) -> str:
         for name in names:
             of_folds = [row for row in same if row["learner"] == name]
             found = [row["rank_correlation"] for row in of_folds]
-            columns.append(f"{_mean(of_folds):.3f} ({min(found):.3f} to {max(found):.3f})" if found else "")
+            columns.append(
+                f"{mean_of(of_folds, 'rank_correlation'):.3f} ({min(found):.3f} to {max(found):.3f})" if found else ""
+            )
         lines.append(f"| {gamma:g} | {' | '.join(columns)} |")
     return "\n".join(lines)
-
-
-def _mean(rows: Rows) -> float:
-    return float(np.mean([row["rank_correlation"] for row in rows]))
 
 
 def main(words: Sequence[str]) -> None:

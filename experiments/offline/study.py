@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
@@ -25,6 +24,7 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
+    mean_of,
     read_csv,
     spread,
 )
@@ -109,9 +109,9 @@ def table(results: Rows, curves: Rows) -> str:
     offline = [row for row in results if row["start"] == OFFLINE]
     for (low, data, episodes), runs in groups(offline, "low", "data", "episodes").items():
         score = spread([run["score"] for run in runs])
-        shares = " | ".join(f"{_mean(runs, outcome):.1%}" for outcome in OUTCOMES)
-        presses = _mean(runs, "presses")
-        cpu_s = _mean(runs, "cpu_s")
+        shares = " | ".join(f"{mean_of(runs, outcome):.1%}" for outcome in OUTCOMES)
+        presses = mean_of(runs, "presses")
+        cpu_s = mean_of(runs, "cpu_s")
         lines.append(
             f"| {low} | {data} | {episodes} | {updates[low, OFFLINE, data, episodes]:,.0f} | {len(runs)} | {score} | "
             f"{shares} | {presses:.2f} | {cpu_s:.0f} s |"
@@ -142,10 +142,6 @@ def comparison(title: str, better: Case, other: Case, curves: Rows) -> str | Non
     found = difference(*scores)
     unit = "updates" if better[1] == OFFLINE else "presses"
     return f"| {title} | {end:,.0f} {unit} | {found} | {found.improvement:.2f} |"
-
-
-def _mean(rows: Rows, column: str) -> float:
-    return float(np.mean([row[column] for row in rows]))
 
 
 def draw(curves: Rows, path: Path) -> None:

@@ -25,6 +25,7 @@ from hpamdp.analysis.study import (
     gathered,
     groups,
     interval_text,
+    mean_of,
     read_csv,
     spread,
     standing_rows,
@@ -129,14 +130,14 @@ def boats_table(compares_changes: bool) -> str:
             name,
             len(rows),
             spread(_column(rows, "score")),
-            f"{_mean(rows, 'ceiling'):.3f}",
+            f"{mean_of(rows, 'ceiling'):.3f}",
             _percent(rows, "share"),
             f"{np.mean(changes):.2f}" if changes else "0",
             _percent(rows, "oracle_agreement"),
             _percent(rows, "oracle_agreement_weighted"),
             _percent(rows, "success"),
-            f"{_mean(rows, 'frames'):,.0f}",
-            f"{_mean(rows, 'cpu_s'):.0f} s",
+            f"{mean_of(rows, 'frames'):,.0f}",
+            f"{mean_of(rows, 'cpu_s'):.0f} s",
         ]
         lines.append(_line(cells))
     return "\n".join(lines)
@@ -154,8 +155,8 @@ def goal_table() -> str:
             len(rows),
             spread(scores),
             interval_text(scores),
-            f"{_mean(rows, 'frames'):,.0f}",
-            f"{_mean(rows, 'cpu_s'):.0f} s",
+            f"{mean_of(rows, 'frames'):,.0f}",
+            f"{mean_of(rows, 'cpu_s'):.0f} s",
         ]
         lines.append(_line(cells))
     return "\n".join(lines)
@@ -172,13 +173,13 @@ def pairs_table(name: str) -> str:
             low,
             high,
             f"{min(_column(rows, 'seed'))} to {max(_column(rows, 'seed'))}",
-            f"{_mean(rows, 'steps'):,.0f}",
+            f"{mean_of(rows, 'steps'):,.0f}",
             spread(_column(rows, "share")),
             f"{min(_column(rows, 'share')):.3f}",
             _percent(rows, "success"),
             _percent(rows, "value_error"),
             _percent(rows, "value_error_everywhere"),
-            f"{_mean(rows, 'cpu_s'):.0f} s",
+            f"{mean_of(rows, 'cpu_s'):.0f} s",
         ]
         lines.append(_line(cells))
     return "\n".join(lines)
@@ -188,12 +189,8 @@ def _column(rows: Rows, name: str) -> list[float]:
     return [row[name] for row in rows]
 
 
-def _mean(rows: Rows, name: str) -> float:
-    return float(np.mean(_column(rows, name)))
-
-
 def _percent(rows: Rows, name: str) -> str:
-    return f"{100.0 * _mean(rows, name):.1f} %"
+    return f"{100.0 * mean_of(rows, name):.1f} %"
 
 
 def _line(cells: Sequence[object]) -> str:

@@ -21,6 +21,7 @@ from hpamdp.analysis.study import (
     first_at,
     groups,
     interval_text,
+    mean_of,
     read_csv,
     refuse_repeats,
     spread,
@@ -87,16 +88,16 @@ def table(curves: Rows) -> str:
         firsts = [first for run in runs if (first := first_at(run, "success", REACHED))]
         scores = [end["score"] for end in ends]
         cells = [PROBLEMS[problem], f"{library} {version}", learner, str(len(runs))]
-        cells += [f"{_mean(ends, 'episodes'):,.0f}", f"{_mean(ends, 'steps'):,.0f}", f"{_mean(ends, 'cpu_s'):,.0f} s"]
+        cells += [
+            f"{mean_of(ends, 'episodes'):,.0f}",
+            f"{mean_of(ends, 'steps'):,.0f}",
+            f"{mean_of(ends, 'cpu_s'):,.0f} s",
+        ]
         cells += [spread(scores, 0), interval_text(scores, ",.0f")]
-        cells += [f"{100.0 * _mean(ends, 'success'):.1f} %", f"{len(firsts)} of {len(runs)}"]
+        cells += [f"{100.0 * mean_of(ends, 'success'):.1f} %", f"{len(firsts)} of {len(runs)}"]
         cells += [_range(firsts, "episodes"), _range(firsts, "steps"), _range(firsts, "cpu_s", " s")]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def _mean(rows: Rows, name: str) -> float:
-    return sum(row[name] for row in rows) / len(rows)
 
 
 def _range(rows: Rows, name: str, unit: str = "") -> str:

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from hpamdp.analysis.study import Rows, groups, read_csv, refuse_repeats, spread, write_tables
+from hpamdp.analysis.study import Rows, groups, mean_of, read_csv, refuse_repeats, spread, write_tables
 from hpamdp.figure_style import FAINT, INK, LEARNER_COLOURS, STYLE
 from hpamdp.messages import exit_code
 
@@ -83,14 +83,10 @@ def scores_table(curves: Rows) -> str:
         ends = [run[-1] for run in runs]
         cells = [PROBLEMS[problem], f"{library} {version}", learner, acts, str(len(runs))]
         cells += [spread([at(run, cpu_s)["score"] for run in runs]) for cpu_s in times]
-        cells += [spread([end["success"] for end in ends]), f"{_mean(ends, 'cpu_s'):.0f} s"]
-        cells += [f"{_mean(ends, 'steps'):,.0f}"]
+        cells += [spread([end["success"] for end in ends]), f"{mean_of(ends, 'cpu_s'):.0f} s"]
+        cells += [f"{mean_of(ends, 'steps'):,.0f}"]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def _mean(rows: Rows, name: str) -> float:
-    return sum(row[name] for row in rows) / len(rows)
 
 
 def steps_a_second(run: Rows) -> float:

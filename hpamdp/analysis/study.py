@@ -479,6 +479,11 @@ def first_at(rows: Rows, column: str, level: float) -> dict[str, Any] | None:
     return next((row for row in rows if row[column] >= level), None)
 
 
+def mean_of(rows: Rows, column: str) -> float:
+    """Return the mean of a column."""
+    return float(np.mean([row[column] for row in rows]))
+
+
 def spread(values: Sequence[float], digits: int = 3) -> str:
     """Return a text: mean ± standard deviation (of a sample, n - 1) over seeds, or a single value."""
     mean = f"{np.mean(values):.{digits}f}"

@@ -59,23 +59,27 @@ class Demonstrations:
     ) -> None:
         device = None if device is None else checked_device(self, device)
         check_transitions(transitions)
-        with_sums = _with_open_masks(with_option_sums(transitions))
+        with_sums = with_option_sums(transitions)
         check_returns(with_sums)
         self.batch = _batch(with_sums, device)
         self.decisions = None
         if decisions is not None:
             check_decisions(decisions)
-            self.decisions = _batch(_with_open_masks(decisions), device)
+            self.decisions = _batch(decisions, device)
 
     def check(self, specs: PAMDPSpecs) -> None:
         """Check that every row is possible in an environment with these specs.
+
+        If a mask allows nothing after the end of an episode, it then allows everything, as in environments.
 
         Raises:
             DataError: a row is impossible; the message names the first one.
         """
         check_actions(self.batch.squeeze(0), specs)
+        self.batch = _with_open_masks(self.batch, specs)
         if self.decisions is not None and specs.num_options:
             check_options("the decisions", self.decisions.squeeze(0), specs)
+            self.decisions = _with_open_masks(self.decisions, specs)
 
     def discount(self, gamma: float) -> None:
         """Discount the option returns by `gamma` a step, as a selector asks for.
@@ -90,17 +94,21 @@ class Demonstrations:
         self.batch = with_option_sums(self.batch.squeeze(0), gamma).unsqueeze(0)
 
 
-def _with_open_masks(rows: TensorDict) -> TensorDict:
-    """Return rows `[N]` whose masks after the end of an episode allow everything where they allowed nothing.
+def _with_open_masks(batch: TensorDict, specs: PAMDPSpecs) -> TensorDict:
+    """Return rows `[1, N]` whose masks after the end of an episode allow everything if they allowed nothing.
 
-    Environments do the same (`PAMDPEnv.check_masks`): the best of no values, -inf, is no value to multiply by 0.
+    An action mask allows nothing if a component has no discrete action left. Environments do the same
+    (`PAMDPEnv.check_masks`): the best of no values, -inf, is no value to multiply by 0.
     """
-    rows = rows.copy()
-    for name, end in ((keys.ACTION_MASK, keys.TERMINATED), (keys.OPTION_MASK, keys.DONE)):
-        mask, is_end = rows.get(("next", name), None), rows.get(("next", end), None)
-        if mask is not None and is_end is not None:
-            rows["next", name] = mask | (is_end & ~mask.any(-1, keepdim=True))
-    return rows
+    batch = batch.copy()
+    action_mask, option_mask = (batch.get(("next", name), None) for name in (keys.ACTION_MASK, keys.OPTION_MASK))
+    if action_mask is not None and ("next", keys.TERMINATED) in batch.keys(True):
+        is_empty = ~specs.components.any_of_each(action_mask).unsqueeze(-1)
+        batch["next", keys.ACTION_MASK] = action_mask | (batch["next", keys.TERMINATED] & is_empty)
+    if option_mask is not None:
+        is_empty = ~option_mask.any(-1, keepdim=True)
+        batch["next", keys.OPTION_MASK] = option_mask | (batch["next", keys.DONE] & is_empty)
+    return batch
 
 
 def _batch(rows: TensorDict, device: torch.device | None) -> TensorDict:

@@ -30,6 +30,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO
+from hpamdp.exit_codes import DIVERGED, FAILED, INTERRUPTED, MISTAKE
 from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.messages import one_line, reason_of, say, warn
 from hpamdp.run.folder import check_no_link, has_foreign_error, is_about_folder, locked, remove_error, write_error
@@ -38,7 +39,6 @@ from hpamdp.run.stopping import exits_explained, pass_on_signal
 from hpamdp.run_files import ERROR_NAME, MAX_TEXT_BYTES, saved_summary
 from hpamdp.shell import path_setting
 
-_MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0  # for the running batch, after the sweep's process was killed
 _LOCK_PATIENCE_S = 2 * _PATIENCE_S  # for jobs of a killed sweep, which still save
 # Settings of Hydra that only a sweep reads, and those that only a single run reads.
@@ -75,7 +75,7 @@ class SweepFolderCallback(Callback):
             first_job = first_job_of_search(config)
         except ConfigError as error:
             warn(str(error))
-            sys.exit(_MISTAKE)
+            sys.exit(MISTAKE)
         if first_job is None:
             say(
                 f"{SweepFolderCallback.path}: this search has all of its trials; set hydra.sweeper.n_trials to add some"
@@ -91,7 +91,7 @@ def _check_effects(config: DictConfig, settings: tuple[str, ...], effect: str) -
     for word in config.hydra.overrides.hydra:
         if setting_of(word).startswith(settings):
             warn(one_line(f"{word}: {effect}"))
-            sys.exit(_MISTAKE)
+            sys.exit(MISTAKE)
 
 
 def _check_fixed(config: DictConfig, name: str) -> None:
@@ -99,7 +99,7 @@ def _check_fixed(config: DictConfig, name: str) -> None:
     folder = OmegaConf.select(config, name.rpartition(".")[0])._get_node("dir")._value()
     if config.resume == RESUME_AUTO and "${now:" in str(folder):
         warn(f"resume=auto: goes on with the run in a folder, so give {name}")
-        sys.exit(_MISTAKE)
+        sys.exit(MISTAKE)
 
 
 def _check_number(config: DictConfig) -> None:
@@ -165,7 +165,7 @@ def _check_output_subdir(config: DictConfig) -> None:
     given = config.hydra.output_subdir
     if given is not None:
         warn(f"hydra.output_subdir={given}: must be null; config.yaml in a run's folder has every value of the run")
-        sys.exit(_MISTAKE)
+        sys.exit(MISTAKE)
 
 
 def _compose_jobs_without_folders(loader: ConfigLoader, first_job: int) -> None:
@@ -291,7 +291,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
         say(f"Job {job.number}: {job.state}{f': {job.reason}' if job.reason else ''}")
     if job.state == _STOPPED:
         pass_on_signal()
-        sys.exit(_INTERRUPTED)
+        sys.exit(INTERRUPTED)
     return job.score
 
 
@@ -313,7 +313,7 @@ def _run_rest(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[
         say(f"Going on from {source}")
     reasons: list[str] = []
     code = train.run(cfg, folder, overrides, source, may_overwrite=True, tell=reasons.append)
-    if code in (train.DIVERGED, train.FAILED):
+    if code in (DIVERGED, FAILED):
         return _FAILED, None, one_line(" ".join(reasons))
     if code:
         return _STOPPED, None, ""
@@ -377,10 +377,10 @@ def report(start: str, error: BaseException | None = None) -> int:
             reason = one_line("".join(traceback.format_exception_only(error)))
             warn(f"The sweep broke off: {reason} ({_shown(told)})")
         say(f"To go on: the same command with {path_setting('hydra.sweep.dir', _shown(sweep_dir))}")
-        return _INTERRUPTED if is_stopped else 1
+        return INTERRUPTED if is_stopped else FAILED
     if not failed:
         return 0
-    return _MISTAKE if all(job.state == _REFUSED for job in failed) else 1
+    return MISTAKE if all(job.state == _REFUSED for job in failed) else FAILED
 
 
 def _report_seeds(sweep_dir: Path, jobs: Sequence[Job]) -> None:

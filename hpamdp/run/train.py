@@ -14,6 +14,7 @@ from hpamdp.config.saved import needs_trust
 from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError, fault_of
+from hpamdp.exit_codes import DIVERGED, FAILED, INTERRUPTED
 from hpamdp.messages import first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble, facts_about
@@ -27,8 +28,6 @@ from hpamdp.run.stopping import ProgramExitError, exits_explained
 from hpamdp.run.trainer import DivergedError, Trainer
 from hpamdp.run_files import TENSORBOARD_NAME, WANDB_NAME
 from hpamdp.shell import path_setting, program
-
-INTERRUPTED, DIVERGED, FAILED = 130, 3, 1  # exit codes
 
 
 def run(

@@ -30,10 +30,9 @@ from hpamdp.data.human.released_file import (
 from hpamdp.data.human.transitions import NO_PRESS, transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
+from hpamdp.exit_codes import INTERRUPTED, MISTAKE
 from hpamdp.messages import exit_code, one_line, say, warn
 
-_USAGE_ERROR = 2
-_INTERRUPTED = 130
 _TABLE_FORMATS = ("csv", "npz")
 _TRANSITION_FORMATS = ("memmap", "minari")
 
@@ -57,9 +56,9 @@ def _main(arguments: Sequence[str] | None) -> int:
         options.run(options)
     except DataError as error:
         warn(one_line(error))
-        return _USAGE_ERROR
+        return MISTAKE
     except KeyboardInterrupt:
-        return _INTERRUPTED
+        return INTERRUPTED
     return 0
 
 
@@ -67,7 +66,7 @@ class _Parser(argparse.ArgumentParser):
     """A parser that reports errors in one line, like all of hpamdp."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(_USAGE_ERROR, f"{message}; see --help\n")
+        self.exit(MISTAKE, f"{message}; see --help\n")
 
 
 def _parser() -> argparse.ArgumentParser:

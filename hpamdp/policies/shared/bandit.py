@@ -231,11 +231,12 @@ class Bandit(Selector):
         check_statistics(state, self.specs)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
-        """Add the rewards of finished decisions, oldest first; return the mean reward of each option."""
+        """Add the rewards of finished decisions, oldest first; return the mean reward of each option tried so far."""
         self.num_decisions += len(decisions)
         self.add_demonstrations(decisions)
-        means = self.statistics.means.tolist()
-        return {f"reward_{name}": mean for name, mean in zip(self.specs.option_names, means, strict=True)}
+        statistics, names = self.statistics, self.specs.option_names
+        means = zip(names, statistics.means.tolist(), statistics.is_untried.tolist(), strict=True)
+        return {f"reward_{name}": mean for name, mean, is_untried in means if not is_untried}
 
     def add_demonstrations(self, decisions: TensorDictBase) -> None:
         """Add the rewards of decisions, oldest first."""
