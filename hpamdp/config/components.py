@@ -118,7 +118,8 @@ class Component:
         try:
             return self.cls(**supplied, **settings)
         except SettingError as error:
-            raise ConfigError(f"{self.group}: {first_line(error)} ({self.cls.__name__})") from error
+            what, name = first_line(error), self.cls.__name__
+            raise ConfigError(f"{self.group}: {what}" if name in what else f"{self.group}: {what} ({name})") from error
         except Exception as error:
             if not is_about_memory(error):
                 raise

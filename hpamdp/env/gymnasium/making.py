@@ -65,7 +65,7 @@ class Maker:
                     " This is a worker process; name the module that registers it, as module:Name-v0, or pass the class"
                 )
             raise SettingError(f"{self.name}: {one_line(error)}{cure}") from error
-        except SettingError as error:  # of a class with Options
+        except SettingError as error:  # of `_load`, or of a class with Options
             raise SettingError(f"{self.name}: {error}") from error
         except (ProblemError, MemoryError):
             raise
@@ -93,10 +93,10 @@ class Maker:
             return entry_point
         module_name, _, name = entry_point.partition(":")
         if not all(part.isidentifier() for part in (*module_name.split("."), name)):
-            raise SettingError(f"{self.name}: must be a class or function, as package.module:name")
+            raise SettingError("must be a class or function, as package.module:name")
         entry = getattr(importlib.import_module(module_name), name, None)
         if not callable(entry):
-            raise SettingError(f"{self.name}: there is no class or function {name} in {module_name}")
+            raise SettingError(f"there is no class or function {name} in {module_name}")
         return entry
 
     def _refuse_arguments(self, error: Exception, kwargs: dict[str, Any]) -> None:
