@@ -731,12 +731,13 @@ def domains() -> list[Claim]:
         num_learners.append(len(of_domain))
         is_above.append(mean(best_runs[-1], measure) > bar)
         are_fresh.append(min(column(best_runs[-1], "seed")) >= FIRST_PROTOCOL_SEED)
+    of_tables = with_enough_seeds(rows("domains/results.csv"), "domain", "learner", "frames")
     numbers = dict(
         all=len(published),
         seeds=span(map(seeds, best_runs)),
         learners=span(num_learners),
         fewest=FEWEST_SEEDS,
-        table_hours=sum(column(rows("domains/results.csv"), "cpu_s")) / 3600.0,
+        table_hours=sum(column(of_tables, "cpu_s")) / 3600.0,
         cpu_hours=sum(column(read_csv(ROOT / "experiments/domains/results.csv"), "cpu_s")) / 3600.0,
     )
     return [
