@@ -24,6 +24,8 @@ LEARNER_COLOURS = {
     "patd3": "#332288",
     "mpdqn_published": "#882255",
     "pdqn_published": "#117733",
+    "hppo_published": "#88CCEE",
+    "hyar_published": "#CC6677",
     "pets": "#AA4499",
 }
 

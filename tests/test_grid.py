@@ -27,6 +27,7 @@ SHORT = {
         *("low.num_samples=16", "low.num_elites=4", "low.num_iterations=2"),
     ],
     "hppo": ["low.minibatch_size=16", "low.epochs=2"],
+    "hppo_published": ["low.minibatch_size=16", "low.critic_epochs=1"],
     "iql": ["low.warmup_steps=64", "low.batch_size=16"],
     "td3_bc": ["low.warmup_steps=64", "low.batch_size=16"],
     "hsac": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],

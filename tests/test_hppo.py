@@ -1,10 +1,11 @@
 """H-PPO: ratios, advantages, which rows count, and learning a problem with a known optimum."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from conftest import global_generators_unmoved
+from conftest import global_generators_unmoved, make_config
 from tensordict import TensorDict
 from torch.distributions import Categorical, Normal
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -284,6 +285,44 @@ def test_discrete_actions_without_parameters_are_learned_too():
         td["next"].update({keys.DONE: is_end, keys.TERMINATED: is_end})
         learner.learn(td, everything(td))
     assert td[keys.PARAMETERS].shape == (512, 1, 0) and reward.mean() > 0.95
+
+
+def test_the_critics_own_learning_rate_falls_with_that_of_the_actors():
+    learner = make(anneal_steps=200, minibatch_size=2, critic_lr=3e-2)
+    td = random_rows(learner, 50, 2)
+    rates = []
+    for _ in range(3):
+        learner.learn(td, everything(td))
+        rates.append([group["lr"] for group in learner.optimizer.param_groups])
+    assert rates == [pytest.approx([rate, 10.0 * rate]) for rate in (3e-3, 1.65e-3, 3e-4)]
+    groups = [{id(each) for each in group["params"]} for group in learner.optimizer.param_groups]
+    assert groups[1] == {id(each) for each in learner.critic.parameters()}
+    assert groups[0] == {id(each) for each in learner.parameters()} - groups[1]
+
+
+def test_further_passes_of_the_critic_leave_the_actors_alone():
+    once, more = make(), make(critic_epochs=20)
+    td = random_rows(once, 200, 4)
+    _, targets = once.advantages(td, everything(td))
+    errors = []
+    for learner in (once, more):
+        torch.manual_seed(1)
+        learner.learn(td, everything(td))
+        errors.append((learner.value(td[keys.OBSERVATION].flatten(0, 1)) - targets.flatten()).square().mean())
+    assert errors[1] < errors[0]
+    for name, parameter in once.actor.named_parameters():
+        assert torch.equal(parameter, more.actor.get_parameter(name)), name
+
+
+def test_the_published_form_has_the_settings_of_hyars_code():
+    settings = make_config(["low=hppo_published", "high=none", "env=platform"]).low.settings
+    expected = dict(
+        hidden_dims=(256, 256), critic_hidden_dims=(256, 256), minibatch_size=50, epochs=2, critic_epochs=8, lr=1e-4,
+        lr_final=1e-4, critic_lr=1e-3, clip=0.2, gamma=0.99, gae_lambda=0.95, discrete_entropy=0.0,
+        parameter_entropy=0.0, greedy_discrete="sampled", initial_parameters="none", reward_scale=1.0,
+    )  # fmt: skip
+    assert {name: settings[name] for name in expected} == expected
+    assert settings["initial_scale"] == pytest.approx(math.exp(-0.5), abs=1e-3)
 
 
 def test_learning_rate_and_scale_are_annealed_over_the_steps_of_the_whole_run():

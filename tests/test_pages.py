@@ -20,6 +20,7 @@ DOCS = ROOT / "docs"
 FOLDERS = {"low": "learners", "high": "selectors", "env": "domains"}
 # Those that share a page.
 SHARED = {
+    "hppo_published": "hppo",
     "hyar_published": "hyar",
     "pdqn_published": "pdqn",
     "sliding": "moving",

@@ -111,6 +111,10 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     """Learning rate of actors and critic at the start."""
     lr_final: Fraction = 1e-4
     """Learning rate after `anneal_steps`; it falls linearly from `lr` to this value."""
+    critic_lr: LearningRate | None = None
+    """Learning rate of the critic at the start. It falls by the same factor as `lr`. If null, it is `lr`."""
+    critic_epochs: Annotated[int, Field(ge=0, le=1000)] = 0
+    """Further passes over the collected steps in an update, in which the critic alone learns."""
     critic_weight: PositiveFloat = 0.5
     """Weight of the critic's squared error beside the surrogates."""
     discrete_entropy: NonNegativeFloat = 0.01
@@ -215,7 +219,17 @@ class HPPO(OnPolicy, Learner):
         )
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.to(checked_device(self, device))
-        self.optimizer = torch.optim.Adam(self.parameters(), lr=options.lr, eps=1e-5, fused=True)
+        self.optimizer = torch.optim.Adam(self._groups(), lr=options.lr, eps=1e-5, fused=True)
+        self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
+
+    def _groups(self) -> list[dict[str, Any]]:
+        """Return the parameters of the optimizer, those of the critic apart if it has a learning rate of its own."""
+        rate = self.options.critic_lr
+        if rate is None:
+            return [{"params": list(self.parameters())}]
+        own = list(self.critic.parameters())
+        others = [each for each in self.parameters() if not any(each is parameter for parameter in own)]
+        return [{"params": others}, {"params": own, "lr": rate}]
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Gather the rows in `mask` with their advantages; update once `minibatch_size` or more are waiting.
@@ -232,12 +246,15 @@ class HPPO(OnPolicy, Learner):
         if self.credit_critic is not None:
             rows["advantage"] = rows["advantage"].unsqueeze(-1) - rows[BASELINE]
         rows["advantage"] = normalised(rows["advantage"], rows.get(OWN, None), least=options.least_deviation)
-        for group in self.optimizer.param_groups:
-            group["lr"] = options.lr + progress * (options.lr_final - options.lr)
+        rate = options.lr + progress * (options.lr_final - options.lr)
+        for group, first_rate in zip(self.optimizer.param_groups, self.first_rates, strict=True):
+            group["lr"] = rate * (first_rate / options.lr)
         # A tensor, since code would be compiled again for another number.
         left = 1.0 + progress * (options.entropy_final - 1.0)
         entropy_weight = torch.tensor(left, device=rows.device, dtype=torch.float32)
         steps = [self.gradient_step(self.loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]
+        for minibatch in self.minibatches(rows, options.critic_epochs):
+            self.gradient_step(self.critic_loss, minibatch)
         # The lower limit is the one before this batch, the upper one the one after it. Published scores were made so.
         self.actor.set_min_scale(options.min_scale * (options.min_scale_final / options.min_scale) ** progress)
         if options.max_scale_final is not None:
@@ -282,6 +299,12 @@ class HPPO(OnPolicy, Learner):
             "discrete_clipped": clipped_fraction(discrete_log_ratio.detach(), self.options.clip),
             "parameter_clipped": clipped_fraction(parameter_log_ratio.detach(), self.options.clip),
         }
+
+    def critic_loss(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the squared error of V on a minibatch `[B]`, for a step of the critic alone, and nothing to log."""
+        with torch.no_grad():
+            features = self.features(rows)
+        return self.options.critic_weight * F.mse_loss(self.critic(features).squeeze(-1), rows["target"]), {}
 
     @torch.no_grad()
     def rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:

@@ -105,16 +105,17 @@ class OnPolicy(nn.Module):
         self.waiting = []
         return gathered
 
-    def minibatches(self, rows: TensorDict) -> Iterator[dict[str, Tensor]]:
+    def minibatches(self, rows: TensorDict, epochs: int | None = None) -> Iterator[dict[str, Tensor]]:
         """Yield random minibatches of the gathered rows `[M]`, in `epochs` passes over them.
 
+        If `epochs` is None, it is the setting of that name.
         If the rows are sequences, one after another, with a column `starts`, minibatches have whole ones.
         """
         columns = dict(rows.items())
         starts = columns.get("starts")
         sequence = None if starts is None else starts.long().cumsum(0) - 1
         num = len(rows) if sequence is None else int(sequence[-1]) + 1
-        for _ in range(self.options.epochs):
+        for _ in range(self.options.epochs if epochs is None else epochs):
             order = torch.randperm(num, device=rows.device)
             for indices in order.tensor_split(min(num, len(rows) // self.options.minibatch_size)):
                 if sequence is not None:
