@@ -5,7 +5,7 @@ import torch
 
 from hpamdp.policies.shared import contingent_planning
 from hpamdp.policies.shared.contingent_planning import ContingentSearch
-from hpamdp.policies.shared.planning import SequenceSearchOptions, absolute_temperature
+from hpamdp.policies.shared.planning import SequenceSearch, SequenceSearchOptions, absolute_temperature
 
 ASKS, GUESSES = 1, 0
 TARGETS = torch.tensor([-0.5, 0.5])  # of the second step's parameter, under either hypothesis
@@ -73,3 +73,11 @@ def test_the_first_action_is_the_best_one_for_all_hypotheses():
     search = ContingentSearch((1,), options)
     plan = search(returns, torch.ones(2, 1, dtype=torch.bool), 2, is_greedy=True)
     torch.testing.assert_close(plan.own, torch.full((2, 1), 0.4), atol=0.05, rtol=0.0)
+
+
+def test_a_forbidden_action_is_below_the_lowest_returns():
+    torch.manual_seed(0)
+    search = SequenceSearch((1, 1), SequenceSearchOptions(horizon=1))
+    allowed = torch.tensor([True, False]).expand(3, 1, 2)
+    plan = search(lambda steps: -1e12 - steps[0].own[..., 0].square(), 3, torch.device("cpu"), allowed)
+    assert (plan.discrete == GUESSES).all()

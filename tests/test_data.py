@@ -262,6 +262,18 @@ def test_a_mask_after_the_end_that_leaves_one_component_without_actions_allows_e
     assert after[1].all() and after[4].tolist() == [False, True, True]
 
 
+def test_a_mask_after_the_end_that_leaves_an_option_without_actions_allows_everything():
+    options = ((True, True, True), (False, False, True))
+    rows = masked([], ("next", keys.ACTION_MASK)).set(keys.OPTION, torch.zeros(5, dtype=torch.int64))
+    rows["next", keys.TERMINATED][[1, 4]] = True
+    rows["next", keys.TRUNCATED][[1, 4]] = False
+    rows["next", keys.ACTION_MASK][[1, 4]] = torch.tensor([[True, True, False], [False, True, True]])
+    demonstrations = Demonstrations(rows)
+    demonstrations.check(replace(MASKED, option_names=("any", "last"), option_actions=options))
+    after = demonstrations.batch[0]["next", keys.ACTION_MASK]
+    assert after[1].all() and after[4].tolist() == [False, True, True]
+
+
 def test_a_step_may_take_no_time_as_where_two_signals_of_a_corridor_are_due_at_once():
     Demonstrations(timed(1, 0.0)).check(SPECS)
 

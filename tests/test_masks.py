@@ -17,6 +17,7 @@ from hpamdp.env.base import ProblemError
 from hpamdp.env.decisions import DecisionEnv, with_decisions
 from hpamdp.policies.agent import HierarchicalAgent, OptionValues
 from hpamdp.policies.base import Selector
+from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.random import Random
 from hpamdp.specs import PAMDPSpecs
 
@@ -260,6 +261,37 @@ def test_an_option_ends_where_none_of_its_actions_is_allowed_any_more(high):
     is_stuck = (batch[keys.OPTION] == 2) & ~after[keys.ACTION_MASK][..., 2] & ~after[keys.DONE].squeeze(-1)
     assert is_stuck.any()
     assert after[keys.OPTION_ENDED].squeeze(-1)[is_stuck].all()
+
+
+class Revealing(Forbidden):
+    """A mask that still forbids an action where the episode is over."""
+
+    def _read(self) -> TensorDict:
+        is_forbidden = torch.nn.functional.one_hot(self.forbidden, NUM_DISCRETE) > 0
+        return super()._read().set(keys.ACTION_MASK, ~is_forbidden)
+
+
+@pytest.mark.parametrize("name", ["hyar", "td3_bc"])
+def test_an_episode_may_end_where_no_action_of_its_option_is_allowed(name):
+    problem = Revealing(8)
+    problem.option_names = ()
+    problem.group_actions({"low": [0, 1], "high": [1, 2], "last": [2]})
+    env = with_decisions(problem, 1.0, 3)
+    specs = PAMDPSpecs.from_env(env)
+    agent = HierarchicalAgent(Uniform(specs), [make_learner(name, specs.of_option(i)) for i in range(3)], specs)
+    for learner in agent.learners:
+        learner.frames.fill_(10_000)  # the warm-up is over
+    with torch.no_grad():
+        batch = env.rollout(24, agent.policy, break_when_any_done=False)
+    after = batch["next"]
+    has_action = (after[keys.ACTION_MASK].unsqueeze(-2) & torch.tensor(specs.option_actions)).any(-1)
+    is_forbidden = batch["next", keys.OBSERVATION][..., 2] > 0.0
+    is_stuck = (batch[keys.OPTION] == 2) & is_forbidden & after[keys.DONE].squeeze(-1)
+    assert is_stuck.any() and has_action[is_stuck].all()
+    assert not after[keys.ACTION_MASK][is_forbidden & ~after[keys.DONE].squeeze(-1)].all(-1).any()
+    for learner, rows in zip(agent.learners, agent._batches_of_learners(batch), strict=True):
+        learner.store(*rows[2:])
+        assert learner.target(learner.augmented(learner.buffer[:])).isfinite().all()
 
 
 def test_options_of_which_none_has_an_allowed_action_are_told_in_one_line():

@@ -97,13 +97,17 @@ class Demonstrations:
 def _with_open_masks(batch: TensorDict, specs: PAMDPSpecs) -> TensorDict:
     """Return rows `[1, N]` whose masks after the end of an episode allow everything if they allowed nothing.
 
-    An action mask allows nothing if a component has no discrete action left. Environments do the same
-    (`PAMDPEnv.check_masks`): the best of no values, -inf, is no value to multiply by 0.
+    An action mask allows nothing if a component, or an option that is a set of actions, has no discrete action left.
+    Environments do the same (`PAMDPEnv.check_masks`, `DecisionTracker`): the best of no values, -inf, is no value to
+    multiply by 0.
     """
     batch = batch.copy()
     action_mask, option_mask = (batch.get(("next", name), None) for name in (keys.ACTION_MASK, keys.OPTION_MASK))
     if action_mask is not None and ("next", keys.TERMINATED) in batch.keys(True):
-        is_empty = ~specs.components.any_of_each(action_mask).unsqueeze(-1)
+        everything = ((True,) * specs.num_discrete,)
+        options = torch.tensor(specs.option_actions or everything, device=action_mask.device)
+        has_action = specs.components.any_of_each(action_mask.unsqueeze(-2) & options)
+        is_empty = ~has_action.all(-1, keepdim=True)
         batch["next", keys.ACTION_MASK] = action_mask | (batch["next", keys.TERMINATED] & is_empty)
     if option_mask is not None:
         is_empty = ~option_mask.any(-1, keepdim=True)

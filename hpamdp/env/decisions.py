@@ -30,7 +30,8 @@ class DecisionTracker(Transform):
     - `option_ended`, bool, only with an `option_length` or `ends_with_trips`: under `next`, the option ended with this
       step by itself or with its trip, not only because its episode did.
     - `option_mask`, bool `[*B, num_options]`, only with `option_actions`: which options have an allowed action, of each
-      component. Where the held option has none, it ends.
+      component. Where the held option has none, it ends. Where an episode is over and its mask leaves an option without
+      an action, the mask becomes one that allows everything.
     - `episode_return` and `episode_steps`: undiscounted sum of rewards and number of steps since the episode began.
 
     The rows where `("next", "is_decision")` is True are the transitions of the semi-MDP. All state travels in the
@@ -162,6 +163,7 @@ class DecisionTracker(Transform):
             return None
         possible = self._possible_options(next_tensordict, self.option_actions)
         next_tensordict.set(keys.OPTION_MASK, possible)
+        self._open_last_mask(next_tensordict, self.option_actions)
         option = tensordict.get(keys.OPTION)
         is_stuck = ~possible.gather(-1, option.unsqueeze(-1))
         if self.option_length is None:
@@ -174,6 +176,19 @@ class DecisionTracker(Transform):
                     f"last as long as their {lifetime}; use agent.termination=steps, learned or chosen"
                 )
         return is_stuck
+
+    def _open_last_mask(self, tensordict: TensorDictBase, option_actions: Tensor) -> None:
+        """Allow every action where an episode is over and its mask leaves an option without one.
+
+        An option's value there is the best of its actions. The best of none, -inf, is no value to multiply by 0.
+        """
+        action_mask = tensordict.get(keys.ACTION_MASK, None)
+        if action_mask is None:
+            return
+        allowed = option_actions & action_mask.unsqueeze(-2)
+        has_action = allowed.any(-1) if self.components is None else self.components.any_of_each(allowed)
+        is_open = tensordict.get(keys.DONE) & ~has_action.all(-1, keepdim=True)
+        tensordict.set(keys.ACTION_MASK, action_mask | is_open)
 
     def _possible_options(self, tensordict: TensorDictBase, option_actions: Tensor) -> Tensor:
         """Return which options have an allowed action of each component, bool `[*B, num_options]`.

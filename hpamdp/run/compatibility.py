@@ -164,7 +164,7 @@ def check_effects_on(problem: ProblemFacts, config: Config, words: Sequence[str]
 
 
 def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
-    """Return a warning for each word whose setting counts only with another value of another setting.
+    """Return a warning for each word whose setting counts only with another value of another setting, or of the mode.
 
     A warning is enough: in a sweep, one command line serves several values of the other setting.
 
@@ -176,17 +176,29 @@ def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
         f"{word if name == setting_of(word) else name}: has no effect; {name.rpartition('.')[2]} counts only {each}"
         for word in words
         for name in settings_in(word)
-        for each in _conditions(config, name)
+        for each in (*_conditions(config, name), *_needs_of_steps(config, name))
     ]
+
+
+def _needs_of_steps(config: Config, name: str) -> list[str]:
+    """Return that a setting counts only with own steps, if it does and the run learns from a data set alone."""
+    component, setting = _component_and_setting(config, name)
+    counts_steps = component is not None and setting in getattr(component.cls, "settings_of_steps", ())
+    return ["with mode=train"] if config.run.mode == "offline" and counts_steps else []
+
+
+def _component_and_setting(config: Config, name: str) -> tuple[Component | None, str]:
+    """Return the component that a setting such as `low.memory_size` belongs to, if any, and its name there."""
+    group, _, setting = name.partition(".")
+    if setting.startswith("per_option."):
+        option, _, setting = setting.removeprefix("per_option.").partition(".")
+        return config.low_of.get(option), setting
+    return (getattr(config, group) if group in GROUPS else None), setting
 
 
 def _conditions(config: Config, name: str) -> list[OnlyWith]:
     """Return the conditions of a setting that do not hold, such as those of `low.memory_size` without `low.memory`."""
-    group, _, setting = name.partition(".")
-    component: Component | None = getattr(config, group) if group in GROUPS else None
-    if setting.startswith("per_option."):
-        option, _, setting = setting.removeprefix("per_option.").partition(".")
-        component = config.low_of.get(option)
+    component, setting = _component_and_setting(config, name)
     if component is None or component.cls is None or not takes_settings_model(component.cls):
         return []
     field = settings_model(component.cls).model_fields.get(setting)

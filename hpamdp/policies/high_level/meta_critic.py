@@ -66,6 +66,9 @@ class MetaCritic(RemembersDecisions):
     Options = MetaCriticOptions
     takes_pictures = True
     ends_options: ClassVar[bool] = True
+    settings_of_steps: ClassVar[frozenset[str]] = frozenset(
+        {"epsilon_decisions", "epsilon_final", "max_updates", "updates_per_decision", "warmup_decisions"}
+    )
     num_decisions: Tensor
 
     def __init__(

@@ -286,6 +286,9 @@ class PDQN(ReplayLearner):
     takes_pictures = True
     exploring_keys = frozenset({PROCESS})
     progress = ReplayLearner.progress | {"episodes"}
+    settings_of_steps = ReplayLearner.settings_of_steps | {
+        "epsilon_final", "epsilon_steps", "epsilon_episodes", "lr_final_fraction", "lr_steps"
+    }  # fmt: skip
 
     options: PDQNOptions
     policy: PDQNPolicy

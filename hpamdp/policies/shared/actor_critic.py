@@ -54,7 +54,10 @@ class AnnealedRateOptions(Settings):
     lr_final_fraction: PositiveFraction = 1.0
     """Fraction of the learning rates that is left after `lr_steps`; 1 keeps them constant."""
     lr_steps: NonNegativeInt = 100_000
-    """The learner's own steps, after its warm-up, within which the learning rates fall."""
+    """The learner's own steps, after its warm-up, within which the learning rates fall.
+
+    With `mode=offline` there are none, and the rates stay constant.
+    """
 
 
 def set_learning_rates(

@@ -14,8 +14,8 @@ from typing_extensions import Self
 from hpamdp.policies.masks import random_choice
 from hpamdp.settings import Settings
 
-# Of a sequence with a forbidden action: finite, so that the weights of the elites are numbers.
-_FORBIDDEN_RETURN = -1e9
+# Of a sequence with a forbidden action: below all returns, and finite, so that the weights of the elites are numbers.
+_FORBIDDEN_RETURN = -1e30
 
 
 class SearchOptions(Settings):

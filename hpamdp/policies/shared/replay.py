@@ -104,6 +104,7 @@ class ReplayLearner(Learner):
     explores_with: ClassVar[frozenset[str]] = frozenset({"actions", "rewards"})
     novelty_by: ClassVar[Literal["reward", "sample", "plan"]] = "sample"
     progress: ClassVar[frozenset[str]] = Learner.progress | {"last_rows"}
+    settings_of_steps: ClassVar[frozenset[str]] = frozenset({"warmup_steps", "updates_per_step"})
     counts_durations: ClassVar[bool] = True
     stores_own_parameters: bool = False
     catches_up: bool = False
