@@ -40,7 +40,7 @@ MISTAKES = [
     (["+low=hppo"], "+low=hppo: low is always chosen; leave out the +"),
     (["+exploration=held"], "+exploration=held: exploration is always chosen; leave out the +"),
     (["low=pdqn", "low.epsilon=0.1"], "did you mean epsilon_steps or epsilon_final or epsilon_episodes? It has "),
-    (["low=hppo", "low.learning_rate=1"], "low.learning_rate: no such setting of HPPO; did you mean lr or critic_lr? It has "),
+    (["low=hppo", "low.learning_rate=1"], "no such setting of HPPO; did you mean lr or critic_lr? It has "),
     (["low=pdqn", "low.learning_rate=1"], "did you mean actor_lr or critic_lr? It has "),
     (["low=hppo", "low.batch_size=64"], "did you mean minibatch_size? It has "),
     (["low=hppo", "low.n_steps=64"], "did you mean steps_per_batch? It has "),

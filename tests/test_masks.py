@@ -19,6 +19,7 @@ from hpamdp.policies.agent import HierarchicalAgent, OptionValues
 from hpamdp.policies.base import Selector
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.random import Random
+from hpamdp.policies.masks import masked_logits
 from hpamdp.specs import PAMDPSpecs
 
 CPU = torch.device("cpu")
@@ -323,6 +324,12 @@ def test_where_an_episode_is_over_a_mask_allows_everything():
     specs = PAMDPSpecs.from_env(env)
     rows = env.rollout(4, Random(specs).policy)
     assert rows["next", keys.ACTION_MASK][:, -1].all() and not rows["next", keys.ACTION_MASK][:, 0].all(-1).any()
+
+
+def test_logits_of_any_size_leave_forbidden_choices_a_probability_of_zero():
+    logits = torch.tensor([[-1e12, 0.0], [3.0, -1e20]])
+    probability = masked_logits(logits, torch.tensor([[True, False], [False, True]])).softmax(-1)
+    assert probability.tolist() == [[1.0, 0.0], [0.0, 1.0]]
 
 
 def test_a_problem_without_masks_has_none():

@@ -12,8 +12,8 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.specs import PAMDPSpecs
 
-# With this logit a choice has probability 0, while entropies and gradients stay finite.
-_FORBIDDEN_LOGIT = -1e9
+# With this logit a choice has probability 0 whatever the others' are, while entropies and gradients stay finite.
+_FORBIDDEN_LOGIT = -1e30
 
 
 def sample_index(logits: Tensor) -> Tensor:
