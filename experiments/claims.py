@@ -37,6 +37,7 @@ from hpamdp.analysis.study import (
     groups,
     interquartile_mean,
     mean_interval,
+    mean_of,
     read_csv,
     spread,
     standing_rows,
@@ -93,7 +94,7 @@ def column(of: Rows, name: str) -> list[float]:
 
 
 def mean(of: Rows, name: str = "score") -> float:
-    return float(np.mean(column(of, name)))
+    return mean_of(of, name)
 
 
 def means(of: Rows, *by: str, name: str = "score") -> list[float]:
@@ -103,6 +104,12 @@ def means(of: Rows, *by: str, name: str = "score") -> list[float]:
 
 def mean_and_deviation(of: Rows, name: str = "score") -> str:
     return spread(column(of, name))
+
+
+def listed(values: Iterable[float], style: str) -> str:
+    """Return two numbers or more as a text, as in `0.1, 0.2 and 0.3`."""
+    *first, last = (format(value, style) for value in values)
+    return f"{', '.join(first)} and {last}"
 
 
 def seeds(of: Rows) -> int:
@@ -992,10 +999,6 @@ def notes_on_domains() -> list[Claim]:
     def paper(domain: str, method: str, source: str) -> float:
         return mean(rows("domains/published.csv", domain=domain, method=method, source=source))
 
-    def listed(domain: str, learner: str, style: str) -> str:
-        *others, last = (format(score, style) for score in scores(domain, learner))
-        return f"{', '.join(others)} and {last}"
-
     def passed(domain: str, learner: str, run: Rows) -> float:
         return steps_to(published[domain], run, measure(domain), "at_frames")
 
@@ -1031,8 +1034,10 @@ def notes_on_domains() -> list[Claim]:
             worst=catch[0],
             others=span(catch[1:], ".2f"),
         ),
-        claim("On Goal its five new seeds score {each} (published 0).", each=listed("goal", "hppo", ".2f")),
-        claim("On Hard Goal the new seeds score {each} (published 0).", each=listed("hard_goal", "hppo", ".2f")),
+        claim("On Goal its five new seeds score {each} (published 0).", each=listed(scores("goal", "hppo"), ".2f")),
+        claim(
+            "On Hard Goal the new seeds score {each} (published 0).", each=listed(scores("hard_goal", "hppo"), ".2f")
+        ),
         claim(
             "On Sliding {seeds:word} new seeds return {each} and succeed in {success:.3f} of the episodes (the "
             "hand-written player returns {by_hand:.3f}).",
@@ -1070,11 +1075,11 @@ def notes_on_domains() -> list[Claim]:
             mpdqn_bar=paper("platform", "mpdqn", "MP-DQN"),
             pdqn=average("platform", "pdqn_published"),
             pdqn_bar=paper("platform", "pdqn", "MP-DQN"),
-            each=listed("platform", "pdqn_published", ".3f"),
+            each=listed(scores("platform", "pdqn_published"), ".3f"),
         ),
         claim(
             "three new seeds score {each} (published {bar:.3f}, after 80,000 episodes)",
-            each=listed("goal", "mpdqn_published", ".3f"),
+            each=listed(scores("goal", "mpdqn_published"), ".3f"),
             bar=paper("goal", "mpdqn", "MP-DQN"),
         ),
         claim(
@@ -1303,9 +1308,6 @@ def agents() -> list[Claim]:
 
     ten_actuators = domain_runs()[0]["hard_move_10", "hppo"]
 
-    def listed(scores: Sequence[float]) -> str:
-        return f"{', '.join(f'{score:.3f}' for score in scores[:-1])} and {scores[-1]:.3f}"
-
     def is_best(agent: str, scores: Sequence[float]) -> bool:
         return round(summary(f"agents/{agent}")["score"], 3) == max(scores)
 
@@ -1314,8 +1316,8 @@ def agents() -> list[Claim]:
         score=summary("agents/linucb_hppo")["score"],
         ceiling=ceiling(),
         agreement=100.0 * summary("agents/linucb_hppo")["oracle_agreement"],
-        goal=listed(goal),
-        hard_goal=listed(hard_goal),
+        goal=listed(goal, ".3f"),
+        hard_goal=listed(hard_goal, ".3f"),
         num=len(goal),
         goal_mean=float(np.mean(goal)),
         hard_goal_mean=float(np.mean(hard_goal)),
@@ -1553,8 +1555,7 @@ def problems() -> list[Claim]:
         return rows("problems/results.csv", problem="primitives disassemble, dense", learner=learner)
 
     def each_success(runs: Rows) -> str:
-        *first, last = (f"{100.0 * share:.0f}" for share in column(runs, "success"))
-        return f"{', '.join(first)} and {last}"
+        return listed((100.0 * success for success in column(runs, "success")), ".0f")
 
     sparse = {
         task: [success(task, "sparse", learner) for learner in ("hppo", "hppo, lr=0.001")]

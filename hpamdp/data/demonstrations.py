@@ -105,8 +105,8 @@ def _with_open_masks(batch: TensorDict, specs: PAMDPSpecs) -> TensorDict:
     action_mask, option_mask = (batch.get(("next", name), None) for name in (keys.ACTION_MASK, keys.OPTION_MASK))
     if action_mask is not None and ("next", keys.TERMINATED) in batch.keys(True):
         everything = ((True,) * specs.num_discrete,)
-        options = torch.tensor(specs.option_actions or everything, device=action_mask.device)
-        has_action = specs.components.any_of_each(action_mask.unsqueeze(-2) & options)
+        option_actions = torch.tensor(specs.option_actions or everything, device=action_mask.device)
+        has_action = specs.components.any_of_each(action_mask.unsqueeze(-2) & option_actions)
         is_empty = ~has_action.all(-1, keepdim=True)
         batch["next", keys.ACTION_MASK] = action_mask | (batch["next", keys.TERMINATED] & is_empty)
     if option_mask is not None:

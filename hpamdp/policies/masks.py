@@ -12,7 +12,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.specs import PAMDPSpecs
 
-# With this logit a choice has probability 0 whatever the others' are, while entropies and gradients stay finite.
+# A choice with this logit has probability 0, whatever the other logits are. Entropies and gradients stay finite.
 _FORBIDDEN_LOGIT = -1e30
 
 

@@ -181,7 +181,7 @@ def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
 
 
 def _needs_of_steps(config: Config, name: str) -> list[str]:
-    """Return that a setting counts only with own steps, if it does and the run learns from a data set alone."""
+    """Return the mode that a setting needs, if it counts own steps and the run learns from a data set alone."""
     component, setting = _component_and_setting(config, name)
     counts_steps = component is not None and setting in getattr(component.cls, "settings_of_steps", ())
     return ["with mode=train"] if config.run.mode == "offline" and counts_steps else []

@@ -227,9 +227,8 @@ class HPPO(OnPolicy, Learner):
         rate = self.options.critic_lr
         if rate is None:
             return [{"params": list(self.parameters())}]
-        own = list(self.critic.parameters())
-        others = [each for each in self.parameters() if not any(each is parameter for parameter in own)]
-        return [{"params": others}, {"params": own, "lr": rate}]
+        others = [each for name, each in self.named_parameters() if not name.startswith("critic.")]
+        return [{"params": others}, {"params": list(self.critic.parameters()), "lr": rate}]
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Gather the rows in `mask` with their advantages; update once `minibatch_size` or more are waiting.

@@ -56,7 +56,7 @@ class AnnealedRateOptions(Settings):
     lr_steps: NonNegativeInt = 100_000
     """The learner's own steps, after its warm-up, within which the learning rates fall.
 
-    With `mode=offline` there are none, and the rates stay constant.
+    With `mode=offline` the learner makes no steps of its own, so the rates stay constant.
     """
 
 

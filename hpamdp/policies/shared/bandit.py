@@ -231,7 +231,7 @@ class Bandit(Selector):
         check_statistics(state, self.specs)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
-        """Add the rewards of finished decisions, oldest first; return the mean reward of each option tried so far."""
+        """Add the rewards of finished decisions, oldest first; return the mean of each option's known rewards."""
         self.num_decisions += len(decisions)
         self.add_demonstrations(decisions)
         statistics, names = self.statistics, self.specs.option_names

@@ -108,8 +108,8 @@ class OnPolicy(nn.Module):
     def minibatches(self, rows: TensorDict, epochs: int | None = None) -> Iterator[dict[str, Tensor]]:
         """Yield random minibatches of the gathered rows `[M]`, in `epochs` passes over them.
 
-        If `epochs` is None, it is the setting of that name.
-        If the rows are sequences, one after another, with a column `starts`, minibatches have whole ones.
+        Without `epochs`, the setting of that name says how many. If the rows are sequences, one after another, with a
+        column `starts`, minibatches have whole ones.
         """
         columns = dict(rows.items())
         starts = columns.get("starts")
