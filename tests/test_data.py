@@ -274,6 +274,27 @@ def test_a_mask_after_the_end_that_leaves_an_option_without_actions_allows_every
     assert after[1].all() and after[4].tolist() == [False, True, True]
 
 
+def test_a_mask_after_a_truncation_that_leaves_the_held_option_nothing_opens_its_own_actions_alone():
+    specs = replace(MASKED, option_names=("low", "last"), option_actions=((True, True, False), (False, False, True)))
+    rows = masked([], ("next", keys.ACTION_MASK)).set(keys.OPTION, torch.tensor([0, 0, 1, 1, 1]))
+    rows[keys.DISCRETE][:2], rows[keys.DISCRETE][2:] = 0, 2
+    for name, value in ((keys.TERMINATED, False), (keys.TRUNCATED, True)):
+        rows["next", name][[1, 4]] = value
+    rows["next", keys.ACTION_MASK][[1, 4]] = torch.tensor([[True, False, False], [True, False, False]])
+    demonstrations = Demonstrations(rows)
+    demonstrations.check(specs)
+    after = demonstrations.batch[0]["next", keys.ACTION_MASK]
+    assert after[[1, 4]].tolist() == [[True, False, False], [True, False, True]]
+
+
+def test_a_mask_may_allow_nothing_after_a_truncation_as_after_a_termination():
+    rows = masked(4, ("next", keys.ACTION_MASK))
+    assert rows["next", keys.TRUNCATED][4]
+    demonstrations = Demonstrations(rows)
+    demonstrations.check(MASKED)
+    assert demonstrations.batch[0]["next", keys.ACTION_MASK].all()
+
+
 def test_a_step_may_take_no_time_as_where_two_signals_of_a_corridor_are_due_at_once():
     Demonstrations(timed(1, 0.0)).check(SPECS)
 

@@ -265,11 +265,16 @@ def test_an_option_ends_where_none_of_its_actions_is_allowed_any_more(high):
 
 
 class Revealing(Forbidden):
-    """A mask that still forbids an action where the episode is over."""
+    """A mask that still forbids an action where the episode is over; it may be truncated there."""
+
+    is_truncated = False
 
     def _read(self) -> TensorDict:
         is_forbidden = torch.nn.functional.one_hot(self.forbidden, NUM_DISCRETE) > 0
-        return super()._read().set(keys.ACTION_MASK, ~is_forbidden)
+        after = super()._read().set(keys.ACTION_MASK, ~is_forbidden)
+        if self.is_truncated:
+            after[keys.TERMINATED], after[keys.TRUNCATED] = after[keys.TRUNCATED], after[keys.TERMINATED]
+        return after
 
 
 @pytest.mark.parametrize("name", ["hyar", "td3_bc"])
@@ -293,6 +298,27 @@ def test_an_episode_may_end_where_no_action_of_its_option_is_allowed(name):
     for learner, rows in zip(agent.learners, agent._batches_of_learners(batch), strict=True):
         learner.store(*rows[2:])
         assert learner.target(learner.augmented(learner.buffer[:])).isfinite().all()
+
+
+@pytest.mark.parametrize("option_length", [None, 3])
+def test_a_truncation_that_leaves_the_held_option_no_action_opens_its_own_actions_alone(option_length):
+    problem = Revealing(32)
+    problem.max_steps, problem.is_truncated, problem.option_names = 1, True, ()
+    problem.group_actions({"low": [0, 1], "first": [0], "last": [2]})
+    env = with_decisions(problem, 1.0, option_length)
+    td = env.reset()
+    option = torch.where(td[keys.OPTION_MASK][:, 2], 2, 0)
+    discrete = torch.where(option == 2, 2, td[keys.ACTION_MASK].int().argmax(-1))
+    td.update({keys.OPTION: option, keys.DISCRETE: discrete, keys.PARAMETERS: torch.zeros(32, 3)})
+    after = env.step(td)["next"]
+    is_stuck = (option == 2) & (problem.forbidden == 2)
+    assert after[keys.TRUNCATED].all() and is_stuck.any()
+    assert after[keys.ACTION_MASK][is_stuck].all()
+    allowed = torch.nn.functional.one_hot(problem.forbidden, NUM_DISCRETE) == 0
+    assert after[keys.ACTION_MASK][~is_stuck].equal(allowed[~is_stuck])
+    assert after[keys.OPTION_MASK][:, 1:].equal(allowed[:, [0, 2]]), "what may follow is not opened"
+    if option_length is not None:
+        assert after[keys.OPTION_ENDED].squeeze(-1).equal(is_stuck)
 
 
 def test_options_of_which_none_has_an_allowed_action_are_told_in_one_line():

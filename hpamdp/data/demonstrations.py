@@ -16,6 +16,7 @@ from hpamdp.data.row_checks import (
     check_transitions,
 )
 from hpamdp.devices import checked_device
+from hpamdp.env.decisions import mask_open_at_end
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -33,7 +34,7 @@ class Demonstrations:
             the environment's. The last row of each episode is `done`, and no other row. Parameters of discrete actions
             that a row does not take may be 0. `action_mask` and `option_mask` are optional, at the root and under
             `next`; without them learners take all actions and options as allowed. After the end of an episode a mask
-            may allow nothing.
+            may allow nothing; `check` opens it.
             `pair_mask`, `parameter_low` and `parameter_high` are required if the environment gives them.
             `("next", "duration")`, finite and at least 0, goes with environments whose steps take different times.
             Without it learners discount all these steps alike.
@@ -70,7 +71,7 @@ class Demonstrations:
     def check(self, specs: PAMDPSpecs) -> None:
         """Check that every row is possible in an environment with these specs.
 
-        If a mask allows nothing after the end of an episode, it then allows everything, as in environments.
+        If a mask allows nothing after the end of an episode, it is opened, as in environments.
 
         Raises:
             DataError: a row is impossible; the message names the first one.
@@ -95,23 +96,22 @@ class Demonstrations:
 
 
 def _with_open_masks(batch: TensorDict, specs: PAMDPSpecs) -> TensorDict:
-    """Return rows `[1, N]` whose masks after the end of an episode allow everything if they allowed nothing.
+    """Return rows `[1, N]` whose masks after the end of an episode are opened where they allow nothing.
 
-    An action mask allows nothing if a component, or an option that is a set of actions, has no discrete action left.
-    Environments do the same (`PAMDPEnv.check_masks`, `DecisionTracker`): the best of no values, -inf, is no value to
-    multiply by 0.
+    Environments do the same (`PAMDPEnv.check_masks`, `mask_open_at_end`). An action mask allows nothing if a component,
+    or an option that is a set of actions, has no discrete action left.
     """
     batch = batch.copy()
-    action_mask, option_mask = (batch.get(("next", name), None) for name in (keys.ACTION_MASK, keys.OPTION_MASK))
-    if action_mask is not None and ("next", keys.TERMINATED) in batch.keys(True):
+    after = batch["next"]
+    if keys.ACTION_MASK in after.keys() and keys.TERMINATED in after.keys():
         everything = ((True,) * specs.num_discrete,)
-        option_actions = torch.tensor(specs.option_actions or everything, device=action_mask.device)
-        has_action = specs.components.any_of_each(action_mask.unsqueeze(-2) & option_actions)
-        is_empty = ~has_action.all(-1, keepdim=True)
-        batch["next", keys.ACTION_MASK] = action_mask | (batch["next", keys.TERMINATED] & is_empty)
-    if option_mask is not None:
-        is_empty = ~option_mask.any(-1, keepdim=True)
-        batch["next", keys.OPTION_MASK] = option_mask | (batch["next", keys.DONE] & is_empty)
+        option_actions = torch.tensor(specs.option_actions or everything, device=after.device)
+        option = batch[keys.OPTION] if specs.option_actions else torch.zeros_like(after[keys.DONE].squeeze(-1)).long()
+        has_action = specs.components.any_of_each(after[keys.ACTION_MASK].unsqueeze(-2) & option_actions)
+        after[keys.ACTION_MASK] = mask_open_at_end(after, option, option_actions, has_action)
+    if keys.OPTION_MASK in after.keys():
+        is_empty = ~after[keys.OPTION_MASK].any(-1, keepdim=True)
+        after[keys.OPTION_MASK] = after[keys.OPTION_MASK] | (after[keys.DONE] & is_empty)
     return batch
 
 

@@ -294,7 +294,7 @@ def _action_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
         yield _Rule(keys.DISCRETE, allowed, f"allowed by the row's {keys.ACTION_MASK}")
     if specs.has_action_mask and ("next", keys.ACTION_MASK) in rows.keys(True, True):
         mask = rows.get(("next", keys.ACTION_MASK))
-        has_one = components.any_of_each(mask).unsqueeze(-1) | rows.get(("next", keys.TERMINATED))
+        has_one = components.any_of_each(mask).unsqueeze(-1) | rows.get(("next", keys.DONE))
         yield _Rule(("next", keys.ACTION_MASK), has_one.expand_as(mask), "true for at least one action")
 
 

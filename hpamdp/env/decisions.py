@@ -30,8 +30,8 @@ class DecisionTracker(Transform):
     - `option_ended`, bool, only with an `option_length` or `ends_with_trips`: under `next`, the option ended with this
       step by itself or with its trip, not only because its episode did.
     - `option_mask`, bool `[*B, num_options]`, only with `option_actions`: which options have an allowed action, of each
-      component. Where the held option has none, it ends. Where an episode is over and its mask leaves an option without
-      an action, the mask becomes one that allows everything.
+      component. Where the held option has none, it ends. Where an episode is over and leaves an option no action, the
+      action mask is opened (`mask_open_at_end`).
     - `episode_return` and `episode_steps`: undiscounted sum of rewards and number of steps since the episode began.
 
     The rows where `("next", "is_decision")` is True are the transitions of the semi-MDP. All state travels in the
@@ -99,7 +99,8 @@ class DecisionTracker(Transform):
         if self.ends_inside:
             tensordict_reset.set(keys.OPTION_ENDED, torch.zeros_like(is_decision))
         if self.option_actions is not None:
-            tensordict_reset.set(keys.OPTION_MASK, self._possible_options(tensordict_reset, self.option_actions))
+            has_action = self._has_action(tensordict_reset, self.option_actions)
+            tensordict_reset.set(keys.OPTION_MASK, _possible_options(tensordict_reset, has_action))
         if self.keeps_observation:
             tensordict_reset.set(keys.DECISION_OBSERVATION, observation)
         return tensordict_reset.update(
@@ -161,13 +162,18 @@ class DecisionTracker(Transform):
         """
         if self.option_actions is None:
             return None
-        possible = self._possible_options(next_tensordict, self.option_actions)
-        next_tensordict.set(keys.OPTION_MASK, possible)
-        self._open_last_mask(next_tensordict, self.option_actions)
         option = tensordict.get(keys.OPTION)
+        has_action = self._has_action(next_tensordict, self.option_actions)
+        possible = _possible_options(next_tensordict, has_action)
+        next_tensordict.set(keys.OPTION_MASK, possible)
+        if keys.ACTION_MASK in next_tensordict.keys():
+            action_mask = mask_open_at_end(next_tensordict, option, self.option_actions, has_action)
+            next_tensordict.set(keys.ACTION_MASK, action_mask)
         is_stuck = ~possible.gather(-1, option.unsqueeze(-1))
         if self.option_length is None:
-            cannot_end = is_stuck & ~next_tensordict.get(keys.TRIP_ENDED) if self.ends_with_trips else is_stuck
+            cannot_end = is_stuck & ~next_tensordict.get(keys.DONE)
+            if self.ends_with_trips:
+                cannot_end = cannot_end & ~next_tensordict.get(keys.TRIP_ENDED)
             if cannot_end.any():
                 row = int(cannot_end.flatten().nonzero()[0])
                 lifetime = "trips" if self.ends_with_trips else "episodes"
@@ -177,42 +183,55 @@ class DecisionTracker(Transform):
                 )
         return is_stuck
 
-    def _open_last_mask(self, tensordict: TensorDictBase, option_actions: Tensor) -> None:
-        """Allow every action where an episode is over and its mask leaves an option without one.
-
-        An option's value there is the best of its actions. The best of none, -inf, is no value to multiply by 0.
-        """
-        action_mask = tensordict.get(keys.ACTION_MASK, None)
-        if action_mask is None:
-            return
-        allowed = option_actions & action_mask.unsqueeze(-2)
-        has_action = allowed.any(-1) if self.components is None else self.components.any_of_each(allowed)
-        is_open = tensordict.get(keys.DONE) & ~has_action.all(-1, keepdim=True)
-        tensordict.set(keys.ACTION_MASK, action_mask | is_open)
-
-    def _possible_options(self, tensordict: TensorDictBase, option_actions: Tensor) -> Tensor:
-        """Return which options have an allowed action of each component, bool `[*B, num_options]`.
-
-        All options have one where an episode is over.
-
-        Raises:
-            ProblemError: none has one where the episode goes on.
-        """
+    def _has_action(self, tensordict: TensorDictBase, option_actions: Tensor) -> Tensor:
+        """Return which options have an allowed action of each component, bool `[*B, num_options]`."""
         allowed = option_actions.expand(*tensordict.batch_size, *option_actions.shape)
         if (action_mask := tensordict.get(keys.ACTION_MASK, None)) is not None:
             allowed = allowed & action_mask.unsqueeze(-2)
+        if self.components is None:
+            return allowed.any(-1)
         pair_mask = tensordict.get(keys.PAIR_MASK, None)
-        pairs = None if pair_mask is None else pair_mask.unsqueeze(-3)
-        has_action = allowed.any(-1) if self.components is None else self.components.leaves_any(allowed, pairs)
-        possible = has_action | tensordict.get(keys.DONE)
-        has_none = ~possible.any(-1)
-        if has_none.any():
-            row = int(has_none.flatten().nonzero()[0])
-            masks = " and ".join(name for name in (keys.ACTION_MASK, keys.PAIR_MASK) if name in tensordict.keys())
-            raise ProblemError(
-                f"environment {row}: no option has an action that its {masks} allows; give the options more actions"
-            )
-        return possible
+        return self.components.leaves_any(allowed, None if pair_mask is None else pair_mask.unsqueeze(-3))
+
+
+def _possible_options(tensordict: TensorDictBase, has_action: Tensor) -> Tensor:
+    """Return which options may be chosen in a state, bool `[*B, num_options]`: those with an allowed action.
+
+    All options may be where nothing is chosen any more: after a termination, and where an episode is over and leaves
+    none of them an action.
+
+    Raises:
+        ProblemError: none has an action where the episode goes on.
+    """
+    has_none = ~has_action.any(-1, keepdim=True)
+    done = tensordict.get(keys.DONE)
+    is_refused = (has_none & ~done).flatten()
+    if is_refused.any():
+        row = int(is_refused.nonzero()[0])
+        masks = " and ".join(name for name in (keys.ACTION_MASK, keys.PAIR_MASK) if name in tensordict.keys())
+        raise ProblemError(
+            f"environment {row}: no option has an action that its {masks} allows; give the options more actions"
+        )
+    return has_action | has_none | tensordict.get(keys.TERMINATED)
+
+
+def mask_open_at_end(after: TensorDictBase, option: Tensor, option_actions: Tensor, has_action: Tensor) -> Tensor:
+    """Return the action mask of states `[*B]`, opened where an episode is over and leaves an option no action.
+
+    The value of a state is that of the best action. The best of none, -inf, is no value to learn from. After a
+    termination all actions are allowed, since this value is multiplied by 0. After a truncation it counts. There the
+    held option alone is considered. If it has no action, all of its own are allowed, and no other option's.
+
+    Args:
+        after: `action_mask`, `done` and `terminated` of the states.
+        option: the held options, int64 `[*B]`.
+        option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`.
+        has_action: which options have an allowed action, bool `[*B, num_options]`.
+    """
+    is_open = after.get(keys.TERMINATED) & ~has_action.all(-1, keepdim=True)
+    is_stuck = after.get(keys.DONE) & ~has_action.gather(-1, option.unsqueeze(-1))
+    action_mask: Tensor = after.get(keys.ACTION_MASK)
+    return action_mask | is_open | (is_stuck & option_actions[option])
 
 
 def _zero_where(mask: Tensor, values: Tensor) -> Tensor:
