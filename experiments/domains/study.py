@@ -58,7 +58,7 @@ DOMAINS = {
 # Hard Move is one environment with four numbers of actuators.
 ENVIRONMENTS = [*dict.fromkeys("hard_move" if name.startswith("hard_move") else name for name in DOMAINS)]
 # Random steps before HyAR learns, which its published number of steps leaves out.
-UNCOUNTED = {("platform", "hyar_published"): 11_000}
+UNCOUNTED_STEPS = {("platform", "hyar_published"): 11_000}
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
 MIN_SEEDS_MIDDLE = 5  # least seeds for an interquartile mean beside the mean
 FIRST_STEPS = 700  # start of the curves' axes, before any evaluation
@@ -144,7 +144,7 @@ def at_published_steps(results: Rows) -> Rows:
     """Return each learner's longest runs on each domain that do not exceed the published number of steps."""
     chosen: Rows = []
     for (name, low), cell in groups(results, "domain", "learner").items():
-        most = DOMAINS[name][0] * (1.0 + BATCH_TOLERANCE) + UNCOUNTED.get((name, low), 0)
+        most = DOMAINS[name][0] * (1.0 + BATCH_TOLERANCE) + UNCOUNTED_STEPS.get((name, low), 0)
         allowed = [rows for (steps,), rows in groups(cell, "frames").items() if steps <= most]
         chosen += max(allowed, key=lambda rows: rows[0]["frames"], default=[])
     return chosen
