@@ -63,6 +63,13 @@ Widths = Annotated[tuple[PositiveInt, ...], FromList]
 Indices = Annotated[tuple[NonNegativeInt, ...], FromList]
 
 
+class OwnSteps:
+    """Says, as a part of a setting's type, that it counts own steps or decisions, or belongs to a schedule over these.
+
+    `Annotated[NonNegativeInt, OwnSteps()]` has no effect with `mode=offline`, and a run warns of it.
+    """
+
+
 class OnlyWith:
     """Says, as a part of a setting's type, with which values of another setting it counts.
 

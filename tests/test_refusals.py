@@ -415,6 +415,7 @@ def test_the_length_of_another_mode_is_refused(mode, word):
         ("env=platform high=none low=pdqn low.epsilon_steps=5", None),
         ("data=human high=human mode=offline low=pdqn low.lr_final_fraction=0.1", "with mode=train"),
         ("data=human high=human mode=offline low=iql low.warmup_steps=9", "with mode=train"),
+        ("data=human high=human mode=offline low=hsac low.updates_per_step=2", "with mode=train"),
         ("data=human low=iql mode=offline high=meta_critic high.epsilon_decisions=9", "with mode=train"),
         ("data=human high=human mode=offline low=iql low.actor_lr_updates=9", None),
         ("low=hppo low.memory=gru low.memory_size=8", None),

@@ -174,8 +174,6 @@ class Level:
             With `human`, it writes the probabilities of human choices (`HUMAN_OPTION`). Environments without such an
             argument are refused. Append the keys to `in_keys`.
         guarded_settings: settings that can run code, read files or reach servers.
-        settings_of_steps: settings that count the level's own steps or decisions, or belong to a schedule over these.
-            With `mode=offline` they have no effect, and a run warns of it.
         may_be_nan: the columns of the replay buffer that may hold NaN.
         export_refusal: why its greedy policy cannot be exported to ONNX. If None, it can.
         takes_pictures: whether observations may have pictures, because they go through `policies.shared.perception` or
@@ -184,7 +182,6 @@ class Level:
 
     needs: ClassVar[tuple[str, ...]] = ()
     guarded_settings: ClassVar[tuple[str, ...]] = ()
-    settings_of_steps: ClassVar[frozenset[str]] = frozenset()
     may_be_nan: ClassVar[frozenset[str]] = frozenset()
     export_refusal: str | None = None
     takes_pictures: ClassVar[bool] = False

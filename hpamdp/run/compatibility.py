@@ -27,7 +27,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.pickling import why_unsendable
-from hpamdp.settings import OnlyWith
+from hpamdp.settings import OnlyWith, OwnSteps
 
 # The choice that picks a selector automatically, and the selector that it picks if there are options.
 AUTO_SELECTOR, DEFAULT_SELECTOR = "auto", "ucb"
@@ -176,15 +176,8 @@ def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
         f"{word if name == setting_of(word) else name}: has no effect; {name.rpartition('.')[2]} counts only {each}"
         for word in words
         for name in settings_in(word)
-        for each in (*_conditions(config, name), *_needs_of_steps(config, name))
+        for each in _conditions(config, name)
     ]
-
-
-def _needs_of_steps(config: Config, name: str) -> list[str]:
-    """Return the mode that a setting needs, if it counts own steps and the run learns from a data set alone."""
-    component, setting = _component_and_setting(config, name)
-    counts_steps = component is not None and setting in getattr(component.cls, "settings_of_steps", ())
-    return ["with mode=train"] if config.run.mode == "offline" and counts_steps else []
 
 
 def _component_and_setting(config: Config, name: str) -> tuple[Component | None, str]:
@@ -196,14 +189,16 @@ def _component_and_setting(config: Config, name: str) -> tuple[Component | None,
     return (getattr(config, group) if group in GROUPS else None), setting
 
 
-def _conditions(config: Config, name: str) -> list[OnlyWith]:
+def _conditions(config: Config, name: str) -> list[str]:
     """Return the conditions of a setting that do not hold, such as those of `low.memory_size` without `low.memory`."""
     component, setting = _component_and_setting(config, name)
     if component is None or component.cls is None or not takes_settings_model(component.cls):
         return []
     field = settings_model(component.cls).model_fields.get(setting)
-    conditions = () if field is None else field.metadata
-    return [each for each in conditions if isinstance(each, OnlyWith) and not each.holds(component.settings)]
+    marks = [] if field is None else field.metadata
+    is_of_steps = config.run.mode == "offline" and any(isinstance(mark, OwnSteps) for mark in marks)
+    unmet = [str(mark) for mark in marks if isinstance(mark, OnlyWith) and not mark.holds(component.settings)]
+    return [*unmet, *(["with mode=train"] if is_of_steps else [])]
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:

@@ -36,7 +36,7 @@ from hpamdp.policies.shared.option_values import OptionValueOptions
 from hpamdp.policies.shared.replay import first_multiple, packed_states, unpacked_states
 from hpamdp.policies.shared.selector_memory import RemembersDecisions, SelectorReplayMemoryOptions
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
-from hpamdp.settings import OnlyWith
+from hpamdp.settings import OnlyWith, OwnSteps
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -47,16 +47,16 @@ class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
     """Number of critics in the ensemble."""
     exploration: Literal["epsilon", "ucb"] = "epsilon"
     """`epsilon`: a random option with a decaying probability. `ucb`: the option with the highest upper bound."""
-    epsilon_decisions: Annotated[NonNegativeInt, OnlyWith("exploration", "epsilon")] = 1000
+    epsilon_decisions: Annotated[NonNegativeInt, OnlyWith("exploration", "epsilon"), OwnSteps()] = 1000
     """Finished decisions, after the warm-up, over which the probability of a random option falls.
 
     It falls linearly from 1 to `epsilon_final`. Decisions of a data set do not count.
     """
     ucb_width: Annotated[NonNegativeFloat, OnlyWith("exploration", "ucb")] = 2.0
     """Width of the upper confidence bound, in standard deviations over the critics."""
-    updates_per_decision: PositiveFloat = 0.5
+    updates_per_decision: Annotated[PositiveFloat, OwnSteps()] = 0.5
     """Updates for each finished decision; with `mode=offline`, `offline.updates` counts them instead."""
-    warmup_decisions: NonNegativeInt = 100
+    warmup_decisions: Annotated[NonNegativeInt, OwnSteps()] = 100
     """Decisions with random options before the first update, without those of a data set."""
 
 
@@ -66,9 +66,6 @@ class MetaCritic(RemembersDecisions):
     Options = MetaCriticOptions
     takes_pictures = True
     ends_options: ClassVar[bool] = True
-    settings_of_steps: ClassVar[frozenset[str]] = frozenset(
-        {"epsilon_decisions", "epsilon_final", "max_updates", "updates_per_decision", "warmup_decisions"}
-    )
     num_decisions: Tensor
 
     def __init__(

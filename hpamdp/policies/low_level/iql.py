@@ -36,7 +36,7 @@ from hpamdp.policies.shared.gradients import expectile_loss
 from hpamdp.policies.shared.hybrid_actor import HeadOptions, HybridActor, HybridPolicy, ScaleOptions
 from hpamdp.policies.shared.networks import HybridCritics, JointCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import Expectile, LearningRate, PositiveFraction, Widths
+from hpamdp.settings import Expectile, LearningRate, OwnSteps, PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -51,7 +51,7 @@ class IQLOptions(HeadOptions, ActorCriticOptions, TargetRateOptions, ScaleOption
     """Learning rate of the critics and of the state value."""
     tau: PositiveFraction = 0.005
     """Fraction of the way to the learned critics that the target critics move in an update."""
-    warmup_steps: NonNegativeInt = 1000
+    warmup_steps: Annotated[NonNegativeInt, OwnSteps()] = 1000
     """Steps before the first update; the policy explores by its own standard deviation."""
     batch_size: PositiveInt = 256
     """Transitions in an update."""

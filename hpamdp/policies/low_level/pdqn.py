@@ -77,7 +77,7 @@ from hpamdp.policies.shared.networks import (
 )
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import OnlyWith, PositiveFraction
+from hpamdp.settings import OnlyWith, OwnSteps, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 PROCESS = "noise_process"  # the last step's noise, if it is a process, float32 [*B, num_parameters]
@@ -114,9 +114,9 @@ class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
     With `ornstein_uhlenbeck`, `parameter_noise` is the standard deviation of what is added in a step. The process goes
     on from episode to episode.
     """
-    epsilon_steps: Annotated[NonNegativeInt, OnlyWith("epsilon_episodes", None)] = 40_000
+    epsilon_steps: Annotated[NonNegativeInt, OnlyWith("epsilon_episodes", None), OwnSteps()] = 40_000
     """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
-    epsilon_episodes: PositiveInt | None = None
+    epsilon_episodes: Annotated[PositiveInt | None, OwnSteps()] = None
     """Episodes that end with the learner's own steps, within which the probability of a random action falls.
 
     They are counted from the start, those of the warm-up too, and take the place of `epsilon_steps`.
@@ -286,9 +286,6 @@ class PDQN(ReplayLearner):
     takes_pictures = True
     exploring_keys = frozenset({PROCESS})
     progress = ReplayLearner.progress | {"episodes"}
-    settings_of_steps = ReplayLearner.settings_of_steps | {
-        "epsilon_final", "epsilon_steps", "epsilon_episodes", "lr_final_fraction", "lr_steps"
-    }  # fmt: skip
 
     options: PDQNOptions
     policy: PDQNPolicy

@@ -37,7 +37,7 @@ from hpamdp.policies.shared.actor_critic import ActorCriticOptions, SmoothedTarg
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction, Widths
+from hpamdp.settings import LearningRate, OnlyWith, OwnSteps, PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -63,7 +63,7 @@ class TD3BCOptions(ActorCriticOptions, TargetRateOptions, SmoothedTargetOptions,
     """Critic updates for each update of the actor and the target networks."""
     tau: PositiveFraction = 0.005
     """Fraction of the way to the learned networks that the target networks move in an update of theirs."""
-    warmup_steps: NonNegativeInt = 1000
+    warmup_steps: Annotated[NonNegativeInt, OwnSteps()] = 1000
     """Steps before the first update."""
     batch_size: PositiveInt = 256
     """Transitions in an update."""

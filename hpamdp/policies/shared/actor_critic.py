@@ -9,7 +9,7 @@ import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
 
 from hpamdp.policies.shared.replay import ReplayOptions
-from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction, Settings, Widths
+from hpamdp.settings import LearningRate, OnlyWith, OwnSteps, PositiveFraction, Settings, Widths
 
 
 class ActorCriticOptions(ReplayOptions):
@@ -51,9 +51,9 @@ class TwinCriticOptions(SmoothedTargetOptions):
 class AnnealedRateOptions(Settings):
     """Learning rates that fall linearly."""
 
-    lr_final_fraction: PositiveFraction = 1.0
+    lr_final_fraction: Annotated[PositiveFraction, OwnSteps()] = 1.0
     """Fraction of the learning rates that is left after `lr_steps`; 1 keeps them constant."""
-    lr_steps: NonNegativeInt = 100_000
+    lr_steps: Annotated[NonNegativeInt, OwnSteps()] = 100_000
     """The learner's own steps, after its warm-up, within which the learning rates fall.
 
     With `mode=offline` the learner makes no steps of its own, so the rates stay constant.

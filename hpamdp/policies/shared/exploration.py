@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor
 
-from hpamdp.settings import Fraction, Settings
+from hpamdp.settings import Fraction, OwnSteps, Settings
 
 
 class ParameterNoiseOptions(Settings):
@@ -21,9 +22,9 @@ class ParameterNoiseOptions(Settings):
 class EpsilonOptions(ParameterNoiseOptions):
     """Exploration by noise on the parameters and by random actions."""
 
-    epsilon_final: Fraction = 0.05
+    epsilon_final: Annotated[Fraction, OwnSteps()] = 0.05
     """Probability of a random action after `epsilon_steps`; it falls linearly from 1 to this value."""
-    epsilon_steps: NonNegativeInt = 40_000
+    epsilon_steps: Annotated[NonNegativeInt, OwnSteps()] = 40_000
     """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
 
 

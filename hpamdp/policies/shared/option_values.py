@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from pydantic import PositiveInt, model_validator
 from typing_extensions import Self
 
-from hpamdp.settings import Fraction, LearningRate, PositiveFraction, Settings, Widths
+from hpamdp.settings import Fraction, LearningRate, OwnSteps, PositiveFraction, Settings, Widths
 
 
 class OptionValueOptions(Settings):
@@ -15,13 +17,13 @@ class OptionValueOptions(Settings):
     """Hidden layers of each network."""
     gamma: PositiveFraction = 0.99
     """Discount of an environment step, both within an option's return and for what follows the option."""
-    epsilon_final: Fraction = 0.1
+    epsilon_final: Annotated[Fraction, OwnSteps()] = 0.1
     """Probability of a random option at the end of its linear decay from 1."""
     buffer_size: PositiveInt = 50_000
     """Number of decisions, or of steps, that are stored. Old ones mislead, since the learners improve."""
     batch_size: PositiveInt = 128
     """Number of stored decisions, or of steps, in an update."""
-    max_updates: PositiveInt = 64
+    max_updates: Annotated[PositiveInt, OwnSteps()] = 64
     """Largest number of updates between two collected batches."""
     lr: LearningRate = 1e-3
     """Learning rate of Adam for the option values."""

@@ -6,7 +6,7 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
@@ -24,7 +24,7 @@ from hpamdp.policies.shared.memory import MemoryOptions, ReplayMemoryOptions
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
 from hpamdp.policies.shared.symmetry import RandomSymmetry
-from hpamdp.settings import PositiveFraction, Settings
+from hpamdp.settings import OwnSteps, PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
 
 _STATES = ("state", "next_state")
@@ -48,9 +48,9 @@ class BufferOptions(Settings):
 class ReplayOptions(BufferOptions):
     """Settings of a learner with a replay buffer."""
 
-    warmup_steps: NonNegativeInt = 5000
+    warmup_steps: Annotated[NonNegativeInt, OwnSteps()] = 5000
     """Random steps of a learner before its first update."""
-    updates_per_step: PositiveFloat = 0.25
+    updates_per_step: Annotated[PositiveFloat, OwnSteps()] = 0.25
     """Updates for each step that the learner collects."""
     augment: Literal["auto"] | bool = False
     """Map each sampled transition by a random symmetry that the problem declares.
@@ -104,7 +104,6 @@ class ReplayLearner(Learner):
     explores_with: ClassVar[frozenset[str]] = frozenset({"actions", "rewards"})
     novelty_by: ClassVar[Literal["reward", "sample", "plan"]] = "sample"
     progress: ClassVar[frozenset[str]] = Learner.progress | {"last_rows"}
-    settings_of_steps: ClassVar[frozenset[str]] = frozenset({"warmup_steps", "updates_per_step"})
     counts_durations: ClassVar[bool] = True
     stores_own_parameters: bool = False
     catches_up: bool = False
