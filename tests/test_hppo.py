@@ -320,7 +320,8 @@ def test_the_published_form_has_the_settings_of_hyars_code():
         hidden_dims=(256, 256), critic_hidden_dims=(256, 256), minibatch_size=50, epochs=2, critic_epochs=8, lr=1e-4,
         lr_final=1e-4, critic_lr=1e-3, clip=0.2, gamma=0.99, gae_lambda=0.95, discrete_entropy=0.0,
         parameter_entropy=0.0, greedy_discrete="sampled", initial_parameters="none", reward_scale=1.0,
-        critic_weight=1.0, min_scale=1e-4, min_scale_final=1e-4, max_scale=100.0, max_scale_final=None, max_grad_norm=1e6,
+        critic_weight=1.0, min_scale=1e-4, min_scale_final=1e-4, max_scale=100.0, max_scale_final=None,
+        max_grad_norm=1e6,
     )  # fmt: skip
     assert {name: settings[name] for name in expected} == expected
     assert settings["initial_scale"] == pytest.approx(math.exp(-0.5), abs=1e-3)
