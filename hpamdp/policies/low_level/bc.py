@@ -3,6 +3,11 @@
 Source: Pomerleau 1991, *Efficient Training of Artificial Neural Networks for Autonomous Navigation*; the policy is
 H-PPO's (Fan et al. 2019, arXiv 1903.01344, section 4).
 
+Differs from the source:
+- Pomerleau's network has an output for each of 30 steering directions. Here discrete actions have a categorical
+  distribution, and parameters have Gaussians, as in H-PPO.
+- The optimizer is AdamW, with a weight decay of 0.01 by default.
+
 TorchRL's BCLoss does not fit: it reads a single action leaf.
 """
 

@@ -12,7 +12,14 @@ Differs from the source:
   its own parameters alone. So the others neither receive false gradients nor add noise to the target.
 - Each temperature has a target entropy: a fraction of the uniform distribution's for the discrete action, and nats for
   each parameter of the executed action. So actions with more parameters, or none, need no target of their own.
-- The actor and the temperatures may be updated less often than the critics, as in TD3 (arXiv 1802.09477).
+- The actor and the temperatures may be updated less often than the critics, as in TD3 (arXiv 1802.09477). The code of
+  Haarnoja et al. (github.com/rail-berkeley/softlearning) updates all three for each step. Here critics have an update
+  for every four steps.
+- The loss of a temperature is linear in its logarithm, in that code in the temperature itself. The entropy in it is
+  that of the actor's update. In that code the updated actor is sampled again.
+- By default temperatures start at 0.01 and 0.005, learning rates are 1e-3 and the target rate is 0.01. In that code
+  these are 1, 3e-4 and 0.005.
+- The standard deviation of the parameters lies between 0.005 and 1. In that code its only limit is 1e-5, from below.
 - If an action has several components, the expectation over all discrete actions would be a sum over all combinations.
   The soft value is then the mean of `component_samples` sampled actions, and the critics value the action as a whole.
   The discrete heads get a policy gradient, whose baseline is the mean of the other samples (Kool, van Hoof and Welling

@@ -13,6 +13,14 @@ Differs from the source:
 - The policy's learning rate is constant. The source's code lets it fall along a cosine, within the million updates of a
   run: `actor_lr_updates=1000000`.
 - The learning rates are 1e-3, not 3e-4, and the temperature is 10. The source has 3 on locomotion and 10 on mazes.
+- The expectile is 0.8. The source has 0.7 on locomotion and 0.9 on mazes. Hidden layers have 128 units, not 256.
+- The standard deviation depends on the state and lies between 0.02 and 1. In the source's code it does not depend on
+  the state, its lower limit is exp(-5), and tanh bounds the means.
+- The loss of the critics is the mean over both, in the source's code the sum.
+- Critics and state value have PyTorch's initialisation. In the source's code all weights start orthogonal.
+- Rewards are not normalised. The source's code scales those of locomotion by the range of the data's returns, and
+  subtracts 1 on mazes.
+- With steps of its own there is an update for every four steps. The source's code makes one for each step.
 
 TorchRL's IQLLoss does not fit: it reads a single action leaf.
 """

@@ -9,11 +9,18 @@ sections 4 and 5, equation 11. TD3: Fujimoto, van Hoof and Meger 2018, arXiv 180
 2109.05490 (a row of its tables).
 
 Differs from the source:
-- A random action is stored with random scores of which the highest is its own, as in the code of Bester, James and
-  Konidaris 2019, arXiv 1905.04388.
+- A random action is stored with random scores in [-1, 1], of which the highest is its own, as in the authors' code
+  (github.com/mhauskn/dqn-hfo). In the code of Bester, James and Konidaris 2019, arXiv 1905.04388, they lie in [0, 1].
+- Outputs are clipped to their bounds before a critic sees them and before they are stored. In both codes critics see,
+  and the buffer stores, what the actor gave.
 - `parameter_noise` adds Gaussian noise to scores and parameters, besides epsilon-random actions.
+- Epsilon falls with the learner's steps to 0.05. In the authors' code it falls to 0.1 within 10,000 updates.
+- There is an update for every four steps, in the authors' code for every ten.
 - The networks are smaller and start as PyTorch's; the learning rates and the target rate are those of this project.
+  ReLU has no slope below 0, where the authors' has 0.01. Adam's first beta is 0.9, not 0.95.
 - If `initial_parameters` asks for them, a frozen layer adds the problem's initial parameters, as in Bester et al.
+- With `twin`, the output is clipped. In HyAR's code a tanh bounds it, in addition to inverting gradients. That code
+  explores by Gaussian noise alone, clips the gradients of the actor alone and smooths targets by 0.2, clipped at 0.5.
 
 TorchRL's DDPGLoss and TD3Loss would need a composite action split for them, and bounds of their own. They have no
 inverting gradients, for which the gradient must be changed between critic and actor.

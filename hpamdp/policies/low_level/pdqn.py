@@ -26,10 +26,12 @@ Differs from the source:
 - parameters are clipped to their bounds before a critic sees them and before they are stored, also with inverting
   gradients. In the code of Bester et al. critics see and the buffer stores what the actor gave;
 - the defaults add what TD3 adds to DDPG: twin critics, target smoothing and a delayed actor. The actor, too, increases
-  the minimum of both critics; TD3's actor uses the first one;
+  the minimum of both critics; TD3's actor uses the first one. The noise in the target has a standard deviation of 0.1
+  and is clipped at 0.2; TD3 has 0.2 and 0.5;
 - the defaults squash parameters by tanh, do not clip gradients, draw the parameters of random actions uniformly, and
-  add Gaussian noise to the others. Both networks have one learning rate and one target rate. `pdqn_published.yaml` has
-  the settings of Bester et al. instead.
+  add Gaussian noise to the others. Both networks have one learning rate and one target rate. There is an update for
+  every four steps, and epsilon falls with the steps to 0.05. In the code of Bester et al. there is one for each step,
+  and epsilon falls with the episodes to 0.01. `pdqn_published.yaml` has the settings of Bester et al. instead.
 
 TorchRL's DQNLoss does not fit: its value network sees the observation alone. Here Q and its target also take the
 parameters, which come from a network with a target and a loss of its own. Its OrnsteinUhlenbeckProcessModule does not

@@ -22,8 +22,12 @@ Differs from the source:
   whatever the sign of the change. The temperature is constant, also in the parameter phases, and sigma decays.
   The settings of Bester et al.'s code on Platform: step_scaling=true, step_bound=non_increasing, temperature=1,
   temperature_decay=0.995, samples_in_parameter_phase=false, sigma_decay=1. The settings below call these published.
-  In that code each phase of Sarsa restarts at the initial temperature, and the discount counts ticks. On Goal it has
-  no bound, a constant temperature, alpha 0.01, gradients of unit norm and a baseline of three features.
+  In that code each phase of Sarsa restarts at the initial temperature, and the discount is 0.999 for each tick. On Goal
+  it has no bound, a constant temperature, alpha 0.01, lambda 0.1, a discount of 0.9 and gradients of unit norm.
+- The mean parameters are linear in a Fourier basis, and eNAC's baseline in that of the values. In that code the means
+  are linear in entries of the observation. The baseline is a constant, on Goal three features.
+- Phases are shorter. That code has 10,000 initial and 1,000 relearning episodes on Platform, and 180 updates of 50
+  rollouts.
 - Parameters are in units where their bounds are [-1, 1], and sigma is a standard deviation. eNAC's returns are not
   discounted, and the divergence from the old policy bounds its step.
 """

@@ -13,6 +13,12 @@ Differs from the sources:
 - States are not normalised, as problems scale their observations.
 - By default the values weigh twice as much: `behaviour_weight`, which is 1 / alpha, is 0.2. The source has 0.4, from
   alpha = 2.5.
+- The loss of the critics is the mean over both, in the source the sum. To Adam a constant factor is nearly the same.
+- The noise in the target has a standard deviation of 0.05 and is clipped at 0.1. The source has 0.2 and 0.5.
+- The learning rates are 1e-3, not 3e-4, and the hidden layers have 128 units, not 256.
+- The model of the data's discrete actions has no penalty on its logits. In the code of discrete BCQ it has. There the
+  learned critic chooses the next discrete action and the target values it; here the targets do both.
+- With steps of its own it explores by Gaussian noise on the parameters. The source learns from data sets alone.
 
 TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, without a discrete choice.
 """

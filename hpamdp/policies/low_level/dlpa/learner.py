@@ -9,11 +9,27 @@ extends model predictive path integral control (Williams et al. 2015, arXiv 1509
 
 Differs from the source:
 - the transition predictor's target is the change of the state in units of its standard deviation over all stored steps.
-  It is trained only on steps that do not terminate, because a plan never continues after one that does;
+  It is trained only on steps that do not terminate, because a plan never continues after one that does. The source's
+  code predicts the next state itself, on Platform and Goal through a tanh;
+- predictors give numbers. Those of the source's code give Gaussians: training and exploring plans sample from them, and
+  greedy plans take the means;
+- reward and termination are predicted from the state and the action. In the source's code they are predicted from the
+  predicted next state and the action;
 - rewards are not squashed, and both reward predictors are used: a plan's return weights them by the predicted
-  probability of termination, and later rewards by the probability that the episode continues;
+  probability of termination, and later rewards by the probability that the episode continues. The source's code
+  squashes rewards on Platform alone, and has the second predictor on Catch Point and Hard Move alone. It ends an
+  imagined episode where termination is more likely than not;
 - reward and termination have an ensemble of networks; a plan's return is the ensemble's mean minus `pessimism` standard
   deviations;
+- `form="masking"` sets the inputs of the other actions to 0. In the source's code the networks see the action's own
+  parameters alone and predict for all discrete actions; the chosen one's prediction is taken;
+- parameters have a standard deviation of 1 at first and `min_deviation` at least. The source's code begins with 2 and
+  has no lower limit;
+- the warm-up is 1,000 steps, and the first updates make up for them. In the source's code it is 50 episodes without
+  updates;
+- windows begin at any step. In the source's code none begins in the last `horizon` steps before the step limit;
+- the source's code clamps the parts of the loss at 1e4. It multiplies each termination loss by the masks of all
+  windows, not by its own alone. Its learning rate is 3e-4, not 1e-3;
 - every plan starts from scratch. To start from the previous plan, it would have to be stored with the environments'
   data. In the true model of this project's benchmark, such a warm start adds little: 0.002 to 0.005 of the best
   possible score at 5 iterations, and 0.006 to 0.01 at 3;

@@ -33,8 +33,20 @@ Differs from the sources:
 - some entries of the state change linearly with others, such as a target's offset with the agent's own place. They are
   derived from these instead of predicted;
 - members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
+- reward and termination are learned, and returns are discounted. The code of Chua et al. is given the cost of a state
+  and knows no terminations. Its plans have 25 or 30 steps and no discount;
+- by default members predict no variance (`probabilistic`). If they do, it lies between fixed limits. In the code of
+  Chua et al. all members predict it, and learn its limits;
+- each member imagines one trajectory, not four as in the code of Chua et al. (20 for five members);
+- the networks are small and have ReLU. Those of Chua et al. have three or four layers of 200 or 500 swish units;
+- targets are standardised, too. The code of Chua et al. standardises inputs alone;
+- there are ten updates for each step. The code of Chua et al. makes five passes over all data after each episode;
+- exploring plans carry Gaussian noise on the parameters. The code of Chua et al. adds none;
+- the first 64 steps are random, and more until two rewards differ. In the code of Chua et al. the first episode is;
 - weight decay falls with the number of stored steps, as the weight of a prior does;
-- each sequence of discrete actions has its own search for parameters (`policies.shared.planning`);
+- each sequence of discrete actions has its own search for parameters (`policies.shared.planning`). It weighs the elites
+  by their returns and takes the best sample. The code of Chua et al. takes the mean of equally weighted elites;
+- every plan starts from scratch. In the code of Chua et al. it starts from the last one, moved on by a step;
 - with `end_values` a plan also counts the value of its last state (`policies.shared.end_values`);
 - with `memory` the networks also see what is remembered of the session's earlier observations, for problems in which
   something hidden stays the same. Imagined steps go into the memory, too. Models that are told a context: Rakelly et
