@@ -82,6 +82,7 @@ class AgentConfig(Settings):
     uniform_option_steps: NonNegativeInt = 0
     """Steps at the start of training in which options are chosen uniformly, so that each option's learner gets data.
 
+    They are steps of all environments together; with `low.freeze=true` they are decisions.
     Without them, a selector may settle early on the option whose learner improves first.
     """
 

@@ -7,7 +7,9 @@ Differs from the source:
 - every pair has its own logit or value. The high level of the source has one output for the option and one for the
   length;
 - lengths are a setting, and any selector that learns from decisions can choose them;
-- an option ends earlier if its episode ends, or if none of its actions is allowed any more.
+- an option ends earlier if none of its actions is allowed any more;
+- values are discounted for each step of an option. The source adds up the rewards of an option without a discount, and
+  discounts the next decision once.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ hash was counted n times has the bonus n^-1/2.
 Differs from the source:
 - a state's cell is its observation, multiplied by `resolution` and rounded. The source's random projections suit
   pictures. Of a vector, they would mix entries of different meaning, such as a place and what the agent holds;
+- the bonus of a step is that of the state that it reaches, not of the state that it leaves;
+- there is one table. The authors' code takes the lowest count of six tables, so that fewer states share theirs;
 - learners with a replay buffer add the bonus when they sample, and learners that plan add it in exploring plans, as
   with `novelty`.
 """

@@ -8,6 +8,7 @@ algorithm 1: the length of a held action has the zeta distribution, P(n) proport
 
 Differs from the source:
 - an action has parameters, which are drawn uniformly and held, too;
+- a hold of length n lasts n steps. In algorithm 1 the action is taken once more;
 - lengths above `longest` are drawn again, not cut;
 - a hold ends early if its action is forbidden in a state;
 - the learner explores at the other steps as it always does, in place of greedy steps.
@@ -46,7 +47,7 @@ class HeldOptions(Settings):
     epsilon_final: Fraction | None = None
     """Probability after `epsilon_steps`; it falls linearly from `epsilon` to this value. If null, it stays."""
     epsilon_steps: Annotated[PositiveInt, OnlyWith("epsilon_final")] = 100_000
-    """With `epsilon_final`: the learner's own steps within which the probability falls."""
+    """With `epsilon_final`: the learner's own steps, its warm-up included, within which the probability falls."""
     mu: Annotated[float, Field(gt=1.0, le=10.0)] = 2.0
     """Exponent of the lengths: the probability of n steps is proportional to n^-mu. Less gives longer holds."""
     longest: Annotated[int, Field(ge=1, le=1_000_000)] = 10_000

@@ -16,7 +16,13 @@ Differs from the sources:
 - the bonus is a part of the reward, so it ends with the episode and has the learner's discount. Burda et al. give it
   a value of its own, which goes on across episodes;
 - it is divided by the standard deviation of bonuses, not of their discounted returns, as TorchRL does, and clipped;
-- vectors go through fully connected networks. Pictures go through untrained copies of the learner's encoder.
+- vectors go through fully connected networks. Pictures go through untrained copies of the learner's encoder;
+- both networks have the same layers. The predicting network of Burda et al. has two more;
+- the predicting network learns from each step once, by its own optimizer. In the authors' code it learns in the four
+  passes of the policy;
+- the statistics of observations begin with the first batch. Burda et al. first let a random agent act;
+- disagreement is a standard deviation of predicted changes of the state, added to the problem's reward. In Sekar et al.
+  it is a variance of predicted embeddings, and the only reward while exploring.
 
 Networks, loss and statistics are TorchRL's RNDLoss and RunningMeanStd. Its RNDTransform does not fit: it computes the
 bonus in the environment, where each worker would have statistics of its own and no sample could be valued again.

@@ -12,7 +12,9 @@ Differs from the sources:
 - the gradients of policy, critic and their common perception are clipped separately, since returns may be of any size;
 - with `memory` policy and value also see the observations at earlier decisions of the episode;
 - the advantage is the option's return minus a learned value of the state. It bootstraps if the episode goes on, but not
-  past a time limit.
+  past a time limit;
+- the advantages of the decisions in an update are normalised to mean 0 and standard deviation 1;
+- if the policy is greedy, it chooses the most likely option.
 
 TorchRL's `ClipPPOLoss` computes the same loss and gradients. It needs both networks wrapped as tensordict modules and
 takes 1.3 times as long for an update of 1,024 decisions on one CPU core (1.6 times for 256). H-PPO needs

@@ -3,6 +3,12 @@
 Source: Sutton and Barto 2018, *Reinforcement Learning: An Introduction*, section 2.2; probability proportional to
 1 / t: Auer, Cesa-Bianchi and Fischer 2002, *Finite-time analysis of the multiarmed bandit problem*, figure 3.
 Forgetting: see `RewardStatistics`.
+
+Differs from the sources:
+- the probability of a random option has a lower bound, `epsilon_final`;
+- `epsilon_scale` is a setting. Auer et al. compute it from the number of options and the lead of the best one;
+- all choices are random until each option has a known reward that is not forgotten;
+- if the policy is greedy, no option is random.
 """
 
 from __future__ import annotations
@@ -20,7 +26,10 @@ class EpsilonGreedyOptions(BanditOptions):
     """Settings of `EpsilonGreedy`."""
 
     epsilon_scale: PositiveFloat = 100.0
-    """The probability of a random option is `epsilon_scale` / t at decision t of its own, at most 1."""
+    """The probability of a random option is `epsilon_scale` / t, at most 1.
+
+    t counts the decisions of all environments, uniform ones included, but not those of a data set.
+    """
     epsilon_final: Fraction = 0.1
     """Lower bound of that probability; 0 suits stationary rewards."""
 

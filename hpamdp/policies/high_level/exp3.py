@@ -3,9 +3,12 @@
 Source: Auer, Cesa-Bianchi, Freund and Schapire 2002, *The nonstochastic multiarmed bandit problem*, figure 1.
 
 Differs from the source:
-- rewards are scaled to [0, 1] by the range seen so far. When it grows, the earlier rewards are scaled by the new range;
+- rewards are scaled to [0, 1] by the range seen so far. When it grows, the earlier rewards are scaled by the new range.
+  Until two rewards differ, all gains are 0;
+- the range is that of all rewards, also of forgotten ones;
 - gains may be discounted or limited to a window (see `RewardStatistics`), whereas Exp3.S mixes the weights;
-- many decisions are due at the same time; each reward is divided by the probability of its choice.
+- many decisions are due at the same time; each reward is divided by the probability of its choice;
+- if the policy is greedy, it chooses the highest gain and does not sample.
 """
 
 from __future__ import annotations

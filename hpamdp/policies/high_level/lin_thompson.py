@@ -5,8 +5,12 @@ algorithm 1.
 
 Differs from the source:
 - each option has a regression of its own;
-- the standard deviation of the noise is that of the regressions' residuals;
-- the predicted reward of each decision is sampled, instead of the parameters; its distribution is the same.
+- v is `exploration` times the standard deviation of all options' residuals. The source computes it from a bound of the
+  noise, the number of features and a confidence;
+- the predicted reward of each decision is sampled, instead of the parameters; its distribution is the same;
+- untried options come first, in random order. The source scores them by the prior;
+- decisions that are due at the same time use the same regressions, without the rewards that are not known yet;
+- if the policy is greedy, it chooses the highest prediction, of an untried option only if all are untried.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from hpamdp.policies.shared.linear_bandit import LinearBandit
 class LinThompson(LinearBandit):
     """Choose the option with the highest sample from the posterior distributions of the expected rewards.
 
-    `exploration` is v in the source; 1 is Bayesian.
+    With `exploration=1` the samples are Bayesian.
     """
 
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:

@@ -5,8 +5,11 @@ arXiv 1003.0146, algorithm 1 (disjoint models). Discounting: Russac, Vernade and
 for Non-Stationary Environments*, arXiv 1909.09146.
 
 Differs from the sources:
-- the width is in units of the residuals' standard deviation;
-- the discounted form has one Gram matrix for each option, not two.
+- the width is in units of the standard deviation of all options' residuals;
+- the discounted form has one Gram matrix for each option, not two;
+- untried options come first, in random order. Li et al. score them by the prior;
+- decisions that are due at the same time use the same regressions, without the rewards that are not known yet;
+- if the policy is greedy, it chooses the highest prediction, of an untried option only if all are untried.
 """
 
 from __future__ import annotations

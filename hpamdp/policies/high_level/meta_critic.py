@@ -7,6 +7,7 @@ If the selector decides when options end, it interrupts an option as soon as ano
 of the first source).
 
 Differs from the sources:
+- Q is an ensemble of networks, learned from a replay buffer of decisions, with target networks;
 - values do not bootstrap past the end of an episode, also if a time limit ended it;
 - while exploring, options are also interrupted at random, with the probability of a random option;
 - which decisions a member of the ensemble learns from is drawn again at every update, not once for each decision;
@@ -48,7 +49,7 @@ class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
     exploration: Literal["epsilon", "ucb"] = "epsilon"
     """`epsilon`: a random option with a decaying probability. `ucb`: the option with the highest upper bound."""
     epsilon_decisions: Annotated[NonNegativeInt, OnlyWith("exploration", "epsilon"), OwnSteps()] = 1000
-    """Finished decisions, after the warm-up, over which the probability of a random option falls.
+    """Finished decisions of all environments, after the warm-up, over which the probability of a random option falls.
 
     It falls linearly from 1 to `epsilon_final`. Decisions of a data set do not count.
     """
@@ -57,7 +58,7 @@ class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
     updates_per_decision: Annotated[PositiveFloat, OwnSteps()] = 0.5
     """Updates for each finished decision; with `mode=offline`, `offline.updates` counts them instead."""
     warmup_decisions: Annotated[NonNegativeInt, OwnSteps()] = 100
-    """Decisions with random options before the first update, without those of a data set."""
+    """Decisions of all environments, with random options, before the first update; those of a data set do not count."""
 
 
 class MetaCritic(RemembersDecisions):

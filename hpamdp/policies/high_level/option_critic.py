@@ -9,13 +9,16 @@ Deliberation Cost*, arXiv 1709.04571, equation 10, as a margin of the advantage 
 
 Differs from the sources:
 - the policies within the options are the agent's learners, with values and gradients of their own;
-- Q and beta are learned from a replay buffer of steps, Q with a target network;
+- Q and beta are learned from a replay buffer of steps, Q with a target network. Q(s, o) is learned itself, not as the
+  mean of values of actions;
+- beta has a network of its own. On Atari it shares the layers of Q;
 - the value of a state is max_o Q(s, o), without the random choices;
 - values do not bootstrap past the end of an episode, also if a time limit ended it;
 - beta is learned by logistic regression, weighted by the size of the advantage. Its gradient has the sign of the
   source's. It does not vanish where wrong early values have driven beta close to 0 or 1;
 - while exploring, beta is mixed with `initial_termination`, by the probability of a random option;
-- if the policy is greedy, an option ends where beta is above 1/2.
+- if the policy is greedy, an option ends where beta is above 1/2, and no option is random. The authors' code samples
+  terminations in tests, too, and chooses 5 % of the options at random.
 """
 
 from __future__ import annotations
@@ -60,9 +63,9 @@ class OptionCriticOptions(SelectorStackOptions, OptionValueOptions):
     It falls linearly from 1 to `epsilon_final`.
     """
     updates_per_step: PositiveFloat = 0.02
-    """Updates for each step."""
+    """Updates for each step, of any environment."""
     warmup_steps: NonNegativeInt = 2000
-    """Steps with random options before the first update."""
+    """Steps of all environments, with random options, before the first update."""
     termination_lr: LearningRate = 1e-3
     """Learning rate of Adam for the terminations."""
 

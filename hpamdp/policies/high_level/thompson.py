@@ -4,8 +4,12 @@ Source: Russo, Van Roy, Kazerouni, Osband and Wen 2018, *A Tutorial on Thompson 
 Forgetting: see `RewardStatistics`.
 
 Differs from the source:
-- the variance of the rewards is the observed one, and the prior of the means is flat;
-- with `memory=session` each environment has posteriors of its own, from the rewards of its session's trips.
+- rewards are Gaussian, not Bernoulli;
+- their variance is the observed one, of all options' rewards together;
+- the prior of the means is flat, so untried options come first, in random order;
+- decisions that are due at the same time sample from the same posteriors;
+- with `memory=session` each environment has posteriors of its own, from the rewards of its session's trips;
+- if the policy is greedy, it chooses the highest mean. With `memory=session` it samples, too.
 """
 
 from __future__ import annotations

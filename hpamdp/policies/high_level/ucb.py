@@ -7,7 +7,11 @@ Differs from the sources:
 - rewards need not lie in [0, 1]: the width is in units of their standard deviation;
 - many environments decide at the same time. `UCB` simulates sequential decisions: each choice narrows the bound of its
   option before the reward is known. Otherwise all environments would choose the same option;
-- with `memory=session` each environment has bounds of its own, on the rewards of its session's trips.
+- with `memory=session` each environment has bounds of its own, on the rewards of its session's trips;
+- t also counts the decisions that are due;
+- all memories have the width of UCB1. Garivier and Moulines have a constant xi in place of 2, and double the width of
+  the discounted form;
+- if the policy is greedy, it chooses the highest mean, without a bound. With `memory=session` it uses the bounds, too.
 """
 
 from __future__ import annotations

@@ -8,7 +8,10 @@ Source: the greedy policy over option values of Sutton, Precup and Singh 1999, *
 Intelligence 112. While exploring, the value of PETS without `end_values` is that of a random member of its ensemble.
 That makes the choice posterior sampling over options: Osband, Russo and Van Roy 2013, arXiv 1306.0940.
 
-Differs from the source: while exploring, options whose learner has made no update come first, in random order.
+Differs from the sources:
+- while exploring, some options are random (`epsilon`), and options whose learner has made no update come first, in
+  random order;
+- the member is drawn again at each decision. It need not be the one whose plans PETS then follows.
 """
 
 from __future__ import annotations

@@ -35,9 +35,9 @@ class BanditOptions(Settings):
     memory: Literal["all", "discounted", "sliding_window"] = "discounted"
     """Which rewards count: `all` equally, recent ones more (`discounted`), or the last ones only (`sliding_window`)."""
     discount: Annotated[float, Field(gt=0.0, lt=1.0), OnlyWith("memory", "discounted")] = 0.999
-    """With `memory=discounted`: factor on the weight of a reward for each later decision."""
+    """With `memory=discounted`: factor on the weight of a reward for each later decision, for any option."""
     window: Annotated[PositiveInt, OnlyWith("memory", "sliding_window")] = 2000
-    """With `memory=sliding_window`: number of decisions that count."""
+    """With `memory=sliding_window`: number of decisions that count, for all options together."""
 
 
 class RewardStatistics(nn.Module):

@@ -6,7 +6,8 @@ Monotonic mixing: Rashid et al. 2018, *QMIX*, arXiv 1803.11485, section 4.
 
 Differs from the source: what the other components contributed is subtracted from the advantage as a baseline (Wu et al.
 2018, *Variance Reduction for Policy Gradient with Action-Dependent Factorized Baselines*, arXiv 1803.07246). So errors
-of this critic add variance, but no bias.
+of this critic add variance, but no bias. The mixed total is 0 if all contributions are 0; QMIX adds a value of the
+state.
 """
 
 from __future__ import annotations

@@ -6,6 +6,9 @@ under the next option. So networks learn the values of states from the stored st
 Sources: Lowrey et al. 2019, *Plan Online, Learn Offline*, arXiv 1811.01848: plans that end in a learned value;
 Kostrikov, Nair and Levine 2021, *Offline Reinforcement Learning with Implicit Q-Learning*, arXiv 2110.06169, equation
 5: the expectile, which gives little weight to the returns of the worse stored actions.
+
+Differs from the sources: the expectile is that of reward + discounted next value, without a Q. So where steps are
+random, lucky ones count as good actions.
 """
 
 from __future__ import annotations

@@ -55,16 +55,16 @@ class MemoryOptions(StackOptions):
     memory_size: Annotated[PositiveInt, OnlyWith("memory", "gru")] = 64
     """With `memory=gru`: units of the GRU."""
     sequence_length: Annotated[PositiveInt, OnlyWith("memory", "gru")] = 16
-    """With `memory=gru`: steps through which gradients flow back in time."""
+    """With `memory=gru`: steps, for selectors decisions, through which gradients flow back in time."""
 
 
 class ReplayMemoryOptions(MemoryOptions):
     """Settings of a memory that learns from a replay buffer."""
 
     burn_in: Annotated[NonNegativeInt, OnlyWith("memory", "gru")] = 8
-    """With `memory=gru`: steps before each sequence that the current GRU replays without gradients.
+    """With `memory=gru`: steps, for selectors decisions, before each sequence, replayed without gradients.
 
-    They give the state in which the sequence starts.
+    From them the current GRU computes the state in which the sequence starts.
     """
 
 

@@ -2,6 +2,10 @@
 
 Source: Kapturowski et al. 2019, *Recurrent Experience Replay in Distributed Reinforcement Learning* (R2D2), section 3:
 stored states and burn-in.
+
+Differs from the source:
+- each stored row is drawn with the same probability, not sequences by their priority;
+- in replay only the last row of a sequence has a loss, not all rows after the burn-in.
 """
 
 from __future__ import annotations
