@@ -1129,6 +1129,12 @@ def notes_on_domains() -> list[Claim]:
             success=span(100.0 * success for success in column(results["moving", "hyar"], "success")),
         ),
         claim(
+            "five new seeds return {mean:.2f} on average ({each}) and succeed in {success:.0f} % of the episodes.",
+            mean=average("sliding", "hyar"),
+            each=span(scores("sliding", "hyar"), ".2f"),
+            success=100.0 * mean(results["sliding", "hyar"], "success"),
+        ),
+        claim(
             "the mean of the new ones is {mean:.3f} ({each}, published 0.89).",
             mean=average("catch_point", "hyar_ddpg"),
             each=span(scores("catch_point", "hyar_ddpg"), ".2f"),
@@ -1158,6 +1164,15 @@ def notes_on_domains() -> list[Claim]:
         claim("DLPA scores {each} on Catch Point (five new", each=span(scores("catch_point", "dlpa_augment"), ".2f")),
         claim(
             "On Hard Move 4 five new seeds score {each}, at", each=span(scores("hard_move_4", "dlpa_augment"), ".2f")
+        ),
+        claim(
+            "On Hard Move 6 five new seeds score {each}, at", each=span(scores("hard_move_6", "dlpa_augment"), ".2f")
+        ),
+        claim(
+            "There five new seeds of PETS return {each} after 4,000 steps; the second and the fourth never arrive.",
+            each=listed(scores("platform", "pets"), ".3f"),
+            holds=[success > 0.0 for success in column(results["platform", "pets"], "success")]
+            == [True, False, True, False, True],
         ),
         claim(
             "On Catch Point ten new seeds pass the best published score after {steps} steps, and end at {mean:.3f} on "
