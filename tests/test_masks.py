@@ -265,7 +265,7 @@ def test_an_option_ends_where_none_of_its_actions_is_allowed_any_more(high):
 
 
 class Revealing(Forbidden):
-    """A mask that still forbids an action where the episode is over; it may be truncated there."""
+    """A mask that still forbids an action where the episode is over, terminated or truncated."""
 
     is_truncated = False
 
@@ -319,6 +319,38 @@ def test_a_truncation_that_leaves_the_held_option_no_action_opens_its_own_action
     assert after[keys.OPTION_MASK][:, 1:].equal(allowed[:, [0, 2]]), "what may follow is not opened"
     if option_length is not None:
         assert after[keys.OPTION_ENDED].squeeze(-1).equal(is_stuck)
+
+
+class Closing(Revealing):
+    """A mask that allows a single action where the episode is truncated."""
+
+    max_steps = 1
+    is_truncated = True
+
+    def _read(self) -> TensorDict:
+        after = super()._read()
+        return after.set(keys.ACTION_MASK, after[keys.ACTION_MASK] ^ after[keys.DONE])
+
+
+@pytest.mark.parametrize("option_length", [None, 3])
+@pytest.mark.parametrize("actions", [{"low": [0, 1], "last": [2]}, {"first": [0], "last": [2]}], ids=["one", "none"])
+@pytest.mark.parametrize(("high", "low"), [("uniform", "hyar"), ("uniform", "random"), ("value", "hppo")])
+def test_what_is_played_on_after_a_truncation_is_allowed(high, low, actions, option_length):
+    problem = Closing(32)
+    problem.option_names = ()
+    problem.group_actions(actions)
+    env = with_decisions(problem, 1.0, option_length)
+    specs = PAMDPSpecs.from_env(env)
+    torch.manual_seed(0)
+    selector: Selector = make_config([f"high={high}", "low=hppo", *SELECTORS[high]]).high.build(specs=specs, device=CPU)
+    agent = HierarchicalAgent(selector, [make_learner(low, specs.of_option(i)) for i in range(2)], specs)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        after = env.step_mdp(env.step(agent.policy(env.reset())))
+        played = agent.policy(after.clone())
+    assert after[keys.TRUNCATED].all()
+    option, discrete = played[keys.OPTION], played[keys.DISCRETE]
+    assert torch.tensor(specs.option_actions)[option].gather(-1, discrete.unsqueeze(-1)).all()
+    assert after[keys.OPTION_MASK].gather(-1, option.unsqueeze(-1)).all()
 
 
 def test_options_of_which_none_has_an_allowed_action_are_told_in_one_line():

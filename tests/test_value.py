@@ -73,6 +73,24 @@ def test_learners_are_not_asked_about_episodes_that_have_ended():
     assert chosen.option_values.asked == [2]
 
 
+def test_in_an_episode_that_has_ended_the_first_possible_option_is_played_on():
+    td = seen([[1.0, 2.0]] * 2).set(keys.DONE, torch.tensor([[True], [True]]))
+    td.set(keys.OPTION_MASK, torch.tensor([[False, True], [True, True]]))
+    assert selector()(td)[keys.OPTION].tolist() == [1, 0]
+
+
+def test_after_a_truncation_learners_bootstrap_from_the_best_option():
+    env = with_decisions(BoatDockEnv(2, controller="choose"), 1.0, 2)
+    agent = HierarchicalAgent(selector(), [PDQN(BOATS) for _ in range(2)], BOATS)
+    agent.selector.option_values = Expects()
+    with torch.no_grad():
+        batch = env.rollout(2, agent.policy)
+    after = batch["next"]
+    after[keys.OPTION_ENDED][:, -1], after[keys.DONE][:, -1], after[keys.TRUNCATED][:, -1] = True, True, True
+    after[keys.OBSERVATION][:, -1, :2] = torch.tensor([[0.0, 1.0], [1.0, 0.0]])
+    assert agent.next_options.with_next_option(batch)[keys.NEXT_OPTION][:, -1].tolist() == [1, 0]
+
+
 def test_of_equal_options_exploring_takes_a_random_one():
     torch.manual_seed(0)
     values = [[torch.inf, torch.inf]] * 400

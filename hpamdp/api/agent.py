@@ -182,7 +182,7 @@ class Agent:
         if not self._kept:  # every step is like a first one
             return fresh.set(keys.IS_DECISION, torch.ones(num, 1, dtype=torch.bool, device=fresh.device))
         never = torch.zeros(num, 1, dtype=torch.bool, device=fresh.device)
-        fresh.set(keys.DONE, never)
+        fresh.set(keys.DONE, never).set(keys.TERMINATED, never)
         if self._last is None:
             self._starts, self._starts_later = np.ones(num, bool), np.zeros(num, bool)
             return self._tracker._reset(fresh.empty(), fresh)

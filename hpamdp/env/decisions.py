@@ -220,7 +220,7 @@ def mask_open_at_end(after: TensorDictBase, option: Tensor, option_actions: Tens
 
     The value of a state is that of the best action. The best of none, -inf, is no value to learn from. After a
     termination all actions are allowed, since this value is multiplied by 0. After a truncation it counts. There the
-    held option alone is considered. If it has no action, all of its own are allowed, and no other option's.
+    held option's own actions are allowed if it has none, and all actions if no option has any.
 
     Args:
         after: `action_mask`, `done` and `terminated` of the states.
@@ -229,6 +229,7 @@ def mask_open_at_end(after: TensorDictBase, option: Tensor, option_actions: Tens
         has_action: which options have an allowed action, bool `[*B, num_options]`.
     """
     is_open = after.get(keys.TERMINATED) & ~has_action.all(-1, keepdim=True)
+    is_open = is_open | (after.get(keys.DONE) & ~has_action.any(-1, keepdim=True))
     is_stuck = after.get(keys.DONE) & ~has_action.gather(-1, option.unsqueeze(-1))
     action_mask: Tensor = after.get(keys.ACTION_MASK)
     return action_mask | is_open | (is_stuck & option_actions[option])

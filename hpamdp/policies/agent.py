@@ -233,9 +233,9 @@ class HeldOption(TensorDictModuleBase):
 
 
 def _at_decision(states: TensorDictBase) -> TensorDictBase:
-    """Return a shallow copy of states `[N]` in which a decision is due."""
+    """Return a shallow copy of states `[N]` in which a decision is due, even if their episode was truncated there."""
     is_decision = torch.ones(len(states), 1, dtype=torch.bool, device=states.get(keys.OBSERVATION).device)
-    return states.copy().set(keys.IS_DECISION, is_decision)
+    return states.exclude(keys.DONE).set(keys.IS_DECISION, is_decision)
 
 
 class AgentNextOptions:

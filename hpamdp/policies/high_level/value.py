@@ -27,7 +27,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
-from hpamdp.policies.masks import masked_values, random_choice
+from hpamdp.policies.masks import allowed_or_first, masked_values, random_choice
 from hpamdp.settings import Fraction, Settings
 from hpamdp.specs import PAMDPSpecs
 
@@ -107,22 +107,25 @@ class Value(Selector):
         return goes_on & (before | F.one_hot(option, self.specs.num_options).bool())
 
     def select(self, td: TensorDictBase) -> Tensor:
-        """Return an option for every environment, int64 `[*B]`; 0 if no decision is due or the episode has ended."""
+        """Return an option for every environment, int64 `[*B]`.
+
+        It is the first possible one where no decision is due or the episode has ended.
+        """
         return self._best(td, torch.ones(td.batch_size, dtype=torch.bool, device=td.get(keys.OBSERVATION).device))
 
     def _best(self, td: TensorDictBase, is_asked: Tensor) -> Tensor:
-        """Return what `select` does where `is_asked`, bool `[*B]`, and 0 elsewhere."""
+        """Return what `select` does where `is_asked`, bool `[*B]`, and the first possible option elsewhere."""
         is_decision = is_asked & td.get(keys.IS_DECISION).squeeze(-1)
         done = td.get(keys.DONE, None)
         if done is not None:  # evaluations also step episodes that have ended, and planning for them takes time
             is_decision = is_decision & ~done.squeeze(-1)
+        action_mask, option_mask = td.get(keys.ACTION_MASK, None), td.get(keys.OPTION_MASK, None)
         option = torch.zeros_like(is_decision, dtype=torch.long)
+        if option_mask is not None:
+            option = allowed_or_first(option, option_mask)
         if not is_decision.any():
             return option
-        action_mask, option_mask = (
-            None if mask is None else mask[is_decision]
-            for mask in (td.get(keys.ACTION_MASK, None), td.get(keys.OPTION_MASK, None))
-        )
+        action_mask, option_mask = (None if mask is None else mask[is_decision] for mask in (action_mask, option_mask))
         memory = self._learners_memory(td)
         memory = None if memory is None else memory[is_decision]
         value = self._values(td.get(keys.OBSERVATION)[is_decision], action_mask, option_mask, memory)
