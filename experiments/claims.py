@@ -1981,7 +1981,7 @@ def options() -> list[Claim]:
     bar = 95  # per cent of the best return
     below = {case for case, runs in crossing.items() if min(column(runs, "share")) < bar / 100}
     wrong = {case for case, runs in crossing.items() if mean(runs, "value_error") > 0.05}
-    of_rooms = ("hppo", "pdqn", "hyar", "hsac", "qpamdp", "paddpg", "dlpa")
+    of_rooms = ("hppo", "pdqn", "hyar", "hsac", "qpamdp", "paddpg", "dlpa", "pets")
     on_rooms = {low: [run for high in study_of_options.SELECTORS for run in rooms[low, high]] for low in of_rooms}
     wrong_in_rooms = {case for case, runs in rooms.items() if mean(runs, "value_error") > 0.05}
     said_of_rooms = {("hppo", "actor"), ("dlpa", "actor"), ("paddpg", "option_critic")} | {
@@ -2015,6 +2015,7 @@ def options() -> list[Claim]:
         never=sum(run["success"] == 0.0 for run in on_rooms["hppo"]),
         paddpg_lost=100.0 * min(column(on_rooms["paddpg"], "success")),
         dlpa_rooms=min(column(on_rooms["dlpa"], "share")),
+        pets_rooms=[min(column(rooms["pets", high], "share")) for high in ("actor", "option_critic")],
         rooms_error=100.0 * max(mean(runs, "value_error") for case, runs in rooms.items() if case not in said_of_rooms),
         meta_critic_rooms=span([mean(rooms[low, "meta_critic"], "share") for low in of_rooms], ".2f"),
         rooms_learners=len(of_rooms),
@@ -2049,17 +2050,18 @@ def options() -> list[Claim]:
             "Of the agents that keep their boat, {failed:word} of {seeds:word} ends at {kept_lowest:.0f} %, so "
             "the gain is unclear. - Crossing: with {seeds:word} seeds each, {good} of {pairs} pairs of a learner "
             "and a selector reach {bar} % of the best return with every seed. DLPA under the actor, and Q-PAMDP "
-            "under the actor and the option-critic, do not. - Rooms: of the runs of H-PPO, with "
-            "{rooms_seeds[hppo]:word} seeds under each of three selectors, {reached[hppo]} of {tried[hppo]} reach "
-            "{bar} %, and {never:word} never arrives. Of those of P-DQN, with {rooms_seeds[pdqn]:word} seeds, it is "
-            "{reached[pdqn]} of {tried[pdqn]}. With {rooms_seeds[hyar]:word} seeds it is {reached[hyar]} of "
-            "{tried[hyar]} with HyAR, hybrid SAC and Q-PAMDP each, {reached[paddpg]} with PADDPG and {reached[dlpa]} "
-            "with DLPA. - Goal: a selector above H-PPO makes no clear difference.",
+            "under the actor and the option-critic, do not. - Rooms, under each of three selectors: with "
+            "{rooms_seeds[hppo]:word} seeds {reached[hppo]} of {tried[hppo]} runs of H-PPO reach {bar} %, and "
+            "{never:word} never arrives. With {rooms_seeds[pdqn]:word} seeds {reached[pdqn]} of {tried[pdqn]} of P-DQN "
+            "reach it. With {rooms_seeds[hyar]:word} seeds it is {reached[hyar]} of {tried[hyar]} of HyAR, hybrid SAC "
+            "and Q-PAMDP each, {reached[paddpg]} of PADDPG, and {reached[dlpa]} of DLPA and PETS each. "
+            "- Goal: a selector above H-PPO makes no clear difference.",
             numbers,
             holds=below == said
             and all(seeds(runs) == numbers["seeds"] for runs in crossing.values())
             and {*rooms} == {(low, high) for low in of_rooms for high in study_of_options.SELECTORS}
             and len({numbers["reached"][low] for low in ("hyar", "hsac", "qpamdp")}) == 1
+            and numbers["reached"]["dlpa"] == numbers["reached"]["pets"]
             and {numbers["rooms_seeds"][low] for low in of_rooms[2:]} == {numbers["rooms_seeds"]["hyar"]}
             and is_unclear
             and not gain.is_clear,
@@ -2097,14 +2099,20 @@ def options() -> list[Claim]:
         ),
         Claim(
             page("options"),
-            "Mostly. Of the runs of H-PPO, with {rooms_seeds[hppo]:word} new seeds under each selector, "
-            "{reached[hppo]} of {tried[hppo]} reach {bar} % of the best return, and {never:word} never arrives (under "
-            "the actor). Of those of P-DQN, with {rooms_seeds[pdqn]:word} new seeds, {reached[pdqn]} of "
-            "{tried[pdqn]} reach it. With {rooms_seeds[hyar]:word} new seeds it is {reached[hyar]} of {tried[hyar]} "
-            "with HyAR, hybrid SAC and Q-PAMDP each, {reached[paddpg]} with PADDPG, and {reached[dlpa]} with DLPA. In "
-            "PADDPG's other run {paddpg_lost:.0f} % of the episodes arrive; all of DLPA's do, and its shares are "
-            "{dlpa_rooms:.2f} or more. The mean errors of the values where options end are {rooms_error:.1f} % or "
-            "less, except those of Q-PAMDP, of H-PPO and DLPA under the actor, and of PADDPG under the option-critic.",
+            "Mostly. These runs reach {bar} % of the best return, with new seeds under each of the three selectors: "
+            "- H-PPO, {rooms_seeds[hppo]:word} seeds: {reached[hppo]} of {tried[hppo]}; under the actor {never:word} "
+            "never arrives. - P-DQN, {rooms_seeds[pdqn]:word} seeds: {reached[pdqn]} of {tried[pdqn]}. - With "
+            "{rooms_seeds[hyar]:word} seeds each: HyAR, hybrid SAC and Q-PAMDP {reached[hyar]} of {tried[hyar]}, "
+            "PADDPG {reached[paddpg]}, DLPA and PETS {reached[dlpa]}.",
+            numbers,
+        ),
+        Claim(
+            page("options"),
+            "In PADDPG's other run {paddpg_lost:.0f} % of the episodes arrive; all of DLPA's do, and its shares are "
+            "{dlpa_rooms:.2f} or more. PETS's other runs have {pets_rooms[0]:.2f} under the actor and "
+            "{pets_rooms[1]:.2f} under the option-critic. The mean errors of the values where options end are "
+            "{rooms_error:.1f} % or less, except those of Q-PAMDP, of H-PPO and DLPA under the actor, and of PADDPG "
+            "under the option-critic.",
             numbers,
             holds=wrong_in_rooms == said_of_rooms and min(column(on_rooms["dlpa"], "success")) == 1.0,
         ),
