@@ -434,6 +434,30 @@ def test_a_mask_of_pairs_that_allows_nothing_ends_with_one_line():
         with_decisions(Stuck(2, forbids_pairs=True)).reset()
 
 
+@pytest.mark.parametrize("is_truncated", [False, True], ids=["terminated", "truncated"])
+@pytest.mark.parametrize("forbidden", [[1], [0, 1]], ids=["one", "both"])
+def test_what_is_played_on_after_the_end_is_of_its_option_though_pairs_are_forbidden_there(forbidden, is_truncated):
+    class Closing(OneStep):
+        def _read(self, *, is_over):
+            td = super()._read(is_over=is_over)
+            if is_over:
+                td[keys.PAIR_MASK][:, forbidden, [2 + i for i in forbidden]] = False
+            if is_truncated:
+                td[keys.TERMINATED], td[keys.TRUNCATED] = td[keys.TRUNCATED], td[keys.TERMINATED]
+            return td
+
+    env = Closing(16, forbids_pairs=True)
+    env.group_actions({"zeros": [0, 2], "ones": [1, 3]})
+    env = with_decisions(env)
+    specs = PAMDPSpecs.from_env(env)
+    torch.manual_seed(0)
+    agent = HierarchicalAgent(Uniform(specs), [Random(specs.of_option(i)) for i in range(2)], specs)
+    after = env.step_mdp(env.step(agent.policy(env.reset())))
+    played = agent.policy(after)
+    option, discrete = played[keys.OPTION], played[keys.DISCRETE]
+    assert discrete[:, 0].equal(option) and discrete[:, 1].equal(option)
+
+
 def test_components_see_whole_numbers_in_the_middle_of_their_cells_when_acting_and_when_learning():
     torch.manual_seed(0)
     specs = PAMDPSpecs(1, (), (1, 0, 0), (0.0,), (99.0,), component_sizes=(1, 2), integer_parameters=(True,))

@@ -30,8 +30,8 @@ class DecisionTracker(Transform):
     - `option_ended`, bool, only with an `option_length` or `ends_with_trips`: under `next`, the option ended with this
       step by itself or with its trip, not only because its episode did.
     - `option_mask`, bool `[*B, num_options]`, only with `option_actions`: which options have an allowed action, of each
-      component. Where the held option has none, it ends. Where an episode is over and leaves an option no action, the
-      action mask is opened (`mask_open_at_end`).
+      component. Where the held option has none, it ends. Where an episode is over and leaves an option no action, its
+      masks are opened (`mask_open_at_end`).
     - `episode_return` and `episode_steps`: undiscounted sum of rewards and number of steps since the episode began.
 
     The rows where `("next", "is_decision")` is True are the transitions of the semi-MDP. All state travels in the
@@ -169,6 +169,9 @@ class DecisionTracker(Transform):
         if keys.ACTION_MASK in next_tensordict.keys():
             action_mask = mask_open_at_end(next_tensordict, option, self.option_actions, has_action)
             next_tensordict.set(keys.ACTION_MASK, action_mask)
+        if (pair_mask := next_tensordict.get(keys.PAIR_MASK, None)) is not None:
+            is_open = _is_open_at_end(next_tensordict, has_action)
+            next_tensordict.set(keys.PAIR_MASK, pair_mask | is_open.unsqueeze(-1))
         is_stuck = ~possible.gather(-1, option.unsqueeze(-1))
         if self.option_length is None:
             cannot_end = is_stuck & ~next_tensordict.get(keys.DONE)
@@ -228,11 +231,16 @@ def mask_open_at_end(after: TensorDictBase, option: Tensor, option_actions: Tens
         option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`.
         has_action: which options have an allowed action, bool `[*B, num_options]`.
     """
-    is_open = after.get(keys.TERMINATED) & ~has_action.all(-1, keepdim=True)
-    is_open = is_open | (after.get(keys.DONE) & ~has_action.any(-1, keepdim=True))
     is_stuck = after.get(keys.DONE) & ~has_action.gather(-1, option.unsqueeze(-1))
     action_mask: Tensor = after.get(keys.ACTION_MASK)
-    return action_mask | is_open | (is_stuck & option_actions[option])
+    return action_mask | _is_open_at_end(after, has_action) | (is_stuck & option_actions[option])
+
+
+def _is_open_at_end(after: TensorDictBase, has_action: Tensor) -> Tensor:
+    """Return in which states `[*B]` everything is allowed because the episode is over there, bool `[*B, 1]`."""
+    leaves_one_none = after.get(keys.TERMINATED) & ~has_action.all(-1, keepdim=True)
+    leaves_none_any = after.get(keys.DONE) & ~has_action.any(-1, keepdim=True)
+    return leaves_one_none | leaves_none_any
 
 
 def _zero_where(mask: Tensor, values: Tensor) -> Tensor:
