@@ -200,8 +200,7 @@ class DecisionTracker(Transform):
 def _possible_options(tensordict: TensorDictBase, has_action: Tensor) -> Tensor:
     """Return which options may be chosen in a state, bool `[*B, num_options]`: those with an allowed action.
 
-    All options may be where nothing is chosen any more: after a termination, and where an episode is over and leaves
-    none of them an action.
+    All options may be after a termination, and where an episode is over and leaves none of them an action.
 
     Raises:
         ProblemError: none has an action where the episode goes on.
@@ -223,7 +222,8 @@ def mask_open_at_end(after: TensorDictBase, option: Tensor, option_actions: Tens
 
     The value of a state is that of the best action. The best of none, -inf, is no value to learn from. After a
     termination all actions are allowed, since this value is multiplied by 0. After a truncation it counts. There the
-    held option's own actions are allowed if it has none, and all actions if no option has any.
+    held option's own actions are allowed if it has none, and all actions if no option has any. So evaluations, which
+    play on in episodes that have ended, find an action of each possible option.
 
     Args:
         after: `action_mask`, `done` and `terminated` of the states.
