@@ -66,7 +66,7 @@ Indices = Annotated[tuple[NonNegativeInt, ...], FromList]
 class OwnSteps:
     """Says, as a part of a setting's type, that it counts own steps or decisions, or belongs to a schedule over these.
 
-    `Annotated[NonNegativeInt, OwnSteps()]` has no effect with `mode=offline`, and a run warns of it.
+    `Annotated[NonNegativeInt, OwnSteps()]` has no effect on what is learned with `mode=offline`, and a run warns of it.
     """
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 
 import pytest
@@ -300,27 +301,6 @@ def test_an_episode_may_end_where_no_action_of_its_option_is_allowed(name):
         assert learner.target(learner.augmented(learner.buffer[:])).isfinite().all()
 
 
-@pytest.mark.parametrize("option_length", [None, 3])
-def test_a_truncation_that_leaves_the_held_option_no_action_opens_its_own_actions_alone(option_length):
-    problem = Revealing(32)
-    problem.max_steps, problem.is_truncated, problem.option_names = 1, True, ()
-    problem.group_actions({"low": [0, 1], "first": [0], "last": [2]})
-    env = with_decisions(problem, 1.0, option_length)
-    td = env.reset()
-    option = torch.where(td[keys.OPTION_MASK][:, 2], 2, 0)
-    discrete = torch.where(option == 2, 2, td[keys.ACTION_MASK].int().argmax(-1))
-    td.update({keys.OPTION: option, keys.DISCRETE: discrete, keys.PARAMETERS: torch.zeros(32, 3)})
-    after = env.step(td)["next"]
-    is_stuck = (option == 2) & (problem.forbidden == 2)
-    assert after[keys.TRUNCATED].all() and is_stuck.any()
-    assert after[keys.ACTION_MASK][is_stuck].all()
-    allowed = torch.nn.functional.one_hot(problem.forbidden, NUM_DISCRETE) == 0
-    assert after[keys.ACTION_MASK][~is_stuck].equal(allowed[~is_stuck])
-    assert after[keys.OPTION_MASK][:, 1:].equal(allowed[:, [0, 2]]), "what may follow is not opened"
-    if option_length is not None:
-        assert after[keys.OPTION_ENDED].squeeze(-1).equal(is_stuck)
-
-
 class Closing(Revealing):
     """A mask that allows a single action where the episode is truncated."""
 
@@ -330,6 +310,46 @@ class Closing(Revealing):
     def _read(self) -> TensorDict:
         after = super()._read()
         return after.set(keys.ACTION_MASK, after[keys.ACTION_MASK] ^ after[keys.DONE])
+
+
+@pytest.mark.parametrize("option_length", [None, 3], ids=["lasts", "ends"])
+def test_a_truncation_opens_the_actions_of_a_held_option_that_has_none_if_it_lasts_as_long(option_length):
+    problem = Closing(32)
+    problem.option_names = ()
+    problem.group_actions({"low": [0, 1], "high": [1, 2], "last": [2]})
+    env = with_decisions(problem, 1.0, option_length)
+    td = env.reset()
+    option = torch.where(td[keys.OPTION_MASK][:, 2], 2, 0)
+    own = torch.tensor(problem.option_actions)[option]
+    discrete = (own & td[keys.ACTION_MASK]).int().argmax(-1)
+    td.update({keys.OPTION: option, keys.DISCRETE: discrete, keys.PARAMETERS: torch.zeros(32, 3)})
+    after = env.step(td)["next"]
+    allowed = torch.nn.functional.one_hot(problem.forbidden, NUM_DISCRETE) > 0
+    is_stuck = ~(allowed & own).any(-1)
+    assert after[keys.TRUNCATED].all() and {*option[is_stuck].tolist()} == {0, 2}
+    opened = own & is_stuck.unsqueeze(-1) if option_length is None else torch.zeros_like(own)
+    assert after[keys.ACTION_MASK].equal(allowed | opened)
+    assert after[keys.OPTION_MASK][:, 2].equal(allowed[:, 2]), "what may follow is not opened"
+    if option_length is not None:
+        assert after[keys.OPTION_ENDED].squeeze(-1).equal(is_stuck)
+
+
+def test_a_truncated_option_without_an_action_is_followed_by_another_if_the_selector_ends_options():
+    problem = Closing(32)
+    problem.option_names = ()
+    problem.group_actions({"low": [0, 1], "high": [1, 2], "last": [2]})
+    env = with_decisions(problem, 1.0, math.inf)
+    specs = PAMDPSpecs.from_env(env)
+    torch.manual_seed(0)
+    selector: Selector = make_config(["high=meta_critic", "low=random"]).high.build(specs=specs, device=CPU)
+    learners = [BestAction(specs.of_option(i)) for i in range(3)]
+    agent = HierarchicalAgent(selector, learners, specs, selector_ends_options=True)
+    with torch.no_grad():
+        batch = env.rollout(6, agent.policy, break_when_any_done=False)
+    batch = agent.next_options.with_next_option(agent.next_options.with_ends(batch))
+    possible = batch["next", keys.OPTION_MASK]
+    is_stuck = ~possible.gather(-1, batch[keys.OPTION].unsqueeze(-1)).squeeze(-1)
+    assert is_stuck.any() and possible.gather(-1, batch[keys.NEXT_OPTION].unsqueeze(-1)).all()
 
 
 @pytest.mark.parametrize("option_length", [None, 3])

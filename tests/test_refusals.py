@@ -8,7 +8,7 @@ import pytest
 import yaml
 from conftest import CONF, choices, compose_config
 from omegaconf import DictConfig, OmegaConf
-from pydantic import TypeAdapter
+from pydantic import BaseModel, TypeAdapter
 from toy_environments import Toy
 
 import hpamdp
@@ -16,6 +16,13 @@ from hpamdp import memory
 from hpamdp.config.components import GROUPS, load_class, settings_model, takes_settings_model
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
+from hpamdp.policies.high_level.epsilon_greedy import EpsilonGreedy
+from hpamdp.policies.high_level.meta_critic import MetaCritic
+from hpamdp.policies.low_level.bc import BC
+from hpamdp.policies.low_level.hsac import HSAC
+from hpamdp.policies.low_level.iql import IQL
+from hpamdp.policies.low_level.pdqn import PDQN
+from hpamdp.policies.low_level.td3_bc import TD3BC
 from hpamdp.run import capacity
 from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.checkpoint import progress_of
@@ -23,7 +30,7 @@ from hpamdp.run.compatibility import check_effects_on, facts_of, settings_withou
 from hpamdp.run.players import load_player, split_words
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.train import run
-from hpamdp.settings import OnlyWith
+from hpamdp.settings import OnlyWith, OwnSteps
 
 SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "eval.every=0"]
 PLATFORM = "env=platform high=none low=random "
@@ -417,6 +424,7 @@ def test_the_length_of_another_mode_is_refused(mode, word):
         ("data=human high=human mode=offline low=iql low.warmup_steps=9", "with mode=train"),
         ("data=human high=human mode=offline low=hsac low.updates_per_step=2", "with mode=train"),
         ("data=human low=iql mode=offline high=meta_critic high.epsilon_decisions=9", "with mode=train"),
+        ("data=human low=iql mode=offline high=epsilon_greedy high.epsilon_scale=9", "with mode=train"),
         ("data=human high=human mode=offline low=iql low.actor_lr_updates=9", None),
         ("low=hppo low.memory=gru low.memory_size=8", None),
         ("low=hppo", None),
@@ -430,6 +438,16 @@ def test_a_setting_that_counts_only_with_another_value_is_told(words, needs):
     name = last.partition("=")[0].partition(".")[2]
     expected = [] if needs is None else [f"{last}: has no effect; {name} counts only {needs}"]
     assert settings_without_effect(read(config_of(words)), words.split()) == expected
+
+
+@pytest.mark.parametrize("cls", [BC, HSAC, IQL, PDQN, TD3BC, MetaCritic, EpsilonGreedy])
+def test_a_setting_that_counts_own_steps_is_marked_where_a_class_declares_it_anew(cls):
+    def marked(model: type[BaseModel]) -> set[str]:
+        fields = model.model_fields.items()
+        return {name for name, field in fields if any(isinstance(mark, OwnSteps) for mark in field.metadata)}
+
+    inherited = [marked(base) for base in cls.Options.__mro__ if issubclass(base, BaseModel)]
+    assert marked(cls.Options) == set().union(*inherited)
 
 
 @pytest.mark.parametrize(

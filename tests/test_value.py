@@ -80,15 +80,18 @@ def test_in_an_episode_that_has_ended_the_first_possible_option_is_played_on():
 
 
 def test_after_a_truncation_learners_bootstrap_from_the_best_option():
-    env = with_decisions(BoatDockEnv(2, controller="choose"), 1.0, 2)
+    env = with_decisions(BoatDockEnv(3, controller="choose"), 1.0, 2)
     agent = HierarchicalAgent(selector(), [PDQN(BOATS) for _ in range(2)], BOATS)
     agent.selector.option_values = Expects()
     with torch.no_grad():
         batch = env.rollout(2, agent.policy)
     after = batch["next"]
-    after[keys.OPTION_ENDED][:, -1], after[keys.DONE][:, -1], after[keys.TRUNCATED][:, -1] = True, True, True
-    after[keys.OBSERVATION][:, -1, :2] = torch.tensor([[0.0, 1.0], [1.0, 0.0]])
-    assert agent.next_options.with_next_option(batch)[keys.NEXT_OPTION][:, -1].tolist() == [1, 0]
+    after[keys.OPTION_ENDED][:, -1], after[keys.DONE][:, -1] = True, True
+    after[keys.TERMINATED][:, -1] = torch.tensor([[False], [False], [True]])
+    after[keys.OBSERVATION][:, -1, :2] = torch.tensor([[0.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
+    agent.selector.option_values.asked.clear()
+    assert agent.next_options.with_next_option(batch)[keys.NEXT_OPTION][:2, -1].tolist() == [1, 0]
+    assert agent.selector.option_values.asked == [2], "after a termination no value counts"
 
 
 def test_of_equal_options_exploring_takes_a_random_one():

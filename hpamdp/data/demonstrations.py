@@ -105,10 +105,10 @@ def _with_open_masks(batch: TensorDict, specs: PAMDPSpecs) -> TensorDict:
     after = batch["next"]
     if keys.ACTION_MASK in after.keys() and keys.TERMINATED in after.keys():
         everything = ((True,) * specs.num_discrete,)
-        option_actions = torch.tensor(specs.option_actions or everything, device=after.device)
+        option_actions = torch.tensor(specs.option_actions or everything, device=after[keys.ACTION_MASK].device)
         option = batch[keys.OPTION] if specs.option_actions else torch.zeros_like(after[keys.DONE].squeeze(-1)).long()
         has_action = specs.components.any_of_each(after[keys.ACTION_MASK].unsqueeze(-2) & option_actions)
-        after[keys.ACTION_MASK] = mask_open_at_end(after, option, option_actions, has_action)
+        after[keys.ACTION_MASK] = mask_open_at_end(after, has_action, option_actions, option)
     if keys.OPTION_MASK in after.keys():
         is_empty = ~after[keys.OPTION_MASK].any(-1, keepdim=True)
         after[keys.OPTION_MASK] = after[keys.OPTION_MASK] | (after[keys.DONE] & is_empty)

@@ -167,7 +167,8 @@ class DecisionTracker(Transform):
         possible = _possible_options(next_tensordict, has_action)
         next_tensordict.set(keys.OPTION_MASK, possible)
         if keys.ACTION_MASK in next_tensordict.keys():
-            action_mask = mask_open_at_end(next_tensordict, option, self.option_actions, has_action)
+            held = option if self.option_length is None else None
+            action_mask = mask_open_at_end(next_tensordict, has_action, self.option_actions, held)
             next_tensordict.set(keys.ACTION_MASK, action_mask)
         if (pair_mask := next_tensordict.get(keys.PAIR_MASK, None)) is not None:
             is_open = _is_open_at_end(next_tensordict, has_action)
@@ -217,23 +218,25 @@ def _possible_options(tensordict: TensorDictBase, has_action: Tensor) -> Tensor:
     return has_action | has_none | tensordict.get(keys.TERMINATED)
 
 
-def mask_open_at_end(after: TensorDictBase, option: Tensor, option_actions: Tensor, has_action: Tensor) -> Tensor:
+def mask_open_at_end(after: TensorDictBase, has_action: Tensor, option_actions: Tensor, held: Tensor | None) -> Tensor:
     """Return the action mask of states `[*B]`, opened where an episode is over and leaves an option no action.
 
     The value of a state is that of the best action. The best of none, -inf, is no value to learn from. After a
-    termination all actions are allowed, since this value is multiplied by 0. After a truncation it counts. There the
-    held option's own actions are allowed if it has none, and all actions if no option has any. So evaluations, which
-    play on in episodes that have ended, find an action of each possible option.
+    termination all actions are allowed, since this value is multiplied by 0. After a truncation it counts. There all
+    actions are allowed if no option has any; if only the held one has none and cannot end, its own are. So evaluations,
+    which play on in episodes that have ended, find an action of each possible option.
 
     Args:
         after: `action_mask`, `done` and `terminated` of the states.
-        option: the held options, int64 `[*B]`.
-        option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`.
         has_action: which options have an allowed action, bool `[*B, num_options]`.
+        option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`.
+        held: the held options, int64 `[*B]`, if they last as long as the episode. If None, those without an action end.
     """
-    is_stuck = after.get(keys.DONE) & ~has_action.gather(-1, option.unsqueeze(-1))
-    action_mask: Tensor = after.get(keys.ACTION_MASK)
-    return action_mask | _is_open_at_end(after, has_action) | (is_stuck & option_actions[option])
+    action_mask: Tensor = after.get(keys.ACTION_MASK) | _is_open_at_end(after, has_action)
+    if held is None:
+        return action_mask
+    is_stuck = after.get(keys.DONE) & ~has_action.gather(-1, held.unsqueeze(-1))
+    return action_mask | (is_stuck & option_actions[held])
 
 
 def _is_open_at_end(after: TensorDictBase, has_action: Tensor) -> Tensor:

@@ -233,9 +233,10 @@ class HeldOption(TensorDictModuleBase):
 
 
 def _at_decision(states: TensorDictBase) -> TensorDictBase:
-    """Return a shallow copy of states `[N]` in which a decision is due, even if their episode was truncated there."""
+    """Return a shallow copy of states `[N]` in which a decision is due; episodes that were truncated there go on."""
     is_decision = torch.ones(len(states), 1, dtype=torch.bool, device=states.get(keys.OBSERVATION).device)
-    return states.exclude(keys.DONE).set(keys.IS_DECISION, is_decision)
+    states = states.copy().set(keys.IS_DECISION, is_decision)
+    return states.set(keys.DONE, states.get(keys.TERMINATED)) if keys.DONE in states.keys() else states
 
 
 class AgentNextOptions:
@@ -346,7 +347,8 @@ class AgentNextOptions:
         is_ended[..., -1, :] = False
         batch = batch.copy()
         batch.set(("next", keys.IS_DECISION), is_ended | done)
-        is_ended = is_ended.clone()
+        # An option without an allowed action ended with its episode.
+        is_ended = is_ended | (batch.get(("next", keys.OPTION_ENDED)) & done)
         is_ended[..., -1, :] = True
         return batch.set(("next", keys.OPTION_ENDED), is_ended)
 

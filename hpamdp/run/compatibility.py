@@ -196,9 +196,9 @@ def _conditions(config: Config, name: str) -> list[str]:
         return []
     field = settings_model(component.cls).model_fields.get(setting)
     marks = [] if field is None else field.metadata
-    is_of_steps = config.run.mode == "offline" and any(isinstance(mark, OwnSteps) for mark in marks)
-    unmet = [str(mark) for mark in marks if isinstance(mark, OnlyWith) and not mark.holds(component.settings)]
-    return [*unmet, *(["with mode=train"] if is_of_steps else [])]
+    if config.run.mode == "offline" and any(isinstance(mark, OwnSteps) for mark in marks):
+        return ["with mode=train"]
+    return [str(mark) for mark in marks if isinstance(mark, OnlyWith) and not mark.holds(component.settings)]
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:
