@@ -310,7 +310,9 @@ def _draw_domain(axes: Axes, name: str, curves: Rows, published: Rows) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        results, curves = gathered(folders, gather, settings={"hard_move.n": None}, env=ENVIRONMENTS)
+        # P-DQN and H-PPO as published end values at the limit of Goal, as their sources do.
+        settings = {"hard_move.n": None, "goal.limit": ("terminated",)}
+        results, curves = gathered(folders, gather, settings=settings, env=ENVIRONMENTS)
         refuse_repeats(results, KEY, KEY)
         tables = {"results": results, "curves": curves}
         stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in tables}
