@@ -796,20 +796,23 @@ def test_the_table_of_unknown_boats_has_a_column_for_each_head():
     assert len({line.count("|") for line in lines}) == 1 and "x, x, per option" in lines[-1]
 
 
-def _listed_to(out, err, words):
-    """Print the list of the domains' runs to this stdout, in a process of its own."""
+def _listed_to(folder: Path, out, err, words):
+    """Print the list of the runs that are planned in this folder to this stdout, in a process of its own."""
     os.dup2(err, 2)
     sys.stdout, sys.stderr = open(out, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
     sys.argv = ["cells.py", *words]
-    runpy.run_path(str(EXPERIMENTS / "domains/cells.py"), run_name="__main__")
+    runpy.run_path(str(folder / "cells.py"), run_name="__main__")
 
 
 @pytest.mark.parametrize("words", [["--list"], ["--help"]])
 def test_the_list_of_runs_ends_quietly_when_its_reader_has_seen_enough(tmp_path, words):
+    for name in ("cells.py", "cells.csv"):
+        shutil.copy(EXPERIMENTS / "domains" / name, tmp_path)
+    (tmp_path / "results.csv").write_text("domain,learner,seed\n")
     reader, writer = os.pipe()
     os.close(reader)
     with (tmp_path / "err.txt").open("w+") as err:
-        assert forked(_listed_to, writer, err.fileno(), words) == 1
+        assert forked(_listed_to, tmp_path, writer, err.fileno(), words) == 1
         err.seek(0)
         assert err.read() == ""
     os.close(writer)
