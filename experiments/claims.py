@@ -551,8 +551,8 @@ def hierarchy() -> list[Claim]:
             page("hierarchy"),
             "the `actor`, with uniform options at first, and the `meta_critic` both end {actor_below:.2f} "
             "below the ceiling. People score {people:.3f}. After half of the presses, learned selectors that see "
-            "the layout score {gains} more than the best context-free one, with one exception: the `actor` without "
-            "uniform options scores {actor_gain:.2f} more, which is unclear.",
+            "the layout score {gains} more than the best context-free one. The exception is the `actor` without uniform "
+            "options: it scores {actor_gain:.2f} more, which is unclear.",
             numbers,
             holds=round(actor["below"], 2) == round(meta_critic["below"], 2) and not actor_over_one.is_clear,
         ),
