@@ -551,8 +551,8 @@ def hierarchy() -> list[Claim]:
             page("hierarchy"),
             "the `actor`, with uniform options at first, and the `meta_critic` both end {actor_below:.2f} "
             "below the ceiling. People score {people:.3f}. After half of the presses, learned selectors that see "
-            "the layout score {gains} more than the best context-free one. The exception is the `actor` without uniform "
-            "options: it scores {actor_gain:.2f} more, which is unclear.",
+            "the layout score {gains} more than the best context-free one. The exception is the `actor` without "
+            "uniform options: it scores {actor_gain:.2f} more, which is unclear.",
             numbers,
             holds=round(actor["below"], 2) == round(meta_critic["below"], 2) and not actor_over_one.is_clear,
         ),
@@ -656,7 +656,7 @@ def hierarchy() -> list[Claim]:
         ),
         Claim(
             "docs/selectors/linucb.md",
-            "it agrees most often with the planner: in {linucb:.1f} % of the layouts, {uniform:.1f} % after uniform "
+            "it agrees with the planner in {linucb:.1f} % of the layouts, and in {uniform:.1f} % after uniform "
             "options.",
             numbers,
         ),
@@ -1096,7 +1096,7 @@ def notes_on_domains() -> list[Claim]:
             each=listed(scores("goal", "pdqn_published"), ".3f"),
             bar=paper("goal", "pdqn", "MP-DQN"),
         ),
-        claim("On Goal they never score (published 0),", holds=not any(scores("goal", "hppo_published"))),
+        claim("On Goal three new seeds never score (published 0),", holds=not any(scores("goal", "hppo_published"))),
         claim(
             "its new seeds score higher than published on Hard Move 4 and 6, and as much on Platform ({mean:.3f}, "
             "published {bar:.2f}).",
@@ -2058,9 +2058,10 @@ def options() -> list[Claim]:
             "and a selector reach {bar} % of the best return with every seed. DLPA under the actor, and Q-PAMDP "
             "under the actor and the option-critic, do not. - Rooms, under each of three selectors: with "
             "{rooms_seeds[hppo]:word} seeds {reached[hppo]} of {tried[hppo]} runs of H-PPO reach {bar} %, and "
-            "{never:word} never arrives. With {rooms_seeds[pdqn]:word} seeds {reached[pdqn]} of {tried[pdqn]} of P-DQN "
-            "reach it. With {rooms_seeds[hyar]:word} seeds it is {reached[hyar]} of {tried[hyar]} of HyAR, hybrid SAC "
-            "and Q-PAMDP each, {reached[paddpg]} of PADDPG, and {reached[dlpa]} of DLPA and PETS each. "
+            "{never:word} never arrives. With {rooms_seeds[pdqn]:word} seeds P-DQN reaches it in {reached[pdqn]} of "
+            "{tried[pdqn]}. With {rooms_seeds[hyar]:word} seeds HyAR, hybrid SAC and Q-PAMDP reach it in "
+            "{reached[hyar]} of {tried[hyar]} each, PADDPG in {reached[paddpg]}, DLPA and PETS in {reached[dlpa]} "
+            "each. "
             "- Goal: a selector above H-PPO makes no clear difference.",
             numbers,
             holds=below == said
@@ -2083,10 +2084,10 @@ def options() -> list[Claim]:
         ),
         Claim(
             page("options"),
-            "No difference to H-PPO alone is clear: on Goal their intervals reach from {goal_reach[0]:.2f} to "
-            "{goal_reach[1]:.2f}. There H-PPO scores {goal} with {seeds:word} seeds under each selector, and "
-            "{alone:.2f} alone with {seeds_alone:word} seeds. On Hard Goal H-PPO scores {hard_goal:.2f} under the "
-            "option-critic, and {hard_alone:.2f} alone. On Goal the option-critic is clearly above the actor.",
+            "No difference to H-PPO alone is clear: on Goal the intervals of the differences reach from "
+            "{goal_reach[0]:.2f} to {goal_reach[1]:.2f}. There H-PPO scores {goal} with {seeds:word} seeds under each "
+            "selector, and {alone:.2f} alone with {seeds_alone:word} seeds. On Hard Goal H-PPO scores "
+            "{hard_goal:.2f} under the option-critic, and {hard_alone:.2f} alone. On Goal the option-critic is clearly above the actor.",
             numbers,
             holds=is_unclear
             and difference(
@@ -2115,10 +2116,10 @@ def options() -> list[Claim]:
         Claim(
             page("options"),
             "In PADDPG's other run {paddpg_lost:.0f} % of the episodes arrive; all of DLPA's do, and its shares are "
-            "{dlpa_rooms:.2f} or more. PETS's other runs have {pets_rooms[0]:.2f} under the actor and "
-            "{pets_rooms[1]:.2f} under the option-critic. The mean errors of the values where options end are "
-            "{rooms_error:.1f} % or less, except those of Q-PAMDP, of H-PPO and DLPA under the actor, and of PADDPG "
-            "under the option-critic.",
+            "{dlpa_rooms:.2f} or more. The shares of PETS's other two runs are {pets_rooms[0]:.3f} under "
+            "the actor and {pets_rooms[1]:.3f} under the option-critic. The mean errors of the values where "
+            "options end are {rooms_error:.1f} % or less, except those of Q-PAMDP, of H-PPO and DLPA under the actor, "
+            "and of PADDPG under the option-critic.",
             numbers,
             holds=wrong_in_rooms == said_of_rooms and min(column(on_rooms["dlpa"], "success")) == 1.0,
         ),

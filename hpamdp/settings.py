@@ -64,9 +64,10 @@ Indices = Annotated[tuple[NonNegativeInt, ...], FromList]
 
 
 class OwnSteps:
-    """Says, as a part of a setting's type, that it counts own steps or decisions, or belongs to a schedule over these.
+    """Says, as a part of a setting's type, that the setting counts the agent's own steps or decisions.
 
-    `Annotated[NonNegativeInt, OwnSteps()]` has no effect on what is learned with `mode=offline`, and a run warns of it.
+    Settings of a schedule over these have it, too. A setting of the type `Annotated[NonNegativeInt, OwnSteps()]` has no
+    effect on what is learned with `mode=offline`. A run warns if such a setting is given.
     """
 
 

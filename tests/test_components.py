@@ -436,7 +436,7 @@ def test_a_mask_of_pairs_that_allows_nothing_ends_with_one_line():
 
 @pytest.mark.parametrize("is_truncated", [False, True], ids=["terminated", "truncated"])
 @pytest.mark.parametrize("forbidden", [[1], [0, 1]], ids=["one", "both"])
-def test_what_is_played_on_after_the_end_is_of_its_option_though_pairs_are_forbidden_there(forbidden, is_truncated):
+def test_after_the_end_actions_belong_to_the_chosen_option_even_if_its_pairs_are_forbidden(forbidden, is_truncated):
     class Closing(OneStep):
         def _read(self, *, is_over):
             td = super()._read(is_over=is_over)

@@ -313,7 +313,7 @@ class Closing(Revealing):
 
 
 @pytest.mark.parametrize("option_length", [None, 3], ids=["lasts", "ends"])
-def test_a_truncation_opens_the_actions_of_a_held_option_that_has_none_if_it_lasts_as_long(option_length):
+def test_a_truncation_opens_the_actions_of_a_held_option_only_if_it_lasts_as_long_as_its_episode(option_length):
     problem = Closing(32)
     problem.option_names = ()
     problem.group_actions({"low": [0, 1], "high": [1, 2], "last": [2]})
@@ -370,6 +370,7 @@ def test_what_is_played_on_after_a_truncation_is_allowed(high, low, actions, opt
     assert after[keys.TRUNCATED].all()
     option, discrete = played[keys.OPTION], played[keys.DISCRETE]
     assert torch.tensor(specs.option_actions)[option].gather(-1, discrete.unsqueeze(-1)).all()
+    assert after[keys.ACTION_MASK].gather(-1, discrete.unsqueeze(-1)).all()
     assert after[keys.OPTION_MASK].gather(-1, option.unsqueeze(-1)).all()
 
 

@@ -16,7 +16,7 @@ from hpamdp.data.row_checks import (
     check_transitions,
 )
 from hpamdp.devices import checked_device
-from hpamdp.env.decisions import mask_open_at_end
+from hpamdp.env.decisions import action_mask_opened_at_end
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -98,17 +98,18 @@ class Demonstrations:
 def _with_open_masks(batch: TensorDict, specs: PAMDPSpecs) -> TensorDict:
     """Return rows `[1, N]` whose masks after the end of an episode are opened where they allow nothing.
 
-    Environments do the same (`PAMDPEnv.check_masks`, `mask_open_at_end`). An action mask allows nothing if a component,
-    or an option that is a set of actions, has no discrete action left.
+    Environments do the same (`PAMDPEnv.check_masks`, `action_mask_opened_at_end`). An action mask allows nothing if a
+    component, or an option that is a set of actions, has no discrete action left. Options last a whole episode.
     """
     batch = batch.copy()
     after = batch["next"]
     if keys.ACTION_MASK in after.keys() and keys.TERMINATED in after.keys():
         everything = ((True,) * specs.num_discrete,)
         option_actions = torch.tensor(specs.option_actions or everything, device=after[keys.ACTION_MASK].device)
-        option = batch[keys.OPTION] if specs.option_actions else torch.zeros_like(after[keys.DONE].squeeze(-1)).long()
+        only_option = torch.zeros_like(after[keys.DONE].squeeze(-1), dtype=torch.long)
+        option = batch[keys.OPTION] if specs.option_actions else only_option
         has_action = specs.components.any_of_each(after[keys.ACTION_MASK].unsqueeze(-2) & option_actions)
-        after[keys.ACTION_MASK] = mask_open_at_end(after, has_action, option_actions, option)
+        after[keys.ACTION_MASK] = action_mask_opened_at_end(after, has_action, option_actions, option)
     if keys.OPTION_MASK in after.keys():
         is_empty = ~after[keys.OPTION_MASK].any(-1, keepdim=True)
         after[keys.OPTION_MASK] = after[keys.OPTION_MASK] | (after[keys.DONE] & is_empty)

@@ -30,8 +30,8 @@ class DecisionTracker(Transform):
     - `option_ended`, bool, only with an `option_length` or `ends_with_trips`: under `next`, the option ended with this
       step by itself or with its trip, not only because its episode did.
     - `option_mask`, bool `[*B, num_options]`, only with `option_actions`: which options have an allowed action, of each
-      component. Where the held option has none, it ends. Where an episode is over and leaves an option no action, its
-      masks are opened (`mask_open_at_end`).
+      component. Where the held option has none, it ends. Where an episode is over, masks that leave options no action
+      may be opened (`action_mask_opened_at_end`).
     - `episode_return` and `episode_steps`: undiscounted sum of rewards and number of steps since the episode began.
 
     The rows where `("next", "is_decision")` is True are the transitions of the semi-MDP. All state travels in the
@@ -119,7 +119,7 @@ class DecisionTracker(Transform):
         done = next_tensordict.get(keys.DONE)
         option_return = tensordict.get(keys.OPTION_RETURN)
         option_steps = tensordict.get(keys.OPTION_STEPS)
-        is_stuck = self._set_option_mask(tensordict, next_tensordict)
+        is_stuck = self._set_masks(tensordict, next_tensordict)
         is_decision = done.clone()
         if self.ends_inside:
             # Only a reset writes zeros: an option that begins inside an episode restarts its sums here.
@@ -154,11 +154,14 @@ class DecisionTracker(Transform):
             return decision_observation.clone()
         return torch.where(tensordict.get(keys.IS_DECISION), tensordict.get(keys.OBSERVATION), decision_observation)
 
-    def _set_option_mask(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor | None:
-        """Write which options are possible next; return where the held one is not, `[*B, 1]`, if any may be forbidden.
+    def _set_masks(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor | None:
+        """Write the masks of the next states; return where the held option is not possible, `[*B, 1]`.
+
+        Return None if no option may be forbidden.
 
         Raises:
-            ProblemError: the held option has no allowed action left, and should last as long as its episode or trip.
+            ProblemError: the held option has no allowed action left, and its episode or trip, which it should last as
+                long as, goes on.
         """
         if self.option_actions is None:
             return None
@@ -168,7 +171,7 @@ class DecisionTracker(Transform):
         next_tensordict.set(keys.OPTION_MASK, possible)
         if keys.ACTION_MASK in next_tensordict.keys():
             held = option if self.option_length is None else None
-            action_mask = mask_open_at_end(next_tensordict, has_action, self.option_actions, held)
+            action_mask = action_mask_opened_at_end(next_tensordict, has_action, self.option_actions, held)
             next_tensordict.set(keys.ACTION_MASK, action_mask)
         if (pair_mask := next_tensordict.get(keys.PAIR_MASK, None)) is not None:
             is_open = _is_open_at_end(next_tensordict, has_action)
@@ -201,30 +204,32 @@ class DecisionTracker(Transform):
 def _possible_options(tensordict: TensorDictBase, has_action: Tensor) -> Tensor:
     """Return which options may be chosen in a state, bool `[*B, num_options]`: those with an allowed action.
 
-    All options may be after a termination, and where an episode is over and leaves none of them an action.
+    After a termination all options may be chosen. After a truncation all may if none has an action.
 
     Raises:
         ProblemError: none has an action where the episode goes on.
     """
-    has_none = ~has_action.any(-1, keepdim=True)
-    done = tensordict.get(keys.DONE)
-    is_refused = (has_none & ~done).flatten()
+    all_lack_action = ~has_action.any(-1, keepdim=True)
+    is_refused = (all_lack_action & ~tensordict.get(keys.DONE)).flatten()
     if is_refused.any():
         row = int(is_refused.nonzero()[0])
         masks = " and ".join(name for name in (keys.ACTION_MASK, keys.PAIR_MASK) if name in tensordict.keys())
         raise ProblemError(
             f"environment {row}: no option has an action that its {masks} allows; give the options more actions"
         )
-    return has_action | has_none | tensordict.get(keys.TERMINATED)
+    return has_action | all_lack_action | tensordict.get(keys.TERMINATED)
 
 
-def mask_open_at_end(after: TensorDictBase, has_action: Tensor, option_actions: Tensor, held: Tensor | None) -> Tensor:
-    """Return the action mask of states `[*B]`, opened where an episode is over and leaves an option no action.
+def action_mask_opened_at_end(
+    after: TensorDictBase, has_action: Tensor, option_actions: Tensor, held: Tensor | None
+) -> Tensor:
+    """Return the action mask of states `[*B]`, opened where an episode is over and options would have no action.
 
-    The value of a state is that of the best action. The best of none, -inf, is no value to learn from. After a
-    termination all actions are allowed, since this value is multiplied by 0. After a truncation it counts. There all
-    actions are allowed if no option has any; if only the held one has none and cannot end, its own are. So evaluations,
-    which play on in episodes that have ended, find an action of each possible option.
+    The value of a state is that of its best action. Without any action it is -inf, which is no value to learn from.
+    After a termination that leaves an option no action, all actions are allowed, since the value is multiplied by 0.
+    After a truncation it counts. There all actions are allowed only if no option has one. Otherwise, if the held option
+    has none and cannot end, its own actions are allowed. So evaluations, which play on in episodes that have ended,
+    find an action of each possible option.
 
     Args:
         after: `action_mask`, `done` and `terminated` of the states.
@@ -241,9 +246,9 @@ def mask_open_at_end(after: TensorDictBase, has_action: Tensor, option_actions: 
 
 def _is_open_at_end(after: TensorDictBase, has_action: Tensor) -> Tensor:
     """Return in which states `[*B]` everything is allowed because the episode is over there, bool `[*B, 1]`."""
-    leaves_one_none = after.get(keys.TERMINATED) & ~has_action.all(-1, keepdim=True)
-    leaves_none_any = after.get(keys.DONE) & ~has_action.any(-1, keepdim=True)
-    return leaves_one_none | leaves_none_any
+    some_lack_action = ~has_action.all(-1, keepdim=True)
+    all_lack_action = ~has_action.any(-1, keepdim=True)
+    return (after.get(keys.TERMINATED) & some_lack_action) | (after.get(keys.DONE) & all_lack_action)
 
 
 def _zero_where(mask: Tensor, values: Tensor) -> Tensor:

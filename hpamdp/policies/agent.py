@@ -347,7 +347,7 @@ class AgentNextOptions:
         is_ended[..., -1, :] = False
         batch = batch.copy()
         batch.set(("next", keys.IS_DECISION), is_ended | done)
-        # An option without an allowed action ended with its episode.
+        # If the last state of an episode leaves the held option no action, it ended, too, and another one follows.
         is_ended = is_ended | (batch.get(("next", keys.OPTION_ENDED)) & done)
         is_ended[..., -1, :] = True
         return batch.set(("next", keys.OPTION_ENDED), is_ended)

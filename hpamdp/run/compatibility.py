@@ -190,7 +190,10 @@ def _component_and_setting(config: Config, name: str) -> tuple[Component | None,
 
 
 def _conditions(config: Config, name: str) -> list[str]:
-    """Return the conditions of a setting that do not hold, such as those of `low.memory_size` without `low.memory`."""
+    """Return what a setting needs to count but does not have, such as `low.memory_size` without `low.memory`.
+
+    With `mode=offline`, a setting marked `OwnSteps` needs another mode, and nothing else is named.
+    """
     component, setting = _component_and_setting(config, name)
     if component is None or component.cls is None or not takes_settings_model(component.cls):
         return []

@@ -7,7 +7,7 @@ Forgetting: see `RewardStatistics`.
 Differs from the sources:
 - the probability of a random option has a lower bound, `epsilon_final`;
 - `epsilon_scale` is a setting. Auer et al. compute it from the number of options and the lead of the best one;
-- all choices are random until each option has a known reward that is not forgotten;
+- all choices are random until each allowed option has a known reward that is not forgotten;
 - if the policy is greedy, no option is random.
 """
 

@@ -9,7 +9,7 @@ Differs from the source:
 - the prior of the means is flat, so untried options come first, in random order;
 - decisions that are due at the same time sample from the same posteriors;
 - with `memory=session` each environment has posteriors of its own, from the rewards of its session's trips;
-- if the policy is greedy, it chooses the highest mean. With `memory=session` it samples, too.
+- if the policy is greedy, it chooses the highest mean. With `memory=session` it samples even then.
 """
 
 from __future__ import annotations

@@ -11,7 +11,8 @@ Differs from the sources:
 - t also counts the decisions that are due;
 - all memories have the width of UCB1. Garivier and Moulines have a constant xi in place of 2, and double the width of
   the discounted form;
-- if the policy is greedy, it chooses the highest mean, without a bound. With `memory=session` it uses the bounds, too.
+- if the policy is greedy, it chooses the highest mean, without a bound. With `memory=session` it uses the bounds even
+  then.
 """
 
 from __future__ import annotations

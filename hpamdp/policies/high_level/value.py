@@ -109,7 +109,7 @@ class Value(Selector):
     def select(self, td: TensorDictBase) -> Tensor:
         """Return an option for every environment, int64 `[*B]`.
 
-        It is the first possible one where no decision is due or the episode has ended.
+        If no decision is due or the episode has ended, it is the first possible option.
         """
         return self._best(td, torch.ones(td.batch_size, dtype=torch.bool, device=td.get(keys.OBSERVATION).device))
 

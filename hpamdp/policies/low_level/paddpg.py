@@ -19,8 +19,9 @@ Differs from the source:
 - The networks are smaller and start as PyTorch's; the learning rates and the target rate are those of this project.
   ReLU has no slope below 0, where the authors' has 0.01. Adam's first beta is 0.9, not 0.95.
 - If `initial_parameters` asks for them, a frozen layer adds the problem's initial parameters, as in Bester et al.
-- With `twin`, the output is clipped. In HyAR's code a tanh bounds it, in addition to inverting gradients. That code
-  explores by Gaussian noise alone, clips the gradients of the actor alone and smooths targets by 0.2, clipped at 0.5.
+- With `twin`, outputs are clipped as without. In HyAR's PATD3 a tanh bounds them, in addition to inverting gradients.
+  That code explores by Gaussian noise alone and clips the gradients of the actor alone. It smooths targets by 0.2,
+  clipped at 0.5.
 
 TorchRL's DDPGLoss and TD3Loss would need a composite action split for them, and bounds of their own. They have no
 inverting gradients, for which the gradient must be changed between critic and actor.
