@@ -2087,7 +2087,8 @@ def options() -> list[Claim]:
             "No difference to H-PPO alone is clear: on Goal the intervals of the differences reach from "
             "{goal_reach[0]:.2f} to {goal_reach[1]:.2f}. There H-PPO scores {goal} with {seeds:word} seeds under each "
             "selector, and {alone:.2f} alone with {seeds_alone:word} seeds. On Hard Goal H-PPO scores "
-            "{hard_goal:.2f} under the option-critic, and {hard_alone:.2f} alone. On Goal the option-critic is clearly above the actor.",
+            "{hard_goal:.2f} under the option-critic, and {hard_alone:.2f} alone. On Goal the option-critic is "
+            "clearly above the actor.",
             numbers,
             holds=is_unclear
             and difference(
