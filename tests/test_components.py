@@ -101,7 +101,9 @@ def test_the_learners_of_policies_reach_the_best_pair_of_a_step():
         assert greedy_reward(learner) > 0.97, settings
 
 
-@pytest.mark.parametrize("learner_class", [PDQN, HSAC, PADDPG])
+@pytest.mark.parametrize(
+    "learner_class", [PDQN, *(pytest.param(each, marks=pytest.mark.slow) for each in (HSAC, PADDPG))]
+)
 def test_the_learners_of_values_reach_the_best_pair_of_a_step(learner_class):
     torch.manual_seed(0)
     settings = {} if learner_class is HSAC else {"epsilon_steps": 2000}

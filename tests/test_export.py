@@ -416,7 +416,7 @@ def test_numbers_that_float32_cannot_hold_are_those_of_the_environment(tmp_path)
     assert (parameters[:, said["integer_parameters"]] % 1.0 == 0.0).all()
 
 
-@pytest.mark.parametrize("low", ["hppo", "pdqn", "hsac"])
+@pytest.mark.parametrize("low", ["hppo", *(pytest.param(low, marks=pytest.mark.slow) for low in ("pdqn", "hsac"))])
 def test_each_component_says_the_number_of_its_first_action(low, tmp_path):
     agent = fresh_agent(*own("Parts"), "high=none", f"low={low}")
     agent.export(tmp_path / "a.onnx")

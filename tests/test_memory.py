@@ -439,7 +439,7 @@ def test_a_run_of_a_selector_with_a_recurrent_memory_resumes_to_the_last_bit(hig
 # In runs.
 
 
-@pytest.mark.parametrize("low", [*LEARNERS, "dlpa"])
+@pytest.mark.parametrize("low", [*LEARNERS, pytest.param("dlpa", marks=pytest.mark.slow)])
 def test_a_run_with_a_recurrent_memory_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
     words = [*words_of("ucb", low), "low.memory=gru", "low.memory_size=8", "low.sequence_length=3"]
     stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)

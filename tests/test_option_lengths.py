@@ -218,7 +218,7 @@ def make_actor(specs: PAMDPSpecs) -> Actor:
     return Actor(specs, hidden_dims=[32], epochs=4, minibatch_size=128, entropy=0.05, lr=1e-2, gamma=GAMMA)
 
 
-@pytest.mark.parametrize("period", [1, 4])
+@pytest.mark.parametrize("period", [pytest.param(1, marks=pytest.mark.slow), 4])
 @pytest.mark.parametrize("make_selector", [make_meta_critic, make_actor], ids=["meta_critic", "actor"])
 def test_the_selector_learns_to_hold_options_as_long_as_they_stay_right(make_selector, period):
     torch.manual_seed(0)

@@ -45,7 +45,10 @@ def learn(learner: PETS | DLPA, rolled: TensorDict) -> None:
 
 
 @every_planner
-@pytest.mark.parametrize(("memory", "low", "high"), [("none", -1.0, 0.25), ("stack", 0.9, 1.0), ("gru", 0.9, 1.0)])
+@pytest.mark.parametrize(
+    ("memory", "low", "high"),
+    [("none", -1.0, 0.25), ("stack", 0.9, 1.0), pytest.param("gru", 0.9, 1.0, marks=pytest.mark.slow)],
+)
 def test_with_a_memory_plans_use_a_hidden_sign_that_the_step_before_has_revealed(kind, memory, low, high):
     env = Cue(16, length=2)
     learner = make(env, memory, kind)

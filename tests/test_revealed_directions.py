@@ -280,7 +280,10 @@ RUN += ["low.num_members=2", "low.greedy_samples=8", "low.num_samples=8", "low.h
 TWO_BOATS = ["env.boats=2", "high=value", "high.untried_first=true", "agent.sharing=shared"]
 
 
-@pytest.mark.parametrize("words", [[], TWO_BOATS], ids=["one boat", "two boats"])
+@pytest.mark.parametrize(
+    "words",
+    [pytest.param([], id="one boat"), pytest.param(TWO_BOATS, id="two boats", marks=pytest.mark.slow)],
+)
 def test_a_run_that_remembers_directions_resumes_to_the_last_bit(words, tmp_path, monkeypatch):
     stop_and_resume([*RUN, *words], tmp_path, monkeypatch, signal.SIGINT)
 
