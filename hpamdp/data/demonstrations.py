@@ -106,10 +106,9 @@ def _with_open_masks(batch: TensorDict, specs: PAMDPSpecs) -> TensorDict:
     if keys.ACTION_MASK in after.keys() and keys.TERMINATED in after.keys():
         everything = ((True,) * specs.num_discrete,)
         option_actions = torch.tensor(specs.option_actions or everything, device=after[keys.ACTION_MASK].device)
-        only_option = torch.zeros_like(after[keys.DONE].squeeze(-1), dtype=torch.long)
-        option = batch[keys.OPTION] if specs.option_actions else only_option
+        held = batch[keys.OPTION] if specs.option_actions else None
         has_action = specs.components.any_of_each(after[keys.ACTION_MASK].unsqueeze(-2) & option_actions)
-        after[keys.ACTION_MASK] = action_mask_opened_at_end(after, has_action, option_actions, option)
+        after[keys.ACTION_MASK] = action_mask_opened_at_end(after, has_action, option_actions, held)
     if keys.OPTION_MASK in after.keys():
         is_empty = ~after[keys.OPTION_MASK].any(-1, keepdim=True)
         after[keys.OPTION_MASK] = after[keys.OPTION_MASK] | (after[keys.DONE] & is_empty)
