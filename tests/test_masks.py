@@ -237,17 +237,19 @@ def test_what_learners_expect_of_an_option_counts_allowed_actions_alone():
     assert values(torch.zeros(3, NUM_DISCRETE), action_mask).tolist() == expected
 
 
-def problem_with_single_actions() -> Forbidden:
-    """Return a problem in which forbidding an action forbids the option `last`, even while it is held."""
-    problem = Forbidden(8)
+def grouped(problem: Forbidden, actions: dict[str, list[int]] | None = None) -> Forbidden:
+    """Return the problem with sets of actions as options.
+
+    By default forbidding an action forbids the option `last`, even while it is held.
+    """
     problem.option_names = ()
-    problem.group_actions({"low": [0, 1], "high": [1, 2], "last": [2]})
+    problem.group_actions(actions or {"low": [0, 1], "high": [1, 2], "last": [2]})
     return problem
 
 
 @pytest.mark.parametrize("high", ["uniform", "meta_critic", "option_critic", "actor", "value"])
 def test_an_option_ends_where_none_of_its_actions_is_allowed_any_more(high):
-    problem = problem_with_single_actions()
+    problem = grouped(Forbidden(8))
     env = with_decisions(problem, 1.0, 3)
     specs = PAMDPSpecs.from_env(env)
     assert specs.has_option_mask
@@ -280,9 +282,7 @@ class Revealing(Forbidden):
 
 @pytest.mark.parametrize("name", ["hyar", "td3_bc"])
 def test_an_episode_may_end_where_no_action_of_its_option_is_allowed(name):
-    problem = Revealing(8)
-    problem.option_names = ()
-    problem.group_actions({"low": [0, 1], "high": [1, 2], "last": [2]})
+    problem = grouped(Revealing(8))
     env = with_decisions(problem, 1.0, 3)
     specs = PAMDPSpecs.from_env(env)
     agent = HierarchicalAgent(Uniform(specs), [make_learner(name, specs.of_option(i)) for i in range(3)], specs)
@@ -314,9 +314,7 @@ class Closing(Revealing):
 
 @pytest.mark.parametrize("option_length", [None, 3], ids=["lasts", "ends"])
 def test_a_truncation_opens_the_actions_of_a_held_option_only_if_it_lasts_as_long_as_its_episode(option_length):
-    problem = Closing(32)
-    problem.option_names = ()
-    problem.group_actions({"low": [0, 1], "high": [1, 2], "last": [2]})
+    problem = grouped(Closing(32))
     env = with_decisions(problem, 1.0, option_length)
     td = env.reset()
     option = torch.where(td[keys.OPTION_MASK][:, 2], 2, 0)
@@ -335,10 +333,7 @@ def test_a_truncation_opens_the_actions_of_a_held_option_only_if_it_lasts_as_lon
 
 
 def test_a_truncated_option_without_an_action_is_followed_by_another_if_the_selector_ends_options():
-    problem = Closing(32)
-    problem.option_names = ()
-    problem.group_actions({"low": [0, 1], "high": [1, 2], "last": [2]})
-    env = with_decisions(problem, 1.0, math.inf)
+    env = with_decisions(grouped(Closing(32)), 1.0, math.inf)
     specs = PAMDPSpecs.from_env(env)
     torch.manual_seed(0)
     selector: Selector = make_config(["high=meta_critic", "low=random"]).high.build(specs=specs, device=CPU)
@@ -356,10 +351,7 @@ def test_a_truncated_option_without_an_action_is_followed_by_another_if_the_sele
 @pytest.mark.parametrize("actions", [{"low": [0, 1], "last": [2]}, {"first": [0], "last": [2]}], ids=["one", "none"])
 @pytest.mark.parametrize(("high", "low"), [("uniform", "hyar"), ("uniform", "random"), ("value", "hppo")])
 def test_what_is_played_on_after_a_truncation_is_allowed(high, low, actions, option_length):
-    problem = Closing(32)
-    problem.option_names = ()
-    problem.group_actions(actions)
-    env = with_decisions(problem, 1.0, option_length)
+    env = with_decisions(grouped(Closing(32), actions), 1.0, option_length)
     specs = PAMDPSpecs.from_env(env)
     torch.manual_seed(0)
     selector: Selector = make_config([f"high={high}", "low=hppo", *SELECTORS[high]]).high.build(specs=specs, device=CPU)
@@ -384,7 +376,7 @@ def test_options_of_which_none_has_an_allowed_action_are_told_in_one_line():
 
 
 def test_an_option_that_can_neither_go_on_nor_end_is_told_in_one_line():
-    env = with_decisions(problem_with_single_actions())
+    env = with_decisions(grouped(Forbidden(8)))
     held = torch.full((8,), 2)
     td = env.reset().update({keys.OPTION: held, keys.DISCRETE: held, keys.PARAMETERS: torch.zeros(8, 3)})
     expected = r"^environment \d: option 2 has no allowed action left, and .*; use agent.termination=steps"
