@@ -2061,8 +2061,7 @@ def options() -> list[Claim]:
             "{never:word} never arrives. With {rooms_seeds[pdqn]:word} seeds P-DQN reaches it in {reached[pdqn]} of "
             "{tried[pdqn]}. With {rooms_seeds[hyar]:word} seeds HyAR, hybrid SAC and Q-PAMDP reach it in "
             "{reached[hyar]} of {tried[hyar]} each, PADDPG in {reached[paddpg]}, DLPA and PETS in {reached[dlpa]} "
-            "each. "
-            "- Goal: a selector above H-PPO makes no clear difference.",
+            "each. - Goal: a selector above H-PPO makes no clear difference.",
             numbers,
             holds=below == said
             and all(seeds(runs) == numbers["seeds"] for runs in crossing.values())
