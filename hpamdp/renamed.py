@@ -7,7 +7,8 @@ from typing import Any
 
 # Old names of settings and the new ones. A dotted name belongs to one group, a plain name to any group.
 _NEW_NAMES = {
-    "agent.uniform_option_frames": "uniform_option_steps",
+    "agent.uniform_option_frames": "practice",
+    "agent.uniform_option_steps": "practice",
     "env.options": "grouping",
     "warmup_frames": "warmup_steps",
     "updates_per_frame": "updates_per_step",

@@ -79,11 +79,13 @@ class AgentConfig(Settings):
     """How far values look, if an episode is a session of trips: to the end of the `session`, or of the `trip`."""
     selector_values_end: Literal["session", "trip"] | None = None
     """How far the selector's values look. If null, as far as `values_end`, which then holds for both levels."""
-    uniform_option_steps: NonNegativeInt = 0
-    """Steps at the start of training in which options are chosen uniformly, so that each option's learner gets data.
+    practice: Literal["auto", "curves"] | NonNegativeInt = "auto"
+    """Which options practise while their learners improve, whatever the selector would choose.
 
-    They are steps of all environments together; with `low.freeze=true` they are decisions.
-    Without them, a selector may settle early on the option whose learner improves first.
+    `curves`: the option whose learner would gain most from the practice that is left; after four fifths of the run the
+    selector takes over. A number: all options equally, for so many steps at the start of training (decisions with
+    `low.freeze=true`); 0 leaves practice to the selector. `auto`: `curves` if the selector learns which option suits
+    which state, options last as long as their episodes, and each has its own learner; otherwise 0.
     """
 
 

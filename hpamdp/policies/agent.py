@@ -18,6 +18,7 @@ from hpamdp.policies.base import Learner, Level, Selector, finished_decisions
 from hpamdp.policies.exploration.base import Exploration
 from hpamdp.policies.masks import allowed_or_first
 from hpamdp.policies.option_lengths import OptionLengths, PairSelector
+from hpamdp.policies.practice import CurvePractice, UniformPractice
 from hpamdp.specs import PAMDPSpecs
 
 FOR_TRAINING = "explorations."
@@ -402,8 +403,7 @@ class HierarchicalAgent(nn.Module):
         is_shared: whether the single learner observes the option. The learner's specs then count the one-hot option as
             part of the observation.
         is_frozen: whether the learners stay as they are.
-        uniform_option_steps: number of steps at the beginning with uniform exploring choices; of decisions, if the
-            learners are frozen. The selector learns from them.
+        practice: which options practise, whatever the selector would choose. If None, none does.
         selector_ends_options: whether the selector decides where options end.
         option_lengths: the lengths that the selector chooses from together with an option, in steps. The selector's
             `specs` then list the pairs as options (`PAMDPSpecs.with_option_lengths`). If empty, it chooses options
@@ -434,7 +434,7 @@ class HierarchicalAgent(nn.Module):
         specs: PAMDPSpecs,
         is_shared: bool = False,
         is_frozen: bool = False,
-        uniform_option_steps: int = 0,
+        practice: UniformPractice | CurvePractice | None = None,
         selector_ends_options: bool = False,
         option_lengths: Sequence[int] = (),
         *,
@@ -447,9 +447,9 @@ class HierarchicalAgent(nn.Module):
         self.specs = specs
         self.is_shared = is_shared
         self.is_frozen = is_frozen
-        self.uniform_option_steps = uniform_option_steps
+        self.practice = practice
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
-        self._set_is_uniform()
+        self._set_practice()
         self.router = OptionRouter(learners, specs, is_shared, explorations)
         self.option_lengths = tuple(option_lengths)
         self.pairs = OptionLengths(option_lengths) if option_lengths and selector is not None else None
@@ -496,9 +496,9 @@ class HierarchicalAgent(nn.Module):
         if self.next_options is not None and self.next_options.decides_ends:
             batch = self.next_options.with_ends(batch)
         if self.selector is not None and self.next_options is not None:
-            self._set_is_uniform()
             seen = ended_with_trips(batch) if self.selector_values_end_with_trips else batch
             seen = steps = self._seen_by_selector(seen)
+            scalars.update(self._practise(seen))
             self._set_pending(self.selector, seen)
             if self.next_options.decides_ends:
                 steps = self.next_options.with_steps_before(seen)
@@ -651,9 +651,20 @@ class HierarchicalAgent(nn.Module):
     def _prefix_of(self, learner: int) -> str:
         return "low" if len(self.learners) == 1 else f"low/{self.specs.option_names[learner]}"
 
-    def _set_is_uniform(self) -> None:
-        if self.selector is not None:
-            self.selector.is_uniform.fill_(self.frames < self.uniform_option_steps)
+    def _practise(self, batch: TensorDictBase) -> dict[str, float]:
+        """Count what the options of a batch `[*B, T]` have practised; return the probabilities of practice to log."""
+        if self.selector is None or self.practice is None:
+            return {}
+        decisions = finished_decisions(batch)
+        returns = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1)
+        self.practice.add(batch.get(keys.OPTION).flatten(), decisions.get(keys.OPTION), returns)
+        self._set_practice()
+        names = self.selector.specs.option_names
+        return {f"high/practice_{name}": p for name, p in zip(names, self.selector.practice.tolist(), strict=True)}
+
+    def _set_practice(self) -> None:
+        if self.selector is not None and self.practice is not None:
+            self.selector.practice.copy_(self.practice.probabilities(int(self.frames)))
 
     def _seen_by_selector(self, batch: TensorDictBase) -> TensorDictBase:
         return batch if self.pairs is None else self.pairs.with_pairs(batch)

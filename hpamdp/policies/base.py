@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.messages import as_code
-from hpamdp.policies.masks import random_choice
+from hpamdp.policies.masks import sample_index
 from hpamdp.policies.stored_rows import check_stored_rows
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -311,13 +311,17 @@ class Selector(Level, TensorDictModuleBase):
         modes: what the selector can learn from: its own choices (`train`), or a data set of other choices (`offline`).
             A data set lacks keys that a selector adds to `out_keys`, so such a selector usually has `train` alone.
         memory_key: key of the selector's memory of earlier decisions in a step; None if it has no memory.
-        is_uniform: bool scalar, a buffer that the agent sets. It is true for the first `agent.uniform_option_steps`
-            steps of a run. Exploring choices then come from `choose_uniformly`, so that every learner gets data.
+        learns_by_state: whether the selector learns which option suits which state. By default the options of such a
+            selector practise first, see `agent.practice`.
+        practice: with which probability an exploring choice is left to each option to practise, `[num_options]`, a
+            buffer that the agent sets. With the remaining probability the selector chooses.
         pending: how many decisions for each option have not yet reached `learn`, int64 `[num_options]`. The agent sets
             this buffer after every batch. A selector that needs the number within a batch adds its own choices.
     """
 
     asks_learners: ClassVar[bool] = False
+    learns_by_state: ClassVar[bool] = False
+    added_later: ClassVar[tuple[str, ...]] = ("practice",)  # checkpoints of 0.3 have `is_uniform` in its place
     is_bandit: ClassVar[bool] = False
     ends_options: ClassVar[bool] = False
     lengths_refusal: ClassVar[str | None] = None
@@ -325,7 +329,7 @@ class Selector(Level, TensorDictModuleBase):
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     gamma: float = 1.0
     memory_key: str | None = None
-    is_uniform: Tensor
+    practice: Tensor
     pending: Tensor
     option_values: nn.Module
 
@@ -340,7 +344,7 @@ class Selector(Level, TensorDictModuleBase):
             self.in_keys.append(keys.OPTION_MASK)
         self.out_keys = [keys.OPTION]
         self.specs = specs
-        self.register_buffer("is_uniform", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("practice", torch.zeros(specs.num_options, dtype=torch.float32))
         self.register_buffer("pending", torch.zeros(specs.num_options, dtype=torch.long))
 
     def select(self, td: TensorDictBase) -> Tensor:
@@ -382,10 +386,18 @@ class Selector(Level, TensorDictModuleBase):
         """
         return lambda td: self.choose(td)[keys.OPTION]
 
-    def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return a uniformly random choice: a tensor `[*B, ...]` for each of `out_keys`."""
+    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return options that practise, chosen by chance: a tensor `[*B, ...]` for each of `out_keys`."""
+        return {keys.OPTION: sample_index(self.practice_in(td).log())}
+
+    def practice_in(self, td: TensorDictBase) -> Tensor:
+        """Return with which probability each option practises in a step, `[*B, num_options]`, 0 where forbidden."""
+        practice = self.practice.expand(*td.batch_size, -1)
         mask = td.get(keys.OPTION_MASK, None)
-        return {keys.OPTION: random_choice(td.batch_size, self.specs.num_options, mask, self.is_uniform.device)}
+        if mask is None:
+            return practice
+        allowed = practice.clamp(min=1e-9) * mask  # of options that may all have no practice, one is drawn
+        return allowed * (practice.sum(-1, keepdim=True) / allowed.sum(-1, keepdim=True))
 
     def ends(self, td: TensorDictBase) -> Tensor:
         """Return whether the held `option` of `td` ends in each environment, bool `[*B]`.
@@ -490,14 +502,27 @@ class Selector(Level, TensorDictModuleBase):
                 td.set((keys.HELD, key), value)
         if not nothing_held and not is_decision.any():
             return td
-        explores_uniformly = bool(self.is_uniform) and not is_greedy()
-        fresh = self.choose_uniformly(td) if explores_uniformly else self.choose(td)
-        for key, value in fresh.items():
+        for key, value in self._choose_or_practise(td).items():
             if self.decides_ends and nothing_held:
                 td.set((keys.HELD, key), value)
-            is_fresh = is_decision.reshape(*is_decision.shape, *[1] * (value.ndim - is_decision.ndim))
-            td.set(key, value if nothing_held else torch.where(is_fresh, value, held[key]))
+            td.set(key, value if nothing_held else _where(is_decision, value, held[key]))
         return td
+
+    def _choose_or_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return what `choose` does, or `choose_to_practise` with the probability of practice if exploring."""
+        probability = float(self.practice.sum())
+        if is_greedy() or probability == 0.0:
+            return self.choose(td)
+        practising = self.choose_to_practise(td)
+        if probability > 0.999:  # a sum of rounded numbers
+            return practising
+        practises = torch.rand(td.batch_size, device=self.practice.device, dtype=torch.float32) < probability
+        return {key: _where(practises, practising[key], value) for key, value in self.choose(td).items()}
+
+
+def _where(rows: Tensor, value: Tensor, other: Tensor) -> Tensor:
+    """Return `value` `[*B, ...]` in the rows that are true, bool `[*B]`, and `other` elsewhere."""
+    return torch.where(rows.reshape(*rows.shape, *[1] * (value.ndim - rows.ndim)), value, other)
 
 
 class Learner(Level, nn.Module):

@@ -26,8 +26,9 @@ from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.messages import first_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.policies.base import Learner
+from hpamdp.policies.base import Learner, Selector
 from hpamdp.policies.option_lengths import DEFAULT_LENGTHS
+from hpamdp.policies.practice import CurvePractice, UniformPractice
 from hpamdp.run import capacity, checkpoint, compatibility
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.specs import PAMDPSpecs
@@ -246,7 +247,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         specs,
         is_shared=is_shared,
         is_frozen=config.run.low.freeze,
-        uniform_option_steps=config.run.agent.uniform_option_steps,
+        practice=_practice(config, selector),
         selector_ends_options=config.run.agent.termination == "learned" and selector is not None,
         option_lengths=lengths,
         explorations=explorations,
@@ -255,6 +256,22 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     agent.values_end_with_trips = values_end == "trip"
     agent.selector_values_end_with_trips = (of_selector or values_end) == "trip"
     return agent.to(device)
+
+
+def _practice(config: Config, selector: Selector | None) -> UniformPractice | CurvePractice | None:
+    """Return which options practise, see `AgentConfig.practice`."""
+    run = config.run
+    practice = run.agent.practice
+    if practice == "auto":
+        practises = selector is not None and selector.learns_by_state and not run.low.freeze
+        lasts = run.agent.termination == "episode" and not compatibility.has_trips(config)
+        practice = "curves" if practises and lasts and run.agent.sharing == "per_option" else 0
+    if selector is None or practice == 0:
+        return None
+    num_options = selector.specs.num_options
+    return (
+        CurvePractice(num_options, run.num_frames) if practice == "curves" else UniformPractice(num_options, practice)
+    )
 
 
 def make_agent_of_run(config: Config, specs: PAMDPSpecs, device: torch.device) -> HierarchicalAgent:

@@ -47,7 +47,7 @@ _OF_STEPS = (
     "collector",
     "eval.every",
     "low.budget",
-    "agent.uniform_option_steps",
+    "agent.practice",
 )
 _OF_LEARNING = ("offline", "data", "log_every", "callbacks", "save_best", "compile_updates", "update_precision")
 _OF_AGENTS_LEARNING = ("agent.values_end", "agent.selector_values_end", "low.freeze", "exploration")
@@ -150,7 +150,7 @@ def check_effects_on(problem: ProblemFacts, config: Config, words: Sequence[str]
     is_low_unused = agent.sharing == "per_option" and with_acting_learners(config, problem) is not config
     for name, word in _words_by_setting(words).items():
         why = None
-        if name == "agent.uniform_option_steps" and agent.uniform_option_steps:
+        if name == "agent.practice" and agent.practice not in ("auto", 0):
             if not has_choice:
                 why = f"{config.env} has no options to choose"
             elif config.high.name == "uniform":

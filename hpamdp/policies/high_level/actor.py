@@ -68,6 +68,7 @@ class Actor(OnPolicy, RemembersDecisions):
 
     Options = ActorOptions
     takes_pictures = True
+    learns_by_state = True
     modes: ClassVar[tuple[str, ...]] = ("train",)
 
     def __init__(
@@ -98,18 +99,22 @@ class Actor(OnPolicy, RemembersDecisions):
         log_probs = self._log_probs(td)
         option = log_probs.argmax(-1) if is_greedy() else sample_index(log_probs)
         log_prob = log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)
-        chosen = {keys.OPTION: option, LOG_PROB: log_prob, WEIGHT: torch.ones_like(log_prob)}
+        chosen = {keys.OPTION: option, LOG_PROB: log_prob, WEIGHT: self._weight(td, log_probs, option)}
         return {**chosen, **self._allowed(td), **self.remembered(td)}
 
     @torch.no_grad()
-    def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return uniformly random options, the policy's log-probabilities and the weights, `[*B]` each."""
-        chosen = super().choose_uniformly(td)
-        log_probs = self._log_probs(td)
-        log_prob = log_probs.gather(-1, chosen[keys.OPTION].unsqueeze(-1)).squeeze(-1)
-        mask = td.get(keys.OPTION_MASK, None)
-        num_allowed = self.specs.num_options if mask is None else mask.sum(-1)
-        return {**chosen, LOG_PROB: log_prob, WEIGHT: log_prob.exp() * num_allowed, **self._allowed(td)}
+    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return options that practise, the policy's log-probabilities and the weights, `[*B]` each."""
+        chosen = super().choose_to_practise(td)
+        option, log_probs = chosen[keys.OPTION], self._log_probs(td)
+        log_prob = log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)
+        return {**chosen, LOG_PROB: log_prob, WEIGHT: self._weight(td, log_probs, option), **self._allowed(td)}
+
+    def _weight(self, td: TensorDictBase, log_probs: Tensor, option: Tensor) -> Tensor:
+        """Return an option's probability under the policy over that of policy and practice together, `[*B]`."""
+        practice, policy = self.practice_in(td), log_probs.exp()
+        of_both = (1.0 - practice.sum(-1, keepdim=True)) * policy + practice
+        return (policy / of_both).gather(-1, option.unsqueeze(-1)).squeeze(-1)
 
     @torch.no_grad()
     def option_probabilities(self, td: TensorDictBase) -> Tensor:

@@ -84,21 +84,23 @@ class Exp3(Bandit):
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return options and their probabilities, `[*B]` each."""
         option = self.select(td)
-        probabilities = self.probabilities.float()
-        mask = td.get(keys.OPTION_MASK, None)
-        allowed = 1.0 if mask is None else (probabilities * mask).sum(-1)
-        return {keys.OPTION: option, PROBABILITY: probabilities[option] / allowed}
+        return {keys.OPTION: option, PROBABILITY: self._probability(td, option)}
 
-    def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return uniformly random options and their probabilities, `[*B]` each."""
-        chosen = super().choose_uniformly(td)
+    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return options that practise, and their probabilities, `[*B]` each."""
+        chosen = super().choose_to_practise(td)
+        return {**chosen, PROBABILITY: self._probability(td, chosen[keys.OPTION])}
+
+    def _probability(self, td: TensorDictBase, option: Tensor) -> Tensor:
+        """Return the probability `[*B]` with which a step's option practises or is chosen."""
+        own = self.probabilities.float().expand(*option.shape, -1)
         mask = td.get(keys.OPTION_MASK, None)
-        if mask is None:
-            uniform = 1.0 / self.specs.num_options
-            chosen[PROBABILITY] = torch.full_like(chosen[keys.OPTION], uniform, dtype=torch.float32)
-        else:
-            chosen[PROBABILITY] = 1.0 / mask.sum(-1)
-        return chosen
+        if mask is not None:
+            own = own * mask
+        own = own / own.sum(-1, keepdim=True)
+        practice = self.practice_in(td)
+        of_all = (1.0 - practice.sum(-1, keepdim=True)) * own + practice
+        return of_all.gather(-1, option.unsqueeze(-1)).squeeze(-1)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add the importance-weighted rewards of finished decisions to the gains.

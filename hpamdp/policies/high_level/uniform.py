@@ -26,5 +26,5 @@ class Uniform(Selector):
         """Return the probabilities of the options, `[*B, num_options]`: the same for all allowed ones."""
         mask = td.get(keys.OPTION_MASK, None)
         if mask is None:
-            mask = torch.ones(*td.batch_size, self.specs.num_options, dtype=torch.bool, device=self.is_uniform.device)
+            mask = torch.ones(*td.batch_size, self.specs.num_options, dtype=torch.bool, device=self.practice.device)
         return mask / mask.sum(-1, keepdim=True)

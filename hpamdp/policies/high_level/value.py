@@ -56,6 +56,7 @@ class Value(Selector):
     Options = ValueOptions
     learners_memory_key: str | None = None
     asks_learners = True
+    learns_by_state = True
     takes_pictures = True
 
     def __init__(self, specs: PAMDPSpecs, options: ValueOptions | None = None, **settings: Any) -> None:
@@ -92,9 +93,9 @@ class Value(Selector):
         option = torch.where(is_open.any(-1), is_open.long().argmax(-1), self._best(td, ~is_open.any(-1)))
         return {keys.OPTION: option, SESSION_TRIED: tried}
 
-    def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return uniformly random options `[*B]` and, with `untried_first`, what the session has tried before them."""
-        chosen = super().choose_uniformly(td)
+    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return options `[*B]` that practise and, with `untried_first`, what the session has tried before them."""
+        chosen = super().choose_to_practise(td)
         return {**chosen, SESSION_TRIED: self._tried(td)} if self.options.untried_first else chosen
 
     def _tried(self, td: TensorDictBase) -> Tensor:

@@ -67,9 +67,9 @@ class RemembersDecisions(Selector):
         """Return the option of `select`, and the state of the memory."""
         return {**super().choose(td), **self.remembered(td)}
 
-    def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return a uniformly random option, and the state of the memory."""
-        return {**super().choose_uniformly(td), **self.remembered(td)}
+    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return an option that practises, and the state of the memory."""
+        return {**super().choose_to_practise(td), **self.remembered(td)}
 
     def seen(self, td: TensorDictBase) -> Tensor:
         """Return what the networks see of a decision in a step `[*B]`, `[*B, perception.specs.observation_dim]`."""

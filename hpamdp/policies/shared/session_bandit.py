@@ -86,9 +86,9 @@ class SessionBandit(Bandit):
         values = masked_values(self.session_values(SessionRewards(rewards)), td.get(keys.OPTION_MASK, None))
         return {keys.OPTION: values.argmax(-1), SESSION_REWARDS: rewards}
 
-    def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return uniformly random options `[*B]` and, with `memory=session`, the rewards of the session so far."""
-        chosen = super().choose_uniformly(td)
+    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return options `[*B]` that practise and, with `memory=session`, the rewards of the session so far."""
+        chosen = super().choose_to_practise(td)
         return chosen if self.memory_key is None else {**chosen, SESSION_REWARDS: self._rewards(td)}
 
     def _rewards(self, td: TensorDictBase) -> Tensor:

@@ -1,0 +1,144 @@
+"""Which option practises while its learner still improves. Whom to trust is the selector's question, not this one.
+
+A selector sees the returns of learners that improve with practice. It settles on the option whose learner improves
+first, and the others never practise enough to show what they can do. So another rule decides who practises: for most of
+the run, the option whose return would gain most if all the practice that is left went to it. The gain is read off a
+curve that is fitted to the option's returns over its own practice. In the last fifth of the run the selector takes
+over, so that learners practise where they will be used.
+
+Sources: Heidari, Kearns and Roth 2016, *Tight Policy Regret Bounds for Improving and Decaying Bandits*, and Metelli,
+Trovo, Pirola and Restelli 2022, *Stochastic Rising Bandits*: options whose reward rises with their own pulls, compared
+by the reward that they would reach by the horizon.
+
+Differs from the sources:
+- what counts is the final greedy agent, not the regret on the way, so the option that gains most practises, not the one
+  that will have the highest return;
+- curves are exponentials, not lines through the last returns. Lines promise more the noisier the returns are;
+- the selector sees the state, so one option can be the best in some states and another one elsewhere.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+NUM_BINS = 100
+"""Bins of an option's own practice: each is this fraction of the run."""
+FIRST_BINS = 4
+"""Bins that every option fills first, before any curve is fitted."""
+UNIFORM = 0.25
+"""Part of the practice that is uniform. It finds options that begin to improve late."""
+TAKEOVER = 0.8
+"""Fraction of the run after which choices by the selector begin to replace practice."""
+
+
+class UniformPractice(nn.Module):
+    """All options practise equally for the first steps of a run.
+
+    Args:
+        num_options: number of options.
+        steps: for how many steps; of decisions, if the learners are frozen.
+    """
+
+    def __init__(self, num_options: int, steps: int) -> None:
+        super().__init__()
+        self.num_options = num_options
+        self.steps = steps
+
+    def probabilities(self, frames: int) -> Tensor:
+        """Return the probability `[num_options]` with which each option practises after so many steps of the run."""
+        return torch.full((self.num_options,), float(frames < self.steps) / self.num_options)
+
+    def add(self, options: Tensor, decided: Tensor, returns: Tensor) -> None:
+        """Ignore what the options have done."""
+
+
+class CurvePractice(nn.Module):
+    """The option whose fitted curve promises the largest gain practises most.
+
+    Args:
+        num_options: number of options.
+        total: length of the run in steps.
+
+    Attributes:
+        own: steps that each option has practised, float64 `[num_options]`.
+        width: steps in a bin.
+        counts, sums, squares: of the returns in each bin of an option's own practice, float64
+            `[num_options, NUM_BINS]`.
+    """
+
+    added_later = ("own", "width", "counts", "sums", "squares")  # checkpoints of 0.3 lack them
+    own: Tensor
+    width: Tensor
+    counts: Tensor
+    sums: Tensor
+    squares: Tensor
+
+    def __init__(self, num_options: int, total: int) -> None:
+        super().__init__()
+        self.total = total
+        self.register_buffer("own", torch.zeros(num_options, dtype=torch.float64))
+        self.register_buffer("width", torch.tensor(total / NUM_BINS, dtype=torch.float64))
+        for name in ("counts", "sums", "squares"):
+            self.register_buffer(name, torch.zeros(num_options, NUM_BINS, dtype=torch.float64))
+
+    def add(self, options: Tensor, decided: Tensor, returns: Tensor) -> None:
+        """Count practice and returns.
+
+        Args:
+            options: the option of each step, int64 `[N]`.
+            decided: the option of each decision that has ended, int64 `[M]`.
+            returns: its return, `[M]`.
+        """
+        returns = returns.double()
+        place = decided * NUM_BINS + self._bin()[decided]
+        for name, values in (("counts", torch.ones_like(returns)), ("sums", returns), ("squares", returns.square())):
+            getattr(self, name).view(-1).index_add_(0, place, values)
+        self.own += torch.bincount(options, minlength=len(self.own))
+
+    def probabilities(self, frames: int) -> Tensor:
+        """Return the probability `[num_options]` with which each option practises after so many steps of the run.
+
+        They sum to 1 until the selector begins to take over.
+        """
+        progress = min(1.0, frames / self.total)
+        practice = min(1.0, (1.0 - progress) / (1.0 - TAKEOVER))
+        num_options = len(self.own)
+        if (self._bin() < FIRST_BINS).any():
+            is_first = self.own == self.own.min()
+            return practice * is_first.float() / is_first.sum()
+        gain = self.gains(max(0, self.total - frames))
+        is_best = gain == gain.max()
+        shares = UNIFORM / num_options + (1.0 - UNIFORM) * is_best / is_best.sum()
+        return (practice * shares).float()
+
+    def gains(self, steps: int) -> Tensor:
+        """Return by how much each option's return would rise with so many more steps of practice, `[num_options]`.
+
+        A curve is a + b exp(-n / tau) over the own practice n, with b <= 0. For each tau of a grid the least squares
+        fit of the bins' means has a closed form. The gain is the mean over tau, weighted by the likelihood.
+        """
+        tau = self.width * NUM_BINS * torch.logspace(-2.0, 0.5, 16, dtype=torch.float64, device=self.own.device)
+        middle = (torch.arange(NUM_BINS, device=self.own.device) + 0.5) * self.width
+        shape = torch.exp(-middle / tau.unsqueeze(-1))  # [16, NUM_BINS]
+        counts = self.counts.unsqueeze(1)  # [num_options, 1, NUM_BINS]
+        total = counts.sum(-1, keepdim=True).clamp(min=1.0)
+        mean = (self.sums / self.counts.clamp(min=1.0)).unsqueeze(1)
+        mean = mean - (counts * mean).sum(-1, keepdim=True) / total
+        shape = shape - (counts * shape).sum(-1, keepdim=True) / total
+        covariance = (counts * shape * mean).sum(-1)
+        variance = (counts * shape.square()).sum(-1)
+        b = (covariance / variance.clamp(min=1e-9)).clamp(max=0.0)
+        error = -2.0 * b * covariance + b.square() * variance
+        likelihood = (-0.5 * error / self._noise()).softmax(-1)  # [num_options, 16]
+        now = self.own.unsqueeze(-1)
+        return (likelihood * b * (torch.exp(-(now + steps) / tau) - torch.exp(-now / tau))).sum(-1)
+
+    def _bin(self) -> Tensor:
+        """Return the bin `[num_options]` that each option's next return belongs to."""
+        return (self.own / self.width).long().clamp(max=NUM_BINS - 1)
+
+    def _noise(self) -> Tensor:
+        """Return the variance of the returns within a bin, a scalar."""
+        within = self.squares - self.sums.square() / self.counts.clamp(min=1.0)
+        return within.sum().clamp(min=1e-6) / (self.counts - 1.0).clamp(min=0.0).sum().clamp(min=1.0)
