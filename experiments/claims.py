@@ -528,9 +528,9 @@ def hierarchy() -> list[Claim]:
             "{people:.3f}, and the ceiling of the same episodes is {ceiling:.3f}.",
             meta_critic,
         ),
-        Claim(RESULTS, f"| `high=actor low=hppo agent.uniform_option_steps=1000000` | {line}", actor),
+        Claim(RESULTS, f"| `high=actor low=hppo agent.practice=1000000` | {line}", actor),
         Claim(RESULTS, f"| `high=meta_critic low=hppo` | {line}", meta_critic),
-        Claim(RESULTS, f"| `high=linucb low=hppo agent.uniform_option_steps=1000000` | {line}", linucb_uniform),
+        Claim(RESULTS, f"| `high=linucb low=hppo agent.practice=1000000` | {line}", linucb_uniform),
         Claim(RESULTS, f"| `high=linucb low=hppo` | {line}", linucb),
         Claim(
             RESULTS,

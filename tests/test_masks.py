@@ -73,7 +73,7 @@ def play_and_learn(env: DecisionEnv, agent: HierarchicalAgent, num_batches: int)
     td = env.reset()
     for i in range(num_batches):
         if agent.selector is not None:
-            agent.selector.is_uniform.fill_(i == 0)
+            agent.selector.practice.fill_(float(i == 0) / agent.selector.specs.num_options)
         with torch.no_grad():
             batch = env.rollout(12, agent.policy, break_when_any_done=False, auto_reset=False, tensordict=td)
         td = env.step_mdp(batch[:, -1])

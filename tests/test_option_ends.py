@@ -269,7 +269,7 @@ def test_options_end_with_the_initial_probability_as_often_as_they_are_random():
         return [is_ended[0::2].mean().item(), is_ended[1::2].mean().item()]
 
     assert shares() == pytest.approx([0.2 * 0.3, 0.8 + 0.2 * 0.3], abs=0.04)
-    critic.is_uniform.fill_(True)
+    critic.practice.fill_(0.5)
     assert shares() == pytest.approx([0.3, 0.3], abs=0.04)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert shares() == [0.0, 1.0]
@@ -288,7 +288,7 @@ def test_the_meta_critic_ends_the_best_option_too_as_often_as_it_chooses_at_rand
         return [is_ended[0::2].mean().item(), is_ended[1::2].mean().item()]
 
     assert shares() == pytest.approx([0.2, 1.0], abs=0.04)
-    critic.is_uniform.fill_(True)
+    critic.practice.fill_(0.5)
     assert shares() == [1.0, 1.0]
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert shares() == [0.0, 1.0]

@@ -151,11 +151,14 @@ def test_learners_see_the_options_and_never_the_pairs():
 
 @pytest.mark.parametrize("high", ["meta_critic", "actor"])
 def test_lengths_that_leave_no_choice_give_the_run_of_options_of_that_length(high, tmp_path):
-    words = words_of(high, "hppo", "agent.uniform_option_steps=128")
+    words = words_of(high, "hppo", "agent.practice=128")
     fixed = [*words, "agent.termination=steps", "agent.option_lengths=null", "agent.option_length=3"]
     assert run(compose_config([*words, "agent.option_lengths=[3]"]), tmp_path / "chosen") == 0
     assert run(compose_config(fixed), tmp_path / "steps") == 0
     chosen, steps = rows_of(tmp_path / "chosen"), rows_of(tmp_path / "steps")
+    for row in (*chosen, *steps):
+        for name in [name for name in row if name.startswith("high/practice_")]:  # of pairs, and of options
+            del row[name]
     lengths = [{name: row.pop(name) for name in ("eval/option_length", "high/length")} for row in chosen]
     assert chosen == steps
     assert {each["eval/option_length"] for each in lengths} == {"", "3.0"}
@@ -266,7 +269,7 @@ def test_a_forbidden_option_is_chosen_with_no_length(kind, is_greedy):
 def test_uniform_steps_are_uniform_over_allowed_pairs():
     torch.manual_seed(0)
     agent = steppers(Actor(of_pairs(MASKED)), MASKED)
-    agent.selector.is_uniform.fill_(True)
+    agent.selector.practice.fill_(1.0 / agent.selector.specs.num_options)
     td = agent.policy[0](masked(12_000))
     for rows, num in ((td[::2], 6), (td[1::2], 3)):
         pair = agent.pairs.with_pairs(rows)[keys.OPTION]

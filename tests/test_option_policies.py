@@ -218,20 +218,20 @@ def test_decisions_that_wait_for_an_update_are_part_of_the_state_dict():
 
 def test_uniform_options_are_weighted_by_the_policys_probability_over_the_uniform_one():
     actor = make(Actor)
-    actor.is_uniform.fill_(True)
+    actor.practice.fill_(0.5)
     observation = torch.tensor([[0.5, -0.5]]).expand(20_000, 2)
     td = actor(due(observation))
     probability = actor.logits(observation[0]).softmax(-1).detach()
     assert td[keys.OPTION].float().mean().item() == pytest.approx(0.5, abs=0.015)
     torch.testing.assert_close(td[LOG_PROB], probability.log()[td[keys.OPTION]])
     torch.testing.assert_close(td[WEIGHT], (probability / 0.5)[td[keys.OPTION]])
-    actor.is_uniform.fill_(False)
+    actor.practice.zero_()
     assert (actor(due(observation))[WEIGHT] == 1.0).all()
 
 
 def test_actor_settles_on_the_better_options_while_options_are_chosen_uniformly():
     actor = make(Actor)
-    actor.is_uniform.fill_(True)
+    actor.practice.fill_(0.5)
     play(actor, by_sign, 4000, 50, noise=0.5)
     assert greedy_regret(actor) < 0.2
     observation = torch.tensor([[0.8, 0.0], [-0.8, 0.0]])
@@ -239,11 +239,11 @@ def test_actor_settles_on_the_better_options_while_options_are_chosen_uniformly(
 
 
 def test_the_value_of_the_actor_is_that_of_its_policy_while_options_are_chosen_uniformly():
-    actor = make(Actor, lr=1e-2)
+    actor = make(Actor, seed=2, lr=1e-2)
     with torch.no_grad():
         actor.logits[-1].weight.zero_()
         actor.logits[-1].bias.copy_(torch.tensor([0.0, 2.0]))
-    actor.is_uniform.fill_(True)
+    actor.practice.fill_(0.5)
     actor.surrogate = lambda log_ratio, advantage: 0.0 * log_ratio  # so that the policy stays as it is
     play(actor, lambda observation: torch.tensor([0.0, 1.0]).expand(len(observation), 2), 6000, 100, noise=0.0)
     likely = torch.tensor([0.0, 2.0]).softmax(-1)[1].item()

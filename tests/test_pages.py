@@ -207,7 +207,7 @@ def run(words: list[str]) -> None:
 def test_the_pages_explain_every_scalar_that_is_logged(low, tmp_path):
     high = SELECTORS[sorted(TRAINED).index(low) % len(SELECTORS)]
     words = [f"low={low}", f"high={high}", "num_envs=16", "steps_per_batch=4", "total_frames=1024", "log_every=64"]
-    words += ["eval.every=0", "eval.layouts=4", f"hydra.run.dir={tmp_path}", "agent.uniform_option_steps=1024"]
+    words += ["eval.every=0", "eval.layouts=4", f"hydra.run.dir={tmp_path}", "agent.practice=1024"]
     words += ["env=rooms", "agent.termination=learned"] if high == "option_critic" else []
     settings = make_config([f"low={low}"]).low.settings
     words += [f"low.{name}={value}" for name, value in FEW.items() if name in settings]

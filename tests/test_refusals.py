@@ -470,8 +470,8 @@ BOTH_OPTIONS = "+low.per_option={run: random, jump: random}"
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ("high=none low=hppo agent.uniform_option_steps=10", "env=platform has no options to choose"),
-        ("high=uniform +env.grouping=default low=hppo agent.uniform_option_steps=10", "high=uniform chooses uniformly"),
+        ("high=none low=hppo agent.practice=10", "env=platform has no options to choose"),
+        ("high=uniform +env.grouping=default low=hppo agent.practice=10", "high=uniform chooses uniformly"),
         ("high=none low=hppo agent.sharing=shared", "env=platform has no options to choose"),
         (f"high=ucb +env.grouping=default low=hppo {BOTH_OPTIONS} low.lr=0.5", "low.per_option names a learner for"),
         ("high=none low=hppo total_frames=64 low.budget.total_frames=32", "beside total_frames=64"),
@@ -494,8 +494,8 @@ def test_python_refuses_what_has_no_effect_on_an_environment_of_others():
 @pytest.mark.parametrize(
     "words",
     [
-        "high=none low=hppo agent.uniform_option_steps=0 agent.sharing=per_option",
-        "high=ucb +env.grouping=default low=hppo agent.uniform_option_steps=10 low.minibatch_size=16",
+        "high=none low=hppo agent.practice=0 agent.sharing=per_option",
+        "high=ucb +env.grouping=default low=hppo agent.practice=10 low.minibatch_size=16",
         f"high=ucb +env.grouping=default low=hppo low.freeze=false {BOTH_OPTIONS}",
     ],
 )

@@ -242,22 +242,22 @@ def test_the_random_agent_has_no_selector_where_there_are_no_options():
 @pytest.mark.parametrize(
     "high", [high for high in choices("high") if high not in ("none", "oracle", "human", "uniform")]
 )
-def test_exploring_choices_are_uniform_for_uniform_option_steps_and_greedy_ones_never(high):
+def test_exploring_choices_are_uniform_for_the_first_steps_and_greedy_ones_never(high):
     low = "hppo" if high == "value" else "random"
-    words = [f"high={high}", f"low={low}", "num_envs=400", "eval.layouts=4", "agent.uniform_option_steps=800"]
+    words = [f"high={high}", f"low={low}", "num_envs=400", "eval.layouts=4", "agent.practice=800"]
     words += ["high.warmup_decisions=0"] if high == "meta_critic" else []
     parts = assemble(make_config(words))
     torch.manual_seed(0)
     agent = parts.agent
     for _ in range(2):
-        assert agent.selector.is_uniform
+        assert agent.selector.practice.tolist() == [0.5, 0.5]
         batch = parts.env.rollout(1, agent.policy)
         assert 0.4 < batch["option"].float().mean() < 0.6
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             td = parts.env.reset()
             assert (agent.selector(td.clone())["option"] == agent.selector.choose(td)["option"]).all()
         agent.learn(batch)
-    assert not agent.selector.is_uniform
+    assert not agent.selector.practice.any()
 
 
 @pytest.mark.parametrize("name", [name for name in choices("high") if name != "none"])

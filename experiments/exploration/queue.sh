@@ -19,7 +19,7 @@ problem[crossing]="hydra.searchpath=[file://$PWD/examples/crossing/conf] env=cro
     high.gamma=0.9 high.hidden_dims=[64] high.lr=3e-3 high.num_members=1 high.epsilon_final=0.02
     high.epsilon_decisions=3000 high.warmup_decisions=200 high.buffer_size=3000 high.batch_size=128
     high.updates_per_decision=0.1 high.tau=0.05 agent.termination=steps agent.option_length=3
-    agent.uniform_option_steps=15000 low.gamma=0.9 low.hidden_dims=[64] num_envs=64 total_frames=30000 eval.every=5000
+    agent.practice=15000 low.gamma=0.9 low.hidden_dims=[64] num_envs=64 total_frames=30000 eval.every=5000
     eval.layouts=200"
 # The reward of a bonus of 1.
 weight=([pinball]=50 [office]=50 [platform]=0.02 [crossing]=0.01)

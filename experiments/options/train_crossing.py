@@ -41,7 +41,7 @@ COMMON = [
     "num_envs=64",
     "steps_per_batch=4",
     "total_frames=30000",
-    "agent.uniform_option_steps=15000",
+    "agent.practice=15000",
     "eval.layouts=200",
     "eval.every=0",
     "log_every=0",
@@ -94,7 +94,7 @@ LEARNERS = {
     ],
     "pets": [
         "total_frames=16000",
-        "agent.uniform_option_steps=8000",
+        "agent.practice=8000",
         "low.warmup_steps=500",
         "low.updates_per_step=0.3",
         "low.end_value_lr=3e-3",
@@ -102,7 +102,7 @@ LEARNERS = {
     ],
     "qpamdp": [
         "total_frames=300000",
-        "agent.uniform_option_steps=150000",
+        "agent.practice=150000",
         "steps_per_batch=16",
         "low.features=null",
         "low.phi_order=1",

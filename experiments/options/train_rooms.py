@@ -87,7 +87,7 @@ SELECTORS = {
 REPLAY = [
     "num_envs=256",
     "total_frames=200000",
-    "agent.uniform_option_steps=120000",
+    "agent.practice=120000",
     "low.hidden_dims=[64,64]",
 ]
 # Plans have one step. The value of the last state covers the rest, and distinguishes lengths of steps more clearly.
@@ -104,14 +104,14 @@ LEARNERS = {
     # Small batches, for many updates of a policy that must cross the rooms before it finds a reward.
     "hppo": [
         "total_frames=160000",
-        "agent.uniform_option_steps=80000",
+        "agent.practice=80000",
         "num_envs=64",
         "steps_per_batch=16",
         "low.minibatch_size=256",
     ],
     "pdqn": [
         *REPLAY,
-        "agent.uniform_option_steps=100000",
+        "agent.practice=100000",
         "low.warmup_steps=2000",
         "low.updates_per_step=0.05",
         "low.actor_tau=0.05",
@@ -153,7 +153,7 @@ LEARNERS = {
     "dlpa": [
         "num_envs=64",
         "total_frames=100000",
-        "agent.uniform_option_steps=60000",
+        "agent.practice=60000",
         "low.hidden_dims=[64,64]",
         "low.warmup_steps=15000",
         "low.updates_per_step=0.1",
@@ -162,7 +162,7 @@ LEARNERS = {
     # As for PADDPG, but more random steps, for models that learn from few arrivals.
     "pets": [
         "total_frames=140000",
-        "agent.uniform_option_steps=110000",
+        "agent.practice=110000",
         "num_envs=64",
         "steps_per_batch=4",
         "low.warmup_steps=40000",
@@ -175,7 +175,7 @@ LEARNERS = {
     # Features of two entries each: with one-hot vectors, this gives each cell a value. Episodes are options.
     "qpamdp": [
         "total_frames=800000",
-        "agent.uniform_option_steps=400000",
+        "agent.practice=400000",
         "num_envs=64",
         "steps_per_batch=16",
         "low.features=null",

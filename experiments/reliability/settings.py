@@ -66,7 +66,7 @@ BY_HAND = [
     "collector=multi num_envs=5",
     "collector=multi collector.num_workers=0", "collector=multi collector.num_workers=100000", "logger=wnadb",
     "logger=wandb logger.project='a/b#c'", "logger=wandb logger.mode=sometimes", "agent.option_length=0",
-    "agent.termination=never", "agent.sharing=none", "agent.uniform_option_steps=-1", "eval.seed=-1",
+    "agent.termination=never", "agent.sharing=none", "agent.practice=-1", "eval.seed=-1",
     "eval.seed=banana", "eval.stop_score=banana", "eval.layouts=0", "eval.every=-1", "log_every=0",
     "checkpoint_minutes=-1", "checkpoint_every=-1", "seed=1.5", "seed=-1", "env=gymnasium high=none low=random",
     "env=gymnasium env.id=CartPole-v1 high=none low=random", "env=gymnasium env.id=Nothing-v0 high=none low=random",

@@ -26,10 +26,15 @@ NUM_BINS = 100
 """Bins of an option's own practice: each is this fraction of the run."""
 FIRST_BINS = 4
 """Bins that every option fills first, before any curve is fitted."""
-UNIFORM = 0.25
-"""Part of the practice that is uniform. It finds options that begin to improve late."""
+UNIFORM_UNTIL = 0.5
+"""Uniform practice falls from all decisions to none at this fraction of the run, but not below `LATE_UNIFORM`."""
+LATE_UNIFORM = 0.25
+"""Part of the decisions that stay uniform practice. They find options that begin to improve late."""
 TAKEOVER = 0.8
-"""Fraction of the run after which choices by the selector begin to replace practice."""
+"""Fraction of the run after which this part falls to 0."""
+CLEAR_ADVANTAGE = 0.4
+"""The option with the largest gain gets all other decisions, too, if its gain is above the smallest one by this many
+standard deviations of a return."""
 
 
 class UniformPractice(nn.Module):
@@ -99,18 +104,19 @@ class CurvePractice(nn.Module):
     def probabilities(self, frames: int) -> Tensor:
         """Return the probability `[num_options]` with which each option practises after so many steps of the run.
 
-        They sum to 1 until the selector begins to take over.
+        With the remaining probability the selector chooses.
         """
         progress = min(1.0, frames / self.total)
-        practice = min(1.0, (1.0 - progress) / (1.0 - TAKEOVER))
         num_options = len(self.own)
         if (self._bin() < FIRST_BINS).any():
             is_first = self.own == self.own.min()
-            return practice * is_first.float() / is_first.sum()
+            return is_first.float() / is_first.sum()
+        uniform = max(1.0 - progress / UNIFORM_UNTIL, LATE_UNIFORM * min(1.0, (1.0 - progress) / (1.0 - TAKEOVER)))
         gain = self.gains(max(0, self.total - frames))
         is_best = gain == gain.max()
-        shares = UNIFORM / num_options + (1.0 - UNIFORM) * is_best / is_best.sum()
-        return (practice * shares).float()
+        advantage = (gain.max() - gain.min()) / (CLEAR_ADVANTAGE * self._noise().sqrt())
+        of_best = (1.0 - uniform) * advantage.clamp(max=1.0) * is_best / is_best.sum()
+        return (uniform / num_options + of_best).float()
 
     def gains(self, steps: int) -> Tensor:
         """Return by how much each option's return would rise with so many more steps of practice, `[num_options]`.
