@@ -1,10 +1,12 @@
 """Which option practises while its learner still improves. Whom to trust is the selector's question, not this one.
 
 A selector sees the returns of learners that improve with practice. It settles on the option whose learner improves
-first, and the others never practise enough to show what they can do. So another rule decides who practises: for most of
-the run, the option whose return would gain most if all the practice that is left went to it. The gain is read off a
-curve that is fitted to the option's returns over its own practice. In the last fifth of the run the selector takes
-over, so that learners practise where they will be used.
+first, and the others never practise enough to show what they can do. So another rule decides who practises:
+
+- At first all options practise equally. This part of the decisions falls to a tenth, and to 0 at the end.
+- A curve is fitted to the returns of each option over its own practice. If an option behind the best one would gain
+  more from the practice that is left, it overrules the selector: the more it gains, the more often.
+- Otherwise the selector chooses, so that learners practise where they will be used.
 
 Sources: Heidari, Kearns and Roth 2016, *Tight Policy Regret Bounds for Improving and Decaying Bandits*, and Metelli,
 Trovo, Pirola and Restelli 2022, *Stochastic Rising Bandits*: options whose reward rises with their own pulls, compared
@@ -26,15 +28,14 @@ NUM_BINS = 100
 """Bins of an option's own practice: each is this fraction of the run."""
 FIRST_BINS = 4
 """Bins that every option fills first, before any curve is fitted."""
-UNIFORM_UNTIL = 0.5
+UNIFORM_UNTIL = 0.3
 """Uniform practice falls from all decisions to none at this fraction of the run, but not below `LATE_UNIFORM`."""
-LATE_UNIFORM = 0.25
-"""Part of the decisions that stay uniform practice. They find options that begin to improve late."""
+LATE_UNIFORM = 0.1
+"""Fraction of the decisions that stay uniform practice. They find options that begin to improve late."""
 TAKEOVER = 0.8
 """Fraction of the run after which this part falls to 0."""
 CLEAR_ADVANTAGE = 0.4
-"""The option with the largest gain gets all other decisions, too, if its gain is above the smallest one by this many
-standard deviations of a return."""
+"""Difference of gains, in standard deviations of a return, from which the option behind gets all decisions."""
 
 
 class UniformPractice(nn.Module):
@@ -112,33 +113,34 @@ class CurvePractice(nn.Module):
             is_first = self.own == self.own.min()
             return is_first.float() / is_first.sum()
         uniform = max(1.0 - progress / UNIFORM_UNTIL, LATE_UNIFORM * min(1.0, (1.0 - progress) / (1.0 - TAKEOVER)))
-        gain = self.gains(max(0, self.total - frames))
+        level, gain = self.curves(max(0, self.total - frames))
         is_best = gain == gain.max()
-        advantage = (gain.max() - gain.min()) / (CLEAR_ADVANTAGE * self._noise().sqrt())
+        advantage = (gain.max() - gain[level.argmax()]) / (CLEAR_ADVANTAGE * self._noise().sqrt())
         of_best = (1.0 - uniform) * advantage.clamp(max=1.0) * is_best / is_best.sum()
         return (uniform / num_options + of_best).float()
 
-    def gains(self, steps: int) -> Tensor:
-        """Return by how much each option's return would rise with so many more steps of practice, `[num_options]`.
+    def curves(self, steps: int) -> tuple[Tensor, Tensor]:
+        """Return each option's return now, and by how much so many more steps of practice would raise it.
 
-        A curve is a + b exp(-n / tau) over the own practice n, with b <= 0. For each tau of a grid the least squares
-        fit of the bins' means has a closed form. The gain is the mean over tau, weighted by the likelihood.
+        Both are `[num_options]`. A curve is a + b exp(-n / tau) over the own practice n, with b <= 0. For each tau of a
+        grid the least squares fit to the bins' means has a closed form. The result is the mean over tau, weighted by
+        the likelihood.
         """
         tau = self.width * NUM_BINS * torch.logspace(-2.0, 0.5, 16, dtype=torch.float64, device=self.own.device)
         middle = (torch.arange(NUM_BINS, device=self.own.device) + 0.5) * self.width
         shape = torch.exp(-middle / tau.unsqueeze(-1))  # [16, NUM_BINS]
-        counts = self.counts.unsqueeze(1)  # [num_options, 1, NUM_BINS]
-        total = counts.sum(-1, keepdim=True).clamp(min=1.0)
-        mean = (self.sums / self.counts.clamp(min=1.0)).unsqueeze(1)
-        mean = mean - (counts * mean).sum(-1, keepdim=True) / total
-        shape = shape - (counts * shape).sum(-1, keepdim=True) / total
-        covariance = (counts * shape * mean).sum(-1)
-        variance = (counts * shape.square()).sum(-1)
+        mean = (self.sums / self.counts.clamp(min=1.0)).unsqueeze(1)  # [num_options, 1, NUM_BINS]
+        weight = (self.counts / self.counts.sum(-1, keepdim=True).clamp(min=1.0)).unsqueeze(1)
+        mean_of_all, shape_of_all = (weight * mean).sum(-1), (weight * shape).sum(-1)  # [num_options, 1 or 16]
+        mean, shape = mean - mean_of_all.unsqueeze(-1), shape - shape_of_all.unsqueeze(-1)
+        covariance, variance = (weight * shape * mean).sum(-1), (weight * shape.square()).sum(-1)
         b = (covariance / variance.clamp(min=1e-9)).clamp(max=0.0)
-        error = -2.0 * b * covariance + b.square() * variance
-        likelihood = (-0.5 * error / self._noise()).softmax(-1)  # [num_options, 16]
-        now = self.own.unsqueeze(-1)
-        return (likelihood * b * (torch.exp(-(now + steps) / tau) - torch.exp(-now / tau))).sum(-1)
+        error = self.counts.sum(-1, keepdim=True) * (b.square() * variance - 2.0 * b * covariance)
+        likelihood = (-0.5 * error / self._noise()).softmax(-1)
+        now = torch.exp(-self.own.unsqueeze(-1) / tau)
+        level = mean_of_all + b * (now - shape_of_all)
+        gain = b * now * torch.expm1(-steps / tau)
+        return (likelihood * level).sum(-1), (likelihood * gain).sum(-1)
 
     def _bin(self) -> Tensor:
         """Return the bin `[num_options]` that each option's next return belongs to."""
