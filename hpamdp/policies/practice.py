@@ -3,10 +3,10 @@
 A selector sees the returns of learners that improve with practice. It settles on the option whose learner improves
 first, and the others never practise enough to show what they can do. So another rule decides who practises:
 
-- At first all options practise equally. This part of the decisions falls to a tenth, and to 0 at the end.
-- A curve is fitted to the returns of each option over its own practice. If an option behind the best one would gain
-  more from the practice that is left, it overrules the selector: the more it gains, the more often.
-- Otherwise the selector chooses, so that learners practise where they will be used.
+- A curve is fitted to the returns of each option over its own practice.
+- In the first half of the run all options practise equally, except those whose curve stays out of reach of the best.
+- In the second half, an option behind the best one overrules the selector if it would gain more from the practice that
+  is left. Otherwise the selector chooses, so that learners practise where they will be used.
 
 Sources: Heidari, Kearns and Roth 2016, *Tight Policy Regret Bounds for Improving and Decaying Bandits*, and Metelli,
 Trovo, Pirola and Restelli 2022, *Stochastic Rising Bandits*: options whose reward rises with their own pulls, compared
@@ -28,14 +28,14 @@ NUM_BINS = 100
 """Bins of an option's own practice: each is this fraction of the run."""
 FIRST_BINS = 4
 """Bins that every option fills first, before any curve is fitted."""
-UNIFORM_UNTIL = 0.3
-"""Uniform practice falls from all decisions to none at this fraction of the run, but not below `LATE_UNIFORM`."""
-LATE_UNIFORM = 0.1
-"""Fraction of the decisions that stay uniform practice. They find options that begin to improve late."""
-TAKEOVER = 0.8
-"""Fraction of the run after which this part falls to 0."""
+UNIFORM_UNTIL = 0.5
+"""Fraction of the run in which all options that could become the best one practise equally."""
+LATE_UNIFORM = 0.05
+"""Fraction of the later decisions that stay uniform practice. They find options that begin to improve late."""
 CLEAR_ADVANTAGE = 0.4
 """Difference of gains, in standard deviations of a return, from which the option behind gets all decisions."""
+OUT_OF_REACH = 2.0
+"""Distance to the best option, in standard deviations of a return, from which an option no longer practises equally."""
 
 
 class UniformPractice(nn.Module):
@@ -107,17 +107,22 @@ class CurvePractice(nn.Module):
 
         With the remaining probability the selector chooses.
         """
-        progress = min(1.0, frames / self.total)
         num_options = len(self.own)
         if (self._bin() < FIRST_BINS).any():
             is_first = self.own == self.own.min()
             return is_first.float() / is_first.sum()
-        uniform = max(1.0 - progress / UNIFORM_UNTIL, LATE_UNIFORM * min(1.0, (1.0 - progress) / (1.0 - TAKEOVER)))
         level, gain = self.curves(max(0, self.total - frames))
+        deviation = self._noise().sqrt()
+        late = torch.full_like(level, LATE_UNIFORM / num_options)
+        if frames < UNIFORM_UNTIL * self.total:
+            is_in_reach = level + gain + OUT_OF_REACH * deviation >= level.max()
+            uniform = late + (1.0 - LATE_UNIFORM) * is_in_reach / is_in_reach.sum()
+        else:
+            uniform = late
         is_best = gain == gain.max()
-        advantage = (gain.max() - gain[level.argmax()]) / (CLEAR_ADVANTAGE * self._noise().sqrt())
-        of_best = (1.0 - uniform) * advantage.clamp(max=1.0) * is_best / is_best.sum()
-        return (uniform / num_options + of_best).float()
+        advantage = (gain.max() - gain[level.argmax()]) / (CLEAR_ADVANTAGE * deviation)
+        of_best = (1.0 - uniform.sum()) * advantage.clamp(max=1.0) * is_best / is_best.sum()
+        return (uniform + of_best).float()
 
     def curves(self, steps: int) -> tuple[Tensor, Tensor]:
         """Return each option's return now, and by how much so many more steps of practice would raise it.
