@@ -34,8 +34,8 @@ LATE_UNIFORM = 0.05
 """Fraction of the later decisions that stay uniform practice. They find options that begin to improve late."""
 CLEAR_ADVANTAGE = 0.4
 """Difference of gains, in standard deviations of a return, from which the option behind gets all decisions."""
-OUT_OF_REACH = 2.0
-"""Distance to the best option, in standard deviations of a return, from which an option no longer practises equally."""
+OUT_OF_REACH = 3.0
+"""Distance to the best option, in standard deviations of a return, from which an option need not practise."""
 
 
 class UniformPractice(nn.Module):
@@ -113,12 +113,11 @@ class CurvePractice(nn.Module):
             return is_first.float() / is_first.sum()
         level, gain = self.curves(max(0, self.total - frames))
         deviation = self._noise().sqrt()
-        late = torch.full_like(level, LATE_UNIFORM / num_options)
+        is_in_reach = level + gain + OUT_OF_REACH * deviation >= level.max()
+        gain = torch.where(is_in_reach, gain, 0.0)
+        uniform = torch.full_like(level, LATE_UNIFORM / num_options)
         if frames < UNIFORM_UNTIL * self.total:
-            is_in_reach = level + gain + OUT_OF_REACH * deviation >= level.max()
-            uniform = late + (1.0 - LATE_UNIFORM) * is_in_reach / is_in_reach.sum()
-        else:
-            uniform = late
+            uniform += (1.0 - LATE_UNIFORM) * is_in_reach / is_in_reach.sum()
         is_best = gain == gain.max()
         advantage = (gain.max() - gain[level.argmax()]) / (CLEAR_ADVANTAGE * deviation)
         of_best = (1.0 - uniform.sum()) * advantage.clamp(max=1.0) * is_best / is_best.sum()

@@ -1,0 +1,74 @@
+"""Options practise while their learners improve: by fitted curves, and whatever the selector would choose."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import make_config
+from tensordict import TensorDict
+
+from hpamdp import keys
+from hpamdp.policies.high_level.linucb import LinUCB
+from hpamdp.policies.practice import CurvePractice
+from hpamdp.run.assemble import assemble
+from hpamdp.specs import PAMDPSpecs
+
+TOTAL = 3000
+
+
+def practised(time_constants: list[float], plateaus: list[float], chosen: int) -> np.ndarray:
+    """Return the part of the decisions that each option gets if the selector always chooses one of them.
+
+    An option's return rises from -1 to its plateau with its own practice.
+    """
+    rng = np.random.default_rng(0)
+    tau, plateau = np.array(time_constants), np.array(plateaus)
+    practice = CurvePractice(len(tau), TOTAL)
+    own = np.zeros(len(tau))
+    for done in range(0, TOTAL, 20):
+        p = practice.probabilities(done).double().numpy()
+        left = np.eye(len(tau))[chosen] * (1.0 - p.sum())
+        option = rng.choice(len(tau), 20, p=(p + left) / (p + left).sum())
+        value = -1.0 + (plateau + 1.0) * (1.0 - np.exp(-own / tau))
+        returns = value[option] + rng.normal(0.0, 0.8, 20)
+        practice.add(torch.tensor(option), torch.tensor(option), torch.tensor(returns))
+        own += np.bincount(option, minlength=len(tau))
+    return own / TOTAL
+
+
+def test_an_option_that_improves_slowly_practises_most_though_the_selector_prefers_another_one():
+    assert practised([200.0, 800.0], [3.3, 3.3], chosen=0)[1] > 0.58  # the best split gives it 0.7
+
+
+def test_options_that_have_stopped_improving_leave_the_second_half_to_the_selector():
+    assert practised([50.0, 50.0], [3.3, 3.3], chosen=0)[0] == pytest.approx(0.73, abs=0.03)
+
+
+def test_a_fruitless_option_practises_little():
+    assert practised([100.0, 100.0, 100.0], [3.3, 3.3, -1.0], chosen=0)[2] < 0.1
+
+
+def test_forbidden_options_do_not_practise():
+    selector = LinUCB(PAMDPSpecs(2, ("a", "b", "c"), (1,), (-1.0,), (1.0,), has_option_mask=True))
+    selector.practice.copy_(torch.tensor([0.9, 0.1, 0.0]))
+    mask = torch.tensor([[False, True, True], [False, False, True]]).repeat(500, 1)
+    observation = torch.zeros(1000, selector.specs.observation_dim)
+    is_decision = torch.ones(1000, 1, dtype=torch.bool)
+    td = TensorDict({keys.OBSERVATION: observation, keys.IS_DECISION: is_decision, keys.OPTION_MASK: mask}, [1000])
+    assert selector(td)[keys.OPTION].unflatten(0, (500, 2)).unique(dim=0).tolist() == [[1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("words", "practises"),
+    [
+        ("high=linucb low=hppo", True),
+        ("high=ucb low=hppo", False),
+        ("high=linucb low=hppo agent.practice=0", False),
+        ("high=ucb low=hppo agent.practice=curves", True),
+        ("high=linucb low=hppo agent.sharing=shared", False),
+        ("high=meta_critic low=hppo agent.termination=steps agent.option_length=3 env.switch_cost=0.2", False),
+        ("high=meta_critic low=hppo agent.termination=steps agent.option_length=3 env.switch_cost=0.2 agent.practice=curves", True),
+    ],
+)
+def test_curves_are_the_default_where_a_selector_of_whole_episodes_sees_the_state(words, practises):
+    agent = assemble(make_config([*words.split(), "eval.layouts=4"])).agent
+    assert isinstance(agent.practice, CurvePractice) == practises
