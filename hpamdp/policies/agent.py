@@ -18,7 +18,7 @@ from hpamdp.policies.base import Learner, Level, Selector, finished_decisions
 from hpamdp.policies.exploration.base import Exploration
 from hpamdp.policies.masks import allowed_or_first
 from hpamdp.policies.option_lengths import OptionLengths, PairSelector
-from hpamdp.policies.practice import CurvePractice, UniformPractice
+from hpamdp.policies.practice import Practice
 from hpamdp.specs import PAMDPSpecs
 
 FOR_TRAINING = "explorations."
@@ -403,7 +403,7 @@ class HierarchicalAgent(nn.Module):
         is_shared: whether the single learner observes the option. The learner's specs then count the one-hot option as
             part of the observation.
         is_frozen: whether the learners stay as they are.
-        practice: which options practise, whatever the selector would choose. If None, none does.
+        practice: which options practise, whatever the selector would choose. If None, nobody counts it.
         selector_ends_options: whether the selector decides where options end.
         option_lengths: the lengths that the selector chooses from together with an option, in steps. The selector's
             `specs` then list the pairs as options (`PAMDPSpecs.with_option_lengths`). If empty, it chooses options
@@ -434,7 +434,7 @@ class HierarchicalAgent(nn.Module):
         specs: PAMDPSpecs,
         is_shared: bool = False,
         is_frozen: bool = False,
-        practice: UniformPractice | CurvePractice | None = None,
+        practice: Practice | None = None,
         selector_ends_options: bool = False,
         option_lengths: Sequence[int] = (),
         *,
@@ -661,6 +661,13 @@ class HierarchicalAgent(nn.Module):
         self._set_practice()
         names = self.selector.specs.option_names
         return {f"high/practice_{name}": p for name, p in zip(names, self.selector.practice.tolist(), strict=True)}
+
+    def practised(self) -> dict[str, float]:
+        """Return the fraction of the steps that each choice of the selector has practised, by name."""
+        if self.selector is None or self.practice is None or not self.practice.own.any():
+            return {}
+        shares = (self.practice.own / self.practice.own.sum()).tolist()
+        return dict(zip(self.selector.specs.option_names, shares, strict=True))
 
     def _set_practice(self) -> None:
         if self.selector is not None and self.practice is not None:

@@ -38,75 +38,81 @@ OUT_OF_REACH = 3.0
 """Distance to the best option, in standard deviations of a return, from which an option need not practise."""
 
 
-class UniformPractice(nn.Module):
-    """All options practise equally for the first steps of a run.
+class Practice(nn.Module):
+    """How much each option has practised, and which ones practise whatever the selector would choose.
+
+    Here all options practise equally for the first steps of a run.
 
     Args:
         num_options: number of options.
-        steps: for how many steps; of decisions, if the learners are frozen.
-    """
-
-    def __init__(self, num_options: int, steps: int) -> None:
-        super().__init__()
-        self.num_options = num_options
-        self.steps = steps
-
-    def probabilities(self, frames: int) -> Tensor:
-        """Return the probability `[num_options]` with which each option practises after so many steps of the run."""
-        return torch.full((self.num_options,), float(frames < self.steps) / self.num_options)
-
-    def add(self, options: Tensor, decided: Tensor, returns: Tensor) -> None:
-        """Ignore what the options have done."""
-
-
-class CurvePractice(nn.Module):
-    """The option whose fitted curve promises the largest gain practises most.
-
-    Args:
-        num_options: number of options.
-        total: length of the run in steps.
+        uniform_steps: for how many steps; of decisions, if the learners are frozen.
 
     Attributes:
         own: steps that each option has practised, float64 `[num_options]`.
-        width: steps in a bin.
-        counts, sums, squares: of the returns in each bin of an option's own practice, float64
-            `[num_options, NUM_BINS]`.
     """
 
-    added_later = ("own", "width", "counts", "sums", "squares")  # checkpoints of 0.3 lack them
+    added_later: tuple[str, ...] = ("own",)  # checkpoints of 0.3 lack it
     own: Tensor
-    width: Tensor
-    counts: Tensor
-    sums: Tensor
-    squares: Tensor
 
-    def __init__(self, num_options: int, total: int) -> None:
+    def __init__(self, num_options: int, uniform_steps: int = 0) -> None:
         super().__init__()
-        self.total = total
+        self.uniform_steps = uniform_steps
         self.register_buffer("own", torch.zeros(num_options, dtype=torch.float64))
-        self.register_buffer("width", torch.tensor(total / NUM_BINS, dtype=torch.float64))
-        for name in ("counts", "sums", "squares"):
-            self.register_buffer(name, torch.zeros(num_options, NUM_BINS, dtype=torch.float64))
-
-    def add(self, options: Tensor, decided: Tensor, returns: Tensor) -> None:
-        """Count practice and returns.
-
-        Args:
-            options: the option of each step, int64 `[N]`.
-            decided: the option of each decision that has ended, int64 `[M]`.
-            returns: its return, `[M]`.
-        """
-        returns = returns.double()
-        place = decided * NUM_BINS + self._bin()[decided]
-        for name, values in (("counts", torch.ones_like(returns)), ("sums", returns), ("squares", returns.square())):
-            getattr(self, name).view(-1).index_add_(0, place, values)
-        self.own += torch.bincount(options, minlength=len(self.own))
 
     def probabilities(self, frames: int) -> Tensor:
         """Return the probability `[num_options]` with which each option practises after so many steps of the run.
 
         With the remaining probability the selector chooses.
         """
+        return torch.full_like(self.own, float(frames < self.uniform_steps) / len(self.own)).float()
+
+    def add(self, options: Tensor, decided: Tensor, returns: Tensor) -> None:
+        """Count practice, and the returns that tell how it goes.
+
+        Args:
+            options: the option of each step, int64 `[N]`.
+            decided: the option of each decision that has ended, int64 `[M]`.
+            returns: its return, `[M]`.
+        """
+        self.own += torch.bincount(options, minlength=len(self.own))
+
+
+class CurvePractice(Practice):
+    """By fitted learning curves: see the head of this file.
+
+    Args:
+        num_options: number of options.
+        total: length of the run in steps.
+
+    Attributes:
+        width: steps in a bin.
+        counts, sums, squares: of the returns in each bin of an option's own practice, float64
+            `[num_options, NUM_BINS]`.
+    """
+
+    added_later = ("own", "width", "counts", "sums", "squares")
+    width: Tensor
+    counts: Tensor
+    sums: Tensor
+    squares: Tensor
+
+    def __init__(self, num_options: int, total: int) -> None:
+        super().__init__(num_options)
+        self.total = total
+        self.register_buffer("width", torch.tensor(total / NUM_BINS, dtype=torch.float64))
+        for name in ("counts", "sums", "squares"):
+            self.register_buffer(name, torch.zeros(num_options, NUM_BINS, dtype=torch.float64))
+
+    def add(self, options: Tensor, decided: Tensor, returns: Tensor) -> None:
+        """Count practice and returns; see `Practice.add`."""
+        returns = returns.double()
+        place = decided * NUM_BINS + self._bin()[decided]
+        for name, values in (("counts", torch.ones_like(returns)), ("sums", returns), ("squares", returns.square())):
+            getattr(self, name).view(-1).index_add_(0, place, values)
+        super().add(options, decided, returns)
+
+    def probabilities(self, frames: int) -> Tensor:
+        """Return the probabilities of practice by the curves; see `Practice.probabilities`."""
         num_options = len(self.own)
         if (self._bin() < FIRST_BINS).any():
             is_first = self.own == self.own.min()

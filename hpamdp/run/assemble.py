@@ -28,7 +28,7 @@ from hpamdp.messages import first_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner, Selector
 from hpamdp.policies.option_lengths import DEFAULT_LENGTHS
-from hpamdp.policies.practice import CurvePractice, UniformPractice
+from hpamdp.policies.practice import CurvePractice, Practice
 from hpamdp.run import capacity, checkpoint, compatibility
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.specs import PAMDPSpecs
@@ -258,7 +258,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     return agent.to(device)
 
 
-def _practice(config: Config, selector: Selector | None) -> UniformPractice | CurvePractice | None:
+def _practice(config: Config, selector: Selector | None) -> Practice | None:
     """Return which options practise, see `AgentConfig.practice`."""
     run = config.run
     practice = run.agent.practice
@@ -266,12 +266,10 @@ def _practice(config: Config, selector: Selector | None) -> UniformPractice | Cu
         practises = selector is not None and selector.learns_by_state and not run.low.freeze
         lasts = run.agent.termination == "episode" and not compatibility.has_trips(config)
         practice = "curves" if practises and lasts and run.agent.sharing == "per_option" else 0
-    if selector is None or practice == 0:
+    if selector is None:
         return None
     num_options = selector.specs.num_options
-    return (
-        CurvePractice(num_options, run.num_frames) if practice == "curves" else UniformPractice(num_options, practice)
-    )
+    return CurvePractice(num_options, run.num_frames) if practice == "curves" else Practice(num_options, practice)
 
 
 def make_agent_of_run(config: Config, specs: PAMDPSpecs, device: torch.device) -> HierarchicalAgent:

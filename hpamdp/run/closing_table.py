@@ -13,6 +13,7 @@ from hpamdp.messages import duration
 from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 
 WITHOUT_UPDATE = "without_update"  # names of the levels that made no update
+ONE_OPTION = "one_option"  # lines about a selector that holds one option in all episodes
 SHORT_SIGHT = "short_sight"  # lines about learners that look far less ahead than episodes last
 _FAR = 4.0  # times the steps that a learner looks ahead; longer episodes count as far longer
 
@@ -28,8 +29,8 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     """Return a plain aligned table of this agent beside the references.
 
     Args:
-        summary: the agent's metrics by their names, `references`, `mode`, `frames`, `wall_s`, `without_update` and
-            `short_sight`.
+        summary: the agent's metrics by their names, `references`, `mode`, `frames`, `wall_s`, `without_update`,
+            `short_sight` and `one_option`.
         metrics: the rows. Rows without a value for the agent are left out, and so are columns without any value.
     """
     titles = {name: title for name, (title, _, _) in REFERENCES.items()}
@@ -53,7 +54,7 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
         lines.append("   ".join(aligned).rstrip())
     if any("" in row[1:] for row in cells[1:]):
         lines.append("empty cells: no figure is stored for that reference with these settings")
-    lines += summary.get(SHORT_SIGHT, [])
+    lines += summary.get(SHORT_SIGHT, []) + summary.get(ONE_OPTION, [])
     without = summary.get(WITHOUT_UPDATE, [])
     lines += [f"no update was made: {', '.join(without)}"] if without else []
     return "\n".join([*lines, *_effort(summary)])

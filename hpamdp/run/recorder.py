@@ -30,7 +30,7 @@ from hpamdp.metrics_file import (
 )
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.closing_table import SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight
+from hpamdp.run.closing_table import ONE_OPTION, SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight
 from hpamdp.run.loggers import EarlierRun, LenientLogger, Logger
 from hpamdp.run.state_checks import SavedPart, check_columns, check_values, checked
 from hpamdp.run.summary import summarise
@@ -215,10 +215,19 @@ class Recorder:
         if self.config.run.mode != "eval":
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
             summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])
+            summary[ONE_OPTION] = self._one_option()
+            summary["practised"] = self.parts.agent.practised()
         self.summary = summary
         if self.output_dir is not None:
             self._write(self.output_dir, played)
         return closing_table(summary, env.table_metrics)
+
+    def _one_option(self) -> list[str]:
+        """Return a line if the selector cannot tell states apart, in which another option may be better."""
+        selector = self.parts.agent.selector
+        if selector is None or not selector.is_bandit or selector.learns_by_state or selector.memory_key is not None:
+            return []
+        return [f"{self.config.high} holds the option that is best on average; high=value chooses one for each episode"]
 
     def _write(self, folder: Path, played: Mapping[str, np.ndarray]) -> None:
         """Write the last evaluation, the summary, the figures and the film, and close the logger."""

@@ -142,7 +142,7 @@ def _choices(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -
     if summary.get("boats"):
         _draw_boats(left, of_choices, summary["boats"])
     else:
-        _draw_choices(left, of_choices, has_people=bool(people))
+        _draw_choices(left, of_choices, summary.get("practised", {}), has_people=bool(people))
     _draw_outcomes(right, evaluation["outcome"].astype(int), people)
     return figure
 
@@ -174,7 +174,9 @@ class _Bins:
         return np.bincount(self._bin, weights=weights, minlength=len(self.all_centres))[self._filled]
 
 
-def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: bool) -> None:
+def _draw_choices(
+    axes: Axes, evaluation: Mapping[str, np.ndarray], practised: Mapping[str, float], *, has_people: bool
+) -> None:
     bins = _Bins(evaluation["bearing_offset"], np.array(OFFSET_EDGES, dtype=float))
     labels = []
     optimum = evaluation.get("optimum", np.full((len(evaluation["option"]), 2), np.nan))
@@ -201,6 +203,9 @@ def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: 
     errors = np.maximum([fraction - [i.low for i in intervals], [i.high for i in intervals] - fraction], 0.0)
     axes.errorbar(bins.centres, fraction, errors, color=AGENT, linewidth=2.0, marker="o", markersize=5, capsize=3)
     labels.append((fraction[-1], "this agent", AGENT))
+    if "congruent" in practised:
+        axes.axhline(practised["congruent"], color=AGENT, linewidth=1.0, linestyle=":")
+        labels.append((practised["congruent"], "its practice", AGENT))
     axes.set(xlim=(0, 60), ylim=(-0.03, 1.03), xticks=bins.edges)
     axes.set_xlabel("degrees between the goal's bearing and the congruent boat's nearest key")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
