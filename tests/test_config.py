@@ -385,6 +385,13 @@ def test_every_recipe_is_of_a_problem_and_a_learner_or_a_selector(group, folder)
     assert {file.stem for file in CONF.glob(f"{folder}/*.yaml")} <= pairs
 
 
+def test_a_recipe_of_a_pair_counts_for_this_selector_over_this_learner_alone():
+    known = {f"{env}_{low}_{high}" for env in choices("env") for low in choices("low") for high in choices("high")}
+    assert {file.stem for file in CONF.glob("recipe/pair/*.yaml")} <= known
+    sizes = [make_config([f"high={high}", "low=hppo"]).low.settings["minibatch_size"] for high in ("linucb", "ucb")]
+    assert sizes == [1024, 2048]
+
+
 def test_cuda_is_refused_in_one_line_where_there_is_none(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="device=cuda:1: this machine has no usable CUDA device"):
