@@ -1,15 +1,18 @@
 """Options practise while their learners improve: by fitted curves, and whatever the selector would choose."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
-from conftest import make_config
+from conftest import compose_config, make_config
 from tensordict import TensorDict
 
 from hpamdp import keys
 from hpamdp.policies.high_level.linucb import LinUCB
 from hpamdp.policies.practice import CurvePractice
 from hpamdp.run.assemble import assemble
+from hpamdp.run.train import run
 from hpamdp.specs import PAMDPSpecs
 
 TOTAL = 3000
@@ -76,3 +79,12 @@ def test_forbidden_options_do_not_practise():
 def test_curves_are_the_default_where_a_selector_of_whole_episodes_sees_the_state(words, practises):
     agent = assemble(make_config([*words.split(), "eval.layouts=4"])).agent
     assert isinstance(agent.practice, CurvePractice) == practises
+
+
+@pytest.mark.parametrize(("high", "is_told"), [("ucb", True), ("linucb", False)])
+def test_a_run_says_what_practised_and_which_selector_holds_one_option(high, is_told, tmp_path):
+    words = [f"high={high}", "low=random", "total_frames=2048", "eval.every=0", "eval.layouts=20", "film=false"]
+    assert run(compose_config(words), tmp_path / "run") == 0
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert sum(summary["practised"].values()) == pytest.approx(1.0)
+    assert [line.startswith(f"high={high} holds") for line in summary["one_option"]] == [True] * is_told
