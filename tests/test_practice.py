@@ -50,6 +50,22 @@ def test_a_fruitless_option_practises_little():
     assert practised([100.0, 100.0, 100.0], [3.3, 3.3, -1.0], chosen=0)[2] < 0.1
 
 
+def test_an_option_that_nobody_may_choose_does_not_keep_the_selector_waiting():
+    practice = CurvePractice(2, TOTAL)
+    for _ in range(TOTAL // 20):
+        practice.add(torch.zeros(20).long(), torch.zeros(20).long(), torch.randn(20))
+    assert practice.probabilities(TOTAL // 4)[1] == 1.0
+    assert practice.probabilities(TOTAL // 2).sum().item() == pytest.approx(0.05)
+
+
+def test_a_run_without_end_practises_equally():
+    practice = CurvePractice(2, 10**12)
+    for i in range(10):
+        option = practice.probabilities(20 * i).argmax().expand(20)
+        practice.add(option, option, torch.randn(20))
+    assert practice.own.tolist() == [100.0, 100.0]
+
+
 def test_forbidden_options_do_not_practise():
     selector = LinUCB(PAMDPSpecs(2, ("a", "b", "c"), (1,), (-1.0,), (1.0,), has_option_mask=True))
     selector.practice.copy_(torch.tensor([0.9, 0.1, 0.0]))

@@ -113,8 +113,8 @@ class CurvePractice(Practice):
 
     def probabilities(self, frames: int) -> Tensor:
         """Return the probabilities of practice by the curves; see `Practice.probabilities`."""
-        num_options = len(self.own)
-        if (self._bin() < FIRST_BINS).any():
+        num_options, is_first_half = len(self.own), frames < UNIFORM_UNTIL * self.total
+        if is_first_half and (self._bin() < FIRST_BINS).any():
             is_first = self.own == self.own.min()
             return is_first.float() / is_first.sum()
         level, gain = self.curves(max(0, self.total - frames))
@@ -122,7 +122,7 @@ class CurvePractice(Practice):
         is_in_reach = level + gain + OUT_OF_REACH * deviation >= level.max()
         gain = torch.where(is_in_reach, gain, 0.0)
         uniform = torch.full_like(level, LATE_UNIFORM / num_options)
-        if frames < UNIFORM_UNTIL * self.total:
+        if is_first_half:
             uniform += (1.0 - LATE_UNIFORM) * is_in_reach / is_in_reach.sum()
         is_best = gain == gain.max()
         advantage = (gain.max() - gain[level.argmax()]) / (CLEAR_ADVANTAGE * deviation)
@@ -132,9 +132,9 @@ class CurvePractice(Practice):
     def curves(self, steps: int) -> tuple[Tensor, Tensor]:
         """Return each option's return now, and by how much so many more steps of practice would raise it.
 
-        Both are `[num_options]`. A curve is a + b exp(-n / tau) over the own practice n, with b <= 0. For each tau of a
-        grid the least squares fit to the bins' means has a closed form. The result is the mean over tau, weighted by
-        the likelihood.
+        Both are `[num_options]`; -inf and 0 for an option without returns. A curve is a + b exp(-n / tau) over the own
+        practice n, with b <= 0. For each tau of a grid the least squares fit to the bins' means has a closed form. The
+        result is the mean over tau, weighted by the likelihood.
         """
         tau = self.width * NUM_BINS * torch.logspace(-2.0, 0.5, 16, dtype=torch.float64, device=self.own.device)
         middle = (torch.arange(NUM_BINS, device=self.own.device) + 0.5) * self.width
@@ -150,7 +150,8 @@ class CurvePractice(Practice):
         now = torch.exp(-self.own.unsqueeze(-1) / tau)
         level = mean_of_all + b * (now - shape_of_all)
         gain = b * now * torch.expm1(-steps / tau)
-        return (likelihood * level).sum(-1), (likelihood * gain).sum(-1)
+        is_known = self.counts.any(-1)
+        return torch.where(is_known, (likelihood * level).sum(-1), -torch.inf), (likelihood * gain).sum(-1)
 
     def _bin(self) -> Tensor:
         """Return the bin `[num_options]` that each option's next return belongs to."""
