@@ -1,7 +1,7 @@
 """Gather the runs of the whole map, every selector that learns over every learner with defaults alone, and tabulate it.
 
-python experiments/hierarchy/whole_map.py FOLDER...    adds the runs in these folders to whole_map.csv
-python experiments/hierarchy/whole_map.py              prints both tables, and draws practice and value over time
+python experiments/whole_map/study.py FOLDER...    adds the runs in these folders to the csv files
+python experiments/whole_map/study.py              prints both tables, and draws practice and value over time
 """
 
 from __future__ import annotations
@@ -72,9 +72,10 @@ def single(rows: Rows, low: str) -> Rows:
 
 
 def of_usual_length(rows: Rows, low: str) -> Rows:
-    """Return the runs of a learner with the number of presses that its yaml recommends, the smallest one."""
+    """Return the runs of a learner under selectors, of the length that most selectors have."""
     of_low = [row for row in rows if row["low"] == low and row["high"] != "none"]
-    return [row for row in of_low if row["frames"] == min(each["frames"] for each in of_low)]
+    lengths = groups(of_low, "frames").values()
+    return max(lengths, key=lambda runs: len({row["high"] for row in runs}), default=[])
 
 
 def table(rows: Rows) -> str:
@@ -107,7 +108,8 @@ def choosing(rows: Rows) -> str:
         mean = {column: np.mean([row[column] for row in runs]) for column in COLUMNS}
         over = f"{mean['score'] - np.mean([row['score'] for row in alone]):+.3f}" if alone else ""
         lines.append(
-            f"| {high} | {low} | {frames:,.0f} | {len(runs)} | {interval_text([row['score'] for row in runs])} | "
+            f"| {high} | {low} | {frames:,.0f} | {len(runs)} | {mean['score']:.3f} "
+            f"({interval_text([row['score'] for row in runs])}) | "
             f"{mean['ceiling'] - mean['score']:.3f} | {over} | {mean['agreement']:.1%} | {mean['weighted']:.1%} | "
             f"{mean['regret']:.3f} | {mean['cpu_s']:.0f} s |"
         )
@@ -144,10 +146,10 @@ def main(folders: Sequence[str]) -> None:
     """Gather, tabulate, draw."""
     if folders:
         results, curves = gathered(folders, gather, env=("boatdock",), settings={"boatdock.controller": None})
-        add_to_tables(HERE, {"whole_map": results, "whole_map_curves": curves}, (*CELL, "seed"))
-    rows, curves = (read_csv(HERE / f"{name}.csv") for name in ("whole_map", "whole_map_curves"))
+        add_to_tables(HERE, {"runs": results, "curves": curves}, (*CELL, "seed"))
+    rows, curves = (read_csv(HERE / f"{name}.csv") for name in ("runs", "curves"))
     print(f"{table(rows)}\n\n{choosing(rows)}")
-    draw(curves, HERE / "whole_map.png")
+    draw(curves, HERE / "curves.png")
 
 
 if __name__ == "__main__":
