@@ -140,6 +140,15 @@ def test_updates_leave_fixed_temperatures_unchanged():
     assert learner.temperatures() == before
 
 
+def test_the_value_that_selectors_compare_is_that_of_the_greedy_action_without_entropy():
+    learner, td = make(), states(50)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        acted = learner.policy(td.clone())
+        unit_parameters = SPECS.to_unit(acted[keys.PARAMETERS])
+        q = learner.target_critics.of_discrete(td[keys.OBSERVATION], acted[keys.DISCRETE], unit_parameters).amin(0)
+        torch.testing.assert_close(learner.value(td[keys.OBSERVATION]), q)
+
+
 def test_the_greedy_policy_samples_nothing_and_the_exploring_one_is_uniform_in_the_warm_up_alone():
     learner, td = make(), states(2000)
     with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):

@@ -303,12 +303,20 @@ class HSAC(ReplayLearner):
         *,
         has_seen: bool = False,
     ) -> Tensor:
-        """Return the soft value V'(s) by the target critics, `[B]`; the actor, too, sees the target's features.
+        """Return the value of the most probable action by the target critics, `[B]`; the actor sees their features.
 
-        `Learner.value` explains `memory` and `has_seen`.
+        It counts no entropy, which the greedy policy does not earn. `Learner.value` explains `memory` and `has_seen`.
         """
-        allowed = self.specs.allowed(observation, action_mask)
+        allowed, is_fixed = self.specs.allowed(observation, action_mask), self.specs.is_fixed(observation)
         features = self.target_perception(observation, memory, has_seen=has_seen)
+        discrete, raw = self.actor.most_probable(features, allowed, None)
+        unit_parameters = zero_fixed(raw.tanh(), is_fixed)
+        return self.target_critics.of_discrete(features, discrete, unit_parameters).amin(0)
+
+    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
+        """Return the soft value V'(s) by the target critics, `[B]`; see `value`."""
+        allowed = self.specs.allowed(observation, action_mask)
+        features = self.target_perception(observation, memory.pop("memory", None), **memory)
         value, _, _ = self.soft_value(self.target_critics, features, allowed, self.specs.is_fixed(observation))
         return value
 
