@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from policies import RSR, RUCBE, Policy, RedUCB, Rising, features
+from bandits import RSR, RUCBE, Policy, RedUCB, Rising, features
 
 Curve = Callable[[np.ndarray], np.ndarray]
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 import csv
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import vowpalwabbit
-from options import BEARINGS, CASES, HERE, Case, Recorded, best_split, final_values, row
-from policies import ON_BEARINGS, Ridge, features
+from bandits import ON_BEARINGS, Ridge, features
+from cases import BEARINGS, HERE, Case, all_cases, best_split, final_values, row
 from SMPyBandits.Policies import SWUCB, UCB, DiscountedUCB
 
 NUM_SEEDS = 10
@@ -47,7 +46,7 @@ class Peer:
 
 
 class Cover:
-    """Vowpal Wabbit's cover of four policies, on the features of the regressions of `policies`."""
+    """Vowpal Wabbit's cover of four policies, on the features of the regressions of `bandits`."""
 
     def __init__(self, case: Case, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -107,10 +106,9 @@ def play(case: Case, build: Callable[[Case, int], Peer | Cover], seed: int) -> t
 
 def main(names: list[str]) -> None:
     """Play the cases, by default all, and write the table."""
-    recorded = [path.stem for path in sorted(Path(HERE / "recorded").glob("*.csv"))]
-    rows = []
-    for name in names or [*CASES, *recorded]:
-        case = CASES.get(name) or Recorded.of(name)
+    cases, rows = all_cases(), []
+    for name in names or cases:
+        case = cases[name]
         for peer, build in PEERS.items():
             own, by_context, practice, regret = map(
                 np.array, zip(*(play(case, build, seed) for seed in range(NUM_SEEDS)), strict=True)

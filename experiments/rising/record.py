@@ -105,19 +105,20 @@ def rows_of(recordings: list[Recording]) -> list[dict[str, float]]:
     practice = np.concatenate([(np.arange(each.num_episodes) + 0.5) / each.num_episodes for each in recordings])
     offsets = np.concatenate([np.concatenate(each.offsets) for each in recordings])
     returns = np.concatenate([np.concatenate(each.returns) for each in recordings])
-    of_practice = bin_of(practice, np.linspace(0.0, 1.0, NUM_PRACTICE_BINS + 1))
+    num_bins = min(NUM_PRACTICE_BINS, len(returns) // (10 * (len(OFFSETS) - 1)))  # at least 10 returns in a cell
+    of_practice = bin_of(practice, np.linspace(0.0, 1.0, num_bins + 1))
     of_offset = bin_of(offsets, OFFSETS)
     episodes = round(np.mean([each.num_episodes for each in recordings]))
     rows = []
-    for i in range(NUM_PRACTICE_BINS):
-        middle = (i + 0.5) / NUM_PRACTICE_BINS
+    for i in range(num_bins):
+        middle = (i + 0.5) / num_bins
         nearest = [min(e.greedy, key=lambda g, e=e: abs(g[0] / e.num_episodes - middle))[1] for e in recordings]
         greedy = np.mean(nearest, 0)
         for j in range(len(OFFSETS) - 1):
             own = returns[(of_practice == i) & (of_offset == j)]
             rows.append(
                 {
-                    "practice": middle,
+                    "practice": round(middle, 4),
                     "offset": (OFFSETS[j] + OFFSETS[j + 1]) / 2.0,
                     "num": len(own),
                     "mean": round(own.mean(), 3) if len(own) else "",

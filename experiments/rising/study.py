@@ -1,260 +1,88 @@
-"""Choose between options that are still learning: which policy ends with the best greedy agent?
+"""Tabulate which policy ends with the best greedy agent if the options are still learning.
 
-python experiments/rising/study.py               plays all cases, writes results.csv and prints the tables
-python experiments/rising/study.py --table       only prints the tables
-python experiments/rising/study.py --case NAME   plays one case and replaces its rows
+python experiments/rising/study.py             only tabulates the csv files
+python experiments/rising/study.py all         plays all cases first, in some minutes
+python experiments/rising/study.py CASE...     plays these cases, such as "50 and 150", and replaces their rows
 """
 
 from __future__ import annotations
 
-import argparse
-import logging
-from collections.abc import Callable
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
-import numpy as np
-import torch
-from options import BEARINGS, CASES, Case, Recorded, best_split, final_values, row, single
-from policies import POLICIES, Policy, features
-from tensordict import TensorDict
-from torch import Tensor
-from torchrl.envs.utils import ExplorationType
-
-from hpamdp import keys
-from hpamdp.acting import acting
 from hpamdp.analysis.study import Rows, groups, read_csv, write_tables
-from hpamdp.policies.base import Selector
-from hpamdp.policies.high_level.epsilon_greedy import EpsilonGreedy
-from hpamdp.policies.high_level.lin_thompson import LinThompson
-from hpamdp.policies.high_level.linucb import LinUCB
-from hpamdp.policies.high_level.meta_critic import MetaCritic
-from hpamdp.policies.high_level.ucb import UCB
-from hpamdp.specs import PAMDPSpecs
+from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
-LEARNERS = ("hyar", "hppo", "pdqn", "hsac", "pets")
-NUM_SEEDS = 50
-NUM_SELECTOR_SEEDS = 10
-NUM_ENVS = 16
-NUM_BATCHES = 200  # of long runs, which have more environments
-# A minute each; the other selectors take seconds.
-CASES_OF_META_CRITIC = ("50 and 150", "200 and 800", "equal", "frozen", "hyar", "hppo")
-LINEAR = {"inputs": [0, 1], "degree": 5}
-
-
-class Practice(Protocol):
-    """What overrules a selector's choices so that options practise; the hook of `play_selector`."""
-
-    def probabilities(self, fraction: float) -> Tensor | None:
-        """Return with which probability each option overrules a decision, `[num_options]`; None: none does.
-
-        Called before each batch. The sum is at most 1.
-
-        Args:
-            fraction: of the run that is done.
-        """
-        ...
-
-    def learn(self, options: Tensor, returns: Tensor) -> None:
-        """Learn from the options and returns `[N]` of a batch, oldest first. Called after each batch."""
-        ...
-
-
-class UniformFirst:
-    """Let uniformly random options practise in the first part of the run, as `agent.uniform_option_steps` does."""
-
-    def __init__(self, num_options: int, part: float) -> None:
-        self.num_options, self.part = num_options, part
-
-    def probabilities(self, fraction: float) -> Tensor | None:
-        return torch.full((self.num_options,), 1.0 / self.num_options) if fraction < self.part else None
-
-    def learn(self, options: Tensor, returns: Tensor) -> None:
-        pass
-
-
-# Builds a selector for the specs, and what practises beside it.
-Build = Callable[[PAMDPSpecs, Case], tuple[Selector, Practice | None]]
-
-SELECTORS: dict[str, Build] = {
-    "ucb": lambda specs, case: (UCB(specs), None),
-    "epsilon_greedy": lambda specs, case: (EpsilonGreedy(specs), None),
-    "linucb": lambda specs, case: (LinUCB(specs, **LINEAR), None),
-    "lin_thompson": lambda specs, case: (LinThompson(specs, **LINEAR), None),
-    "meta_critic": lambda specs, case: (MetaCritic(specs, gamma=1.0), None),
-    "linucb, uniform third": lambda specs, case: (LinUCB(specs, **LINEAR), UniformFirst(case.num_options, 1 / 3)),
-    "linucb, uniform half": lambda specs, case: (LinUCB(specs, **LINEAR), UniformFirst(case.num_options, 1 / 2)),
+TABLES = {
+    "by_context_share": "Share of the best split's gain over option 0 alone, if the final choice sees the context",
+    "value_share": "The same share with the policy's own final choice",
+    "by_context": "Final value, if the final choice sees the context: mean ± half of the 95 % interval",
+    "practice": "Practice of each option in percent of the decisions",
+    "regret": "Mean shortfall of a decision of training from the best split's final value",
 }
 
 
-def cases() -> dict[str, Case]:
-    """Return all cases: the simulated ones, and a recorded one for each learner."""
-    recorded = {name: Recorded.of(name) for name in LEARNERS if (HERE / "recorded" / f"{name}.csv").exists()}
-    return {**CASES, **recorded}
+def play(names: Sequence[str]) -> None:
+    """Play cases and replace their rows in results.csv and cases.csv."""
+    from cases import all_cases, case_row  # these modules lie beside this one, which reports load without them
+    from play import play_case
+
+    cases = all_cases()
+    unknown = set(names) - set(cases)
+    if unknown:
+        raise SystemExit(f"no case {unknown.pop()}; there are: {', '.join(cases)}")
+    write_tables(HERE, {"cases": [case_row(name, case) for name, case in cases.items()]})
+    for name in names or cases:
+        stored = read_csv(HERE / "results.csv") if (HERE / "results.csv").exists() else []
+        rows = [row for row in stored if row["case"] != name] + play_case(name)
+        order = list(cases)
+        write_tables(HERE, {"results": sorted(rows, key=lambda row: order.index(row["case"]))})
 
 
-def play(
-    case: Case, build: type[Policy], num_seeds: int = NUM_SEEDS, seed: int = 0
-) -> tuple[dict, np.ndarray, np.ndarray]:
-    """Play a policy with all seeds at once; return its final values, practice and regret, see `row`.
-
-    `value` is that of the option that the policy recommends for all contexts, or of the regression if it recommends
-    none; `by_context` is that of the regression.
-    """
-    rng = np.random.default_rng(seed)
-    policy, practice = build(num_seeds, case, rng), np.zeros((num_seeds, case.num_options))
-    rows, earned = np.arange(num_seeds), np.zeros(num_seeds)
-    for t in range(case.horizon):
-        bearing = rng.uniform(0.0, 360.0, num_seeds)
-        x = features(bearing)
-        option = policy.choose(t, x)
-        returns, mean = case.sample(rng, bearing, practice, option)
-        practice[rows, option] += 1
-        earned += mean
-        policy.learn(t, option, x, returns)
-    by_context = final_values(case, practice, policy.ridge.choices())
-    own = policy.recommended
-    value = by_context if own is None else final_values(case, practice, np.repeat(own[:, None], 360, 1))
-    regret = best_split(case)[1] - earned / case.horizon
-    return {"value": value, "by_context": by_context}, practice / case.horizon, regret
-
-
-def play_selector(
-    case: Case, build: Build, seed: int, practice: Practice | None = None
-) -> tuple[float, np.ndarray, float]:
-    """Play a selector through its own interface; return its final value, practice `[K]` and regret.
-
-    Args:
-        case: the case.
-        build: makes the selector, and what practises beside it.
-        seed: of contexts, returns and choices.
-        practice: replaces what practises beside the selector.
-    """
-    torch.manual_seed(seed)
-    rng, names = np.random.default_rng(seed), tuple(f"option{i}" for i in range(case.num_options))
-    specs = PAMDPSpecs(2, names, parameter_dims=(1,), parameter_low=(-1.0,), parameter_high=(1.0,))
-    selector, own = build(specs, case)
-    practice = practice or own
-    counts, earned = np.zeros(case.num_options), 0.0
-    num_envs = max(NUM_ENVS, case.horizon // NUM_BATCHES)
-    for done in range(0, case.horizon, num_envs):
-        num = min(num_envs, case.horizon - done)
-        bearing = rng.uniform(0.0, 360.0, num)
-        td = decision(bearing)
-        with acting(ExplorationType.RANDOM), torch.no_grad():
-            option = selector(td)[keys.OPTION]
-        if practice is not None and (probabilities := practice.probabilities(done / case.horizon)) is not None:
-            drawn = torch.cat([probabilities.double(), 1.0 - probabilities.double().sum(0, keepdim=True).clamp(0, 1)])
-            drawn = drawn.multinomial(num, replacement=True)
-            option = torch.where(drawn < case.num_options, drawn, option)
-        returns, mean = sample_batch(case, rng, bearing, counts, option.numpy())
-        earned += mean
-        selector.learn(finished(td, option, returns))
-        selector.pending.zero_()  # all decisions have ended
-        if practice is not None:
-            practice.learn(option, torch.from_numpy(returns).float())
-    with acting(ExplorationType.DETERMINISTIC), torch.no_grad():
-        choice = selector(decision(BEARINGS))[keys.OPTION].numpy()
-    value = final_values(case, counts[None], choice[None])[0]
-    return value, counts / case.horizon, best_split(case)[1] - earned / case.horizon
-
-
-def sample_batch(
-    case: Case, rng: np.random.Generator, bearing: np.ndarray, counts: np.ndarray, option: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Return the returns of decisions made at the same time and the sum of their means; count them in `counts`."""
-    # The learners learn after the batch, so all its decisions see the same practice.
-    returns, means = case.sample(rng, bearing, np.repeat(counts[None], len(option), 0), option)
-    counts += np.bincount(option, minlength=len(counts))
-    return returns, float(means.sum())
-
-
-def decision(bearing: np.ndarray) -> TensorDict:
-    """Return a step in which every environment has a decision to make."""
-    angle = torch.from_numpy(np.radians(bearing)).float()
-    observation = torch.stack([angle.cos(), angle.sin()], -1)
-    is_decision = torch.ones(len(bearing), 1, dtype=torch.bool)
-    return TensorDict({keys.OBSERVATION: observation, keys.IS_DECISION: is_decision}, [len(bearing)])
-
-
-def finished(td: TensorDict, option: Tensor, returns: np.ndarray) -> TensorDict:
-    """Return the finished decisions in the form of `Selector.learn`; each took one step, which ended its episode."""
-    yes, observation = torch.ones(len(td), 1, dtype=torch.bool), td[keys.OBSERVATION]
-    after = {
-        keys.DECISION_OBSERVATION: observation,
-        keys.OPTION_RETURN: torch.from_numpy(returns).float().unsqueeze(-1),
-        keys.OPTION_STEPS: torch.ones(len(td), 1, dtype=torch.long),
-        keys.OBSERVATION: observation,
-        keys.DONE: yes,
-        keys.IS_DECISION: yes,
-    }
-    return TensorDict({keys.OPTION: option, keys.OBSERVATION: observation, "next": after}, [len(td)])
-
-
-def play_case(name: str) -> Rows:
-    """Return the rows of all policies and selectors in a case."""
-    case, rows = cases()[name], []
-    for policy, build in POLICIES.items():
-        rows.append(row(name, case, policy, *play(case, build)))
-    for selector, build in SELECTORS.items():
-        if selector == "meta_critic" and name not in CASES_OF_META_CRITIC:
-            continue
-        played = [play_selector(case, build, seed) for seed in range(NUM_SELECTOR_SEEDS)]
-        values, practice, regret = (np.array(each) for each in zip(*played, strict=True))
-        rows.append(row(name, case, selector, {"value": values, "by_context": values}, practice, regret))
-    return rows
-
-
-def ceilings(rows: Rows) -> str:
-    """Return a line for each case: option 0 alone, the best split, and its final value."""
+def of_cases(cases: Rows) -> str:
+    """Return a line for each case: option 0 alone, the best split and its final value."""
     lines = ["| case | decisions | option 0 alone | best split | its final value |", "|---|---|---|---|---|"]
-    for name, case in cases().items():
-        split, value = best_split(case)
-        shares = " : ".join(f"{100 * each:.0f}" for each in split)
-        lines.append(f"| {name} | {case.horizon:,} | {single(case):.3f} | {shares} | {value:.3f} |")
+    for case in cases:
+        shares = " : ".join(f"{100 * case[f'split_{i}']:.0f}" for i in range(3) if case[f"split_{i}"] != "")
+        lines.append(
+            f"| {case['case']} | {case['decisions']:,} | {case['alone']:.3f} | {shares} | {case['best']:.3f} |"
+        )
     return "\n".join(lines)
 
 
-def table(rows: Rows, column: str) -> str:
-    """Return a line for each policy, with a cell for each case: mean ± half interval."""
-    names = [name for name in cases() if any(each["case"] == name for each in rows)]
+def table(rows: Rows, cases: Rows, column: str) -> str:
+    """Return a line for each policy, with a cell for each case."""
+    names = [case["case"] for case in cases]
     lines = ["| policy | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     for (policy,), own in groups(rows, "policy").items():
-        of_case = {each["case"]: each for each in own}
+        of_case = {row["case"]: row for row in own}
         cells = [cell(of_case[name], column) if name in of_case else "" for name in names]
         lines.append(f"| {policy} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def cell(entries: dict, column: str) -> str:
-    """Return a value with half the width of its interval, or the practice of all options in percent."""
+def cell(row: dict, column: str) -> str:
+    """Return a number, a value with half of its interval, or the practice of all options in percent."""
     if column == "practice":
-        return " : ".join(f"{100 * entries[f'practice_{i}']:.0f}" for i in range(3) if entries[f"practice_{i}"] != "")
-    if column.endswith("_share"):
-        return "" if entries[column] == "" else f"{entries[column]:.2f}"
-    return f"{entries[column]:.3f} ± {entries[f'{column}_ci']:.3f}"
+        return " : ".join(f"{100 * row[f'practice_{i}']:.0f}" for i in range(3) if row[f"practice_{i}"] != "")
+    if row[column] == "":
+        return ""
+    return f"{row[column]:.3f} ± {row[f'{column}_ci']:.3f}" if f"{column}_ci" in row else f"{row[column]:.2f}"
 
 
-def main() -> None:
-    """Play what the arguments ask for, and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", action="store_true")
-    parser.add_argument("--case", action="append")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
-    path = HERE / "results.csv"
-    rows = read_csv(path) if path.exists() else []
-    for name in [] if arguments.table else arguments.case or cases():
-        rows = [each for each in rows if each["case"] != name] + play_case(name)
-        write_tables(HERE, {"results": rows})
-    peers = HERE / "peers.csv"
-    rows += read_csv(peers) if peers.exists() else []
-    print(ceilings(rows))
-    for column in ("by_context", "by_context_share", "value", "practice", "regret"):
-        print(f"\n{column}\n\n{table(rows, column)}")
+def main(arguments: Sequence[str]) -> None:
+    """Play what the arguments name, and tabulate."""
+    if arguments:
+        play([] if list(arguments) == ["all"] else arguments)
+    cases, rows = read_csv(HERE / "cases.csv"), read_csv(HERE / "results.csv")
+    if (HERE / "peers.csv").exists():
+        rows += read_csv(HERE / "peers.csv")
+    print(of_cases(cases))
+    for column, title in TABLES.items():
+        print(f"\n{title}\n\n{table(rows, cases, column)}")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

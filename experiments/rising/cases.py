@@ -105,13 +105,14 @@ class Recorded:
 
     learner: str
     horizon: int = 3000
+    speeds: tuple[float, float] = (1.0, 1.0)  # factors of the options' practice
     num_options: int = 2
 
     @classmethod
-    def of(cls, learner: str) -> Recorded:
+    def of(cls, learner: str, speeds: tuple[float, float] = (1.0, 1.0)) -> Recorded:
         """Return the case of a learner, with the decisions of the recorded run, but at most 3,000."""
         with (HERE / "recorded" / f"{learner}.csv").open() as file:
-            return cls(learner, min(3000, int(next(csv.DictReader(file))["episodes"])))
+            return cls(learner, min(3000, int(next(csv.DictReader(file))["episodes"])), speeds)
 
     @cached_property
     def tables(self) -> dict[str, np.ndarray]:
@@ -132,7 +133,8 @@ class Recorded:
         """Return a column `[..., K]` at bearings `[...]` and the options' practice `[..., K]`."""
         offset = offset_of(bearing)
         offsets = np.rint(np.stack([offset, 60.0 - offset], -1)).astype(int)
-        return self.tables[name][np.rint(400.0 * np.minimum(practice / self.horizon, 1.0)).astype(int), offsets]
+        fraction = np.minimum(practice * np.array(self.speeds) / self.horizon, 1.0)
+        return self.tables[name][np.rint(400.0 * fraction).astype(int), offsets]
 
     def greedy_values(self, bearing: np.ndarray, practice: np.ndarray) -> np.ndarray:
         """Return the greedy learners' expected returns `[..., K]`; see `lookup`."""
@@ -165,6 +167,19 @@ CASES: dict[str, Case] = {
 }
 
 
+LEARNERS = ("hyar", "hppo", "pdqn", "hsac", "pets")
+
+
+def all_cases() -> dict[str, Case]:
+    """Return the simulated cases, a recorded one for each learner, and one in which option 1 learns more slowly."""
+    unequal = Recorded.of("hyar", (1.0, 1 / 3))
+    return {
+        **CASES,
+        **{name: Recorded.of(name) for name in LEARNERS},
+        "hyar, option 1 at a third of the speed": unequal,
+    }
+
+
 def final_values(case: Case, practice: np.ndarray, choice: np.ndarray | None = None) -> np.ndarray:
     """Return the mean over contexts of the greedy values `[S]` of options with the practice `[S, K]`.
 
@@ -180,7 +195,10 @@ def final_values(case: Case, practice: np.ndarray, choice: np.ndarray | None = N
 
 
 def best_split(case: Case) -> tuple[np.ndarray, float]:
-    """Return the fixed split of the decisions, `[K]`, with the highest final value, and that value, by search."""
+    """Return the fixed split of the decisions, `[K]`, with the highest final value, and that value, by search.
+
+    Of equally good splits it is the most even one.
+    """
     steps = np.linspace(0.0, 1.0, 101)
     splits = np.stack([steps, 1.0 - steps], -1)
     if case.num_options == 3:  # a third option that is not worth practising gets nothing, or a little
@@ -188,7 +206,8 @@ def best_split(case: Case) -> tuple[np.ndarray, float]:
             [np.c_[(1.0 - third) * splits, np.full(101, third)] for third in (0.0, 0.02, 0.1, 1 / 3)]
         )
     values = final_values(case, splits * case.horizon)
-    return splits[values.argmax()], float(values.max())
+    best = (values - 1e-6 * splits.max(1)).argmax()
+    return splits[best], float(values[best])
 
 
 def single(case: Case) -> float:
@@ -196,6 +215,13 @@ def single(case: Case) -> float:
     practice = np.zeros((1, case.num_options))
     practice[0, 0] = case.horizon
     return float(final_values(case, practice, np.zeros((1, 360), dtype=int))[0])
+
+
+def case_row(name: str, case: Case) -> dict[str, float | str]:
+    """Return what is known of a case: its length, the value of option 0 alone, and the best split with its value."""
+    split, value = best_split(case)
+    known = {"case": name, "decisions": case.horizon, "alone": round(single(case), 4), "best": round(value, 4)}
+    return known | {f"split_{i}": round(float(split[i]), 3) if i < case.num_options else "" for i in range(3)}
 
 
 def row(

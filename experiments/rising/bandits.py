@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from options import BEARINGS, Case, best_split
+from cases import BEARINGS, Case, best_split
 
 
 def features(bearing: np.ndarray) -> np.ndarray:
