@@ -69,7 +69,8 @@ def cell(row: dict, column: str) -> str:
         return " : ".join(f"{100 * row[f'practice_{i}']:.0f}" for i in range(3) if row[f"practice_{i}"] != "")
     if row[column] == "":
         return ""
-    return f"{row[column]:.3f} ± {row[f'{column}_ci']:.3f}" if f"{column}_ci" in row else f"{row[column]:.2f}"
+    value = round(row[column], 3) + 0.0  # no minus before a zero
+    return f"{value:.3f} ± {row[f'{column}_ci']:.3f}" if f"{column}_ci" in row else f"{round(value, 2) + 0.0:.2f}"
 
 
 def main(arguments: Sequence[str]) -> None:
