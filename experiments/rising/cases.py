@@ -155,9 +155,9 @@ Case = Simulated | Recorded
 CASES: dict[str, Case] = {
     "50 and 150": Simulated((50, 150)),
     "200 and 800": Simulated((200, 800)),
-    "20 and 60, 500 decisions": Simulated((20, 60), horizon=500),
-    "50 and 150, 500 decisions": Simulated((50, 150), horizon=500),
-    "2,000 and 8,000, 30,000 decisions": Simulated((2000, 8000), horizon=30_000),
+    "20 and 60": Simulated((20, 60), horizon=500),
+    "50 and 150, short": Simulated((50, 150), horizon=500),
+    "2,000 and 8,000": Simulated((2000, 8000), horizon=30_000),
     "equal": Simulated((100, 100)),
     "frozen": Simulated((0, 0)),
     "crossing": Simulated((50, 400), plateaus=(3.0, 3.6), contrast=0.5),
@@ -176,7 +176,7 @@ def all_cases() -> dict[str, Case]:
     return {
         **CASES,
         **{name: Recorded.of(name) for name in LEARNERS},
-        "hyar, option 1 at a third of the speed": unequal,
+        "hyar, unequal": unequal,
     }
 
 
@@ -233,14 +233,15 @@ def row(
         name: of the case.
         case: the case.
         policy: name of the policy.
-        values: final values `[S]` by the name of their column. Each also has a column with its share of the best
-            split's gain over option 0 alone; empty if there is nothing to gain.
+        values: final values `[S]` by the name of their column. `best_choice` is added, the value if the final choice
+            were the truly better option. Each also has a column with its share of the best split's gain over option 0
+            alone; empty if there is nothing to gain.
         practice: fraction of the decisions that each option has had, `[S, K]`.
         regret: mean shortfall `[S]` of a decision's expected return from the best split's final value.
     """
     best, alone = best_split(case)[1], single(case)
     entries: dict[str, float | str] = {"case": name, "policy": policy, "seeds": len(practice)}
-    for column, each in values.items():
+    for column, each in {**values, "best_choice": final_values(case, practice * case.horizon)}.items():
         half = stats.t.ppf(0.975, len(each) - 1) * each.std(ddof=1) / len(each) ** 0.5
         entries |= {column: round(float(each.mean()), 4), f"{column}_ci": round(float(half), 4)}
         share = (each.mean() - alone) / (best - alone) if best - alone > 0.01 else None

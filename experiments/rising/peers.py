@@ -107,18 +107,17 @@ def play(case: Case, build: Callable[[Case, int], Peer | Cover], seed: int) -> t
 def main(names: list[str]) -> None:
     """Play the cases, by default all, and write the table."""
     cases, rows = all_cases(), []
-    for name in names or cases:
+    for name in names or [name for name, case in cases.items() if case.horizon <= 3000]:  # others take minutes
         case = cases[name]
         for peer, build in PEERS.items():
             own, by_context, practice, regret = map(
                 np.array, zip(*(play(case, build, seed) for seed in range(NUM_SEEDS)), strict=True)
             )
             rows.append(row(name, case, peer, {"value": own, "by_context": by_context}, practice, regret))
-            print(rows[-1], flush=True)
-    with (HERE / "peers.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+        with (HERE / "peers.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
 
 
 if __name__ == "__main__":

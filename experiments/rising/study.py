@@ -17,7 +17,7 @@ from hpamdp.messages import exit_code
 HERE = Path(__file__).resolve().parent
 TABLES = {
     "by_context_share": "Share of the best split's gain over option 0 alone, if the final choice sees the context",
-    "value_share": "The same share with the policy's own final choice",
+    "best_choice_share": "The same share if the final choice is the truly better option: the practice alone",
     "by_context": "Final value, if the final choice sees the context: mean ± half of the 95 % interval",
     "practice": "Practice of each option in percent of the decisions",
     "regret": "Mean shortfall of a decision of training from the best split's final value",
