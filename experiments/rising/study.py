@@ -18,9 +18,7 @@ HERE = Path(__file__).resolve().parent
 TABLES = {
     "by_context_share": "Share of the best split's gain over option 0 alone, if the final choice sees the context",
     "best_choice_share": "The same share if the final choice is the truly better option: the practice alone",
-    "by_context": "Final value, if the final choice sees the context: mean ± half of the 95 % interval",
     "practice": "Practice of each option in percent of the decisions",
-    "regret": "Mean shortfall of a decision of training from the best split's final value",
 }
 
 
@@ -64,13 +62,12 @@ def table(rows: Rows, cases: Rows, column: str) -> str:
 
 
 def cell(row: dict, column: str) -> str:
-    """Return a number, a value with half of its interval, or the practice of all options in percent."""
+    """Return a share, or the practice of all options in percent."""
     if column == "practice":
         return " : ".join(f"{100 * row[f'practice_{i}']:.0f}" for i in range(3) if row[f"practice_{i}"] != "")
     if row[column] == "":
         return ""
-    value = round(row[column], 3) + 0.0  # no minus before a zero
-    return f"{value:.3f} ± {row[f'{column}_ci']:.3f}" if f"{column}_ci" in row else f"{round(value, 2) + 0.0:.2f}"
+    return f"{round(row[column], 2) + 0.0:.2f}"  # no minus before a zero
 
 
 def main(arguments: Sequence[str]) -> None:
