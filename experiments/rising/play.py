@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from hpamdp.policies.high_level.lin_thompson import LinThompson
 from hpamdp.policies.high_level.linucb import LinUCB
 from hpamdp.policies.high_level.meta_critic import MetaCritic
 from hpamdp.policies.high_level.ucb import UCB
+from hpamdp.policies.practice import CurvePractice, Practice
 from hpamdp.specs import PAMDPSpecs
 
 NUM_SEEDS = 50
@@ -34,48 +35,36 @@ CASES_OF_META_CRITIC = ("50 and 150", "200 and 800", "equal", "frozen", "hyar", 
 LINEAR = {"inputs": [0, 1], "degree": 5}
 
 
-class Practice(Protocol):
-    """What overrules a selector's choices so that options practise; the hook of `play_selector`."""
-
-    def probabilities(self, fraction: float) -> Tensor | None:
-        """Return with which probability each option overrules a decision, `[num_options]`; None: none does.
-
-        Called before each batch. The sum is at most 1.
-
-        Args:
-            fraction: of the run that is done.
-        """
-        ...
-
-    def learn(self, options: Tensor, returns: Tensor) -> None:
-        """Learn from the options and returns `[N]` of a batch, oldest first. Called after each batch."""
-        ...
-
-
-class UniformFirst:
-    """Let uniformly random options practise in the first part of the run, as `agent.uniform_option_steps` does."""
-
-    def __init__(self, num_options: int, part: float) -> None:
-        self.num_options, self.part = num_options, part
-
-    def probabilities(self, fraction: float) -> Tensor | None:
-        return torch.full((self.num_options,), 1.0 / self.num_options) if fraction < self.part else None
-
-    def learn(self, options: Tensor, returns: Tensor) -> None:
-        pass
-
-
 # Builds a selector for the specs, and what practises beside it.
-Build = Callable[[PAMDPSpecs, Case], tuple[Selector, Practice | None]]
+Build = Callable[[PAMDPSpecs, Case], tuple[Selector, Practice]]
+
+
+def alone(selector: type[Selector], **settings: Any) -> Build:
+    """Return what builds a selector that decides itself which option practises."""
+    return lambda specs, case: (selector(specs, **settings), Practice(case.num_options))
+
+
+def uniform(part: float, selector: type[Selector], **settings: Any) -> Build:
+    """Return what builds a selector beside options that practise equally in the first part of the run."""
+    return lambda specs, case: (selector(specs, **settings), Practice(case.num_options, int(part * case.horizon)))
+
+
+def curves(selector: type[Selector], **settings: Any) -> Build:
+    """Return what builds a selector beside options that practise by fitted curves, the default of runs."""
+    return lambda specs, case: (selector(specs, **settings), CurvePractice(case.num_options, case.horizon))
+
 
 SELECTORS: dict[str, Build] = {
-    "ucb": lambda specs, case: (UCB(specs), None),
-    "epsilon_greedy": lambda specs, case: (EpsilonGreedy(specs), None),
-    "linucb": lambda specs, case: (LinUCB(specs, **LINEAR), None),
-    "lin_thompson": lambda specs, case: (LinThompson(specs, **LINEAR), None),
-    "meta_critic": lambda specs, case: (MetaCritic(specs, gamma=1.0), None),
-    "linucb, uniform third": lambda specs, case: (LinUCB(specs, **LINEAR), UniformFirst(case.num_options, 1 / 3)),
-    "linucb, uniform half": lambda specs, case: (LinUCB(specs, **LINEAR), UniformFirst(case.num_options, 1 / 2)),
+    "ucb": alone(UCB),
+    "epsilon_greedy": alone(EpsilonGreedy),
+    "linucb": alone(LinUCB, **LINEAR),
+    "lin_thompson": alone(LinThompson, **LINEAR),
+    "meta_critic": alone(MetaCritic, gamma=1.0),
+    "linucb, uniform third": uniform(1 / 3, LinUCB, **LINEAR),
+    "linucb, uniform half": uniform(1 / 2, LinUCB, **LINEAR),
+    "linucb, curves": curves(LinUCB, **LINEAR),
+    "lin_thompson, curves": curves(LinThompson, **LINEAR),
+    "meta_critic, curves": curves(MetaCritic, gamma=1.0),
 }
 
 
@@ -105,40 +94,32 @@ def play(
     return {"value": value, "by_context": by_context}, practice / case.horizon, regret
 
 
-def play_selector(
-    case: Case, build: Build, seed: int, practice: Practice | None = None
-) -> tuple[float, np.ndarray, float]:
+def play_selector(case: Case, build: Build, seed: int) -> tuple[float, np.ndarray, float]:
     """Play a selector through its own interface; return its final value, practice `[K]` and regret.
 
     Args:
         case: the case.
         build: makes the selector, and what practises beside it.
         seed: of contexts, returns and choices.
-        practice: replaces what practises beside the selector.
     """
     torch.manual_seed(seed)
     rng, names = np.random.default_rng(seed), tuple(f"option{i}" for i in range(case.num_options))
     specs = PAMDPSpecs(2, names, parameter_dims=(1,), parameter_low=(-1.0,), parameter_high=(1.0,))
-    selector, own = build(specs, case)
-    practice = practice or own
+    selector, practice = build(specs, case)
     counts, earned = np.zeros(case.num_options), 0.0
     num_envs = max(NUM_ENVS, case.horizon // NUM_BATCHES)
     for done in range(0, case.horizon, num_envs):
         num = min(num_envs, case.horizon - done)
         bearing = rng.uniform(0.0, 360.0, num)
         td = decision(bearing)
+        selector.practice.copy_(practice.probabilities(done))
         with acting(ExplorationType.RANDOM), torch.no_grad():
             option = selector(td)[keys.OPTION]
-        if practice is not None and (probabilities := practice.probabilities(done / case.horizon)) is not None:
-            drawn = torch.cat([probabilities.double(), 1.0 - probabilities.double().sum(0, keepdim=True).clamp(0, 1)])
-            drawn = drawn.multinomial(num, replacement=True)
-            option = torch.where(drawn < case.num_options, drawn, option)
         returns, mean = sample_batch(case, rng, bearing, counts, option.numpy())
         earned += mean
         selector.learn(finished(td, option, returns))
         selector.pending.zero_()  # all decisions have ended
-        if practice is not None:
-            practice.learn(option, torch.from_numpy(returns).float())
+        practice.add(option, option, torch.from_numpy(returns))
     with acting(ExplorationType.DETERMINISTIC), torch.no_grad():
         choice = selector(decision(BEARINGS))[keys.OPTION].numpy()
     value = final_values(case, counts[None], choice[None])[0]
@@ -185,7 +166,7 @@ def play_case(name: str) -> Rows:
     for policy, build in POLICIES.items():
         rows.append(row(name, case, policy, *play(case, build)))
     for selector, build in SELECTORS.items():
-        if selector == "meta_critic" and name not in CASES_OF_META_CRITIC:
+        if selector.startswith("meta_critic") and name not in CASES_OF_META_CRITIC:
             continue
         played = [play_selector(case, build, seed) for seed in range(NUM_SELECTOR_SEEDS)]
         values, practice, regret = (np.array(each) for each in zip(*played, strict=True))

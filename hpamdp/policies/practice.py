@@ -4,9 +4,10 @@ A selector sees the returns of learners that improve with practice. It settles o
 first, and the others never practise enough to show what they can do. So another rule decides who practises:
 
 - A curve is fitted to the returns of each option over its own practice.
-- In the first half of the run all options practise equally, except those whose curve stays out of reach of the best.
-- In the second half, an option behind the best one overrules the selector if it would gain more from the practice that
-  is left. Otherwise the selector chooses, so that learners practise where they will be used.
+- An option behind the best one practises if it would gain more from the practice that is left: the more it would gain,
+  the more often.
+- Otherwise, in the first half of the run all options practise equally, except those whose curve stays out of reach of
+  the best one. In the second half the selector chooses, so that learners practise where they will be used.
 
 Sources: Heidari, Kearns and Roth 2016, *Tight Policy Regret Bounds for Improving and Decaying Bandits*, and Metelli,
 Trovo, Pirola and Restelli 2022, *Stochastic Rising Bandits*: options whose reward rises with their own pulls, compared
@@ -121,13 +122,12 @@ class CurvePractice(Practice):
         deviation = self._noise().sqrt()
         is_in_reach = level + gain + OUT_OF_REACH * deviation >= level.max()
         gain = torch.where(is_in_reach, gain, 0.0)
-        uniform = torch.full_like(level, LATE_UNIFORM / num_options)
-        if is_first_half:
-            uniform += (1.0 - LATE_UNIFORM) * is_in_reach / is_in_reach.sum()
         is_best = gain == gain.max()
-        advantage = (gain.max() - gain[level.argmax()]) / (CLEAR_ADVANTAGE * deviation)
-        of_best = (1.0 - uniform.sum()) * advantage.clamp(max=1.0) * is_best / is_best.sum()
-        return (uniform + of_best).float()
+        advantage = ((gain.max() - gain[level.argmax()]) / (CLEAR_ADVANTAGE * deviation)).clamp(max=1.0)
+        share = advantage * is_best / is_best.sum()
+        if is_first_half:
+            share += (1.0 - advantage) * is_in_reach / is_in_reach.sum()
+        return (LATE_UNIFORM / num_options + (1.0 - LATE_UNIFORM) * share).float()
 
     def curves(self, steps: int) -> tuple[Tensor, Tensor]:
         """Return each option's return now, and by how much so many more steps of practice would raise it.
