@@ -63,7 +63,7 @@ def test_a_run_without_end_practises_equally():
     for i in range(10):
         option = practice.probabilities(20 * i).argmax().expand(20)
         practice.add(option, option, torch.randn(20))
-    assert practice.own.tolist() == [100.0, 100.0]
+    assert practice.own_steps.tolist() == [100.0, 100.0]
 
 
 def test_forbidden_options_do_not_practise():

@@ -82,10 +82,11 @@ class AgentConfig(Settings):
     practice: Literal["auto", "curves"] | NonNegativeInt = "auto"
     """Which options practise while their learners improve, whatever the selector would choose.
 
-    `curves`: the option whose learner would gain most from the practice that is left; after four fifths of the run the
-    selector takes over. A number: all options equally, for so many steps at the start of training (decisions with
-    `low.freeze=true`); 0 leaves practice to the selector. `auto`: `curves` if the selector learns which option suits
-    which state, options last as long as their episodes, and each has its own learner; otherwise 0.
+    `curves`: an option behind the best one, if its learner would gain more from the practice that is left; otherwise
+    all options equally in the first half of the run, and the selector's choice in the second. A number: all options
+    equally, for so many steps at the start of training (decisions with `low.freeze=true`); 0 leaves practice to the
+    selector. `auto`: `curves` if the selector sees the state, options last as long as their episodes, and each has its
+    own learner; otherwise 0.
     """
 
 

@@ -403,7 +403,7 @@ class HierarchicalAgent(nn.Module):
         is_shared: whether the single learner observes the option. The learner's specs then count the one-hot option as
             part of the observation.
         is_frozen: whether the learners stay as they are.
-        practice: which options practise, whatever the selector would choose. If None, nobody counts it.
+        practice: which options practise, whatever the selector would choose. If None, no practice is counted.
         selector_ends_options: whether the selector decides where options end.
         option_lengths: the lengths that the selector chooses from together with an option, in steps. The selector's
             `specs` then list the pairs as options (`PAMDPSpecs.with_option_lengths`). If empty, it chooses options
@@ -498,12 +498,12 @@ class HierarchicalAgent(nn.Module):
         if self.selector is not None and self.next_options is not None:
             seen = ended_with_trips(batch) if self.selector_values_end_with_trips else batch
             seen = steps = self._seen_by_selector(seen)
-            scalars.update(self._practise(seen))
             self._set_pending(self.selector, seen)
             if self.next_options.decides_ends:
                 steps = self.next_options.with_steps_before(seen)
                 if self.selector_values_end_with_trips:  # the step before the batch may have ended a trip
                     steps = ended_with_trips(steps)
+            scalars.update(self._practise(seen, finished_decisions(steps)))
             learned = self.selector.learn_from_options(steps)
             learned = {**learned, **self.selector.learn_from_steps(seen), **self._mean_length(batch)}
             scalars.update({f"high/{name}": value for name, value in learned.items()})
@@ -651,22 +651,23 @@ class HierarchicalAgent(nn.Module):
     def _prefix_of(self, learner: int) -> str:
         return "low" if len(self.learners) == 1 else f"low/{self.specs.option_names[learner]}"
 
-    def _practise(self, batch: TensorDictBase) -> dict[str, float]:
-        """Count what the options of a batch `[*B, T]` have practised; return the probabilities of practice to log."""
+    def _practise(self, batch: TensorDictBase, decisions: TensorDictBase) -> dict[str, float]:
+        """Count the practice in a batch `[*B, T]` with these decisions `[N]`; return the next probabilities to log."""
         if self.selector is None or self.practice is None:
             return {}
-        decisions = finished_decisions(batch)
         returns = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1)
         self.practice.add(batch.get(keys.OPTION).flatten(), decisions.get(keys.OPTION), returns)
         self._set_practice()
+        if not self.practice.can_overrule:
+            return {}
         names = self.selector.specs.option_names
         return {f"high/practice_{name}": p for name, p in zip(names, self.selector.practice.tolist(), strict=True)}
 
     def practised(self) -> dict[str, float]:
         """Return the fraction of the steps that each choice of the selector has practised, by name."""
-        if self.selector is None or self.practice is None or not self.practice.own.any():
+        if self.selector is None or self.practice is None or not self.practice.own_steps.any():
             return {}
-        shares = (self.practice.own / self.practice.own.sum()).tolist()
+        shares = (self.practice.own_steps / self.practice.own_steps.sum()).tolist()
         return dict(zip(self.selector.specs.option_names, shares, strict=True))
 
     def _set_practice(self) -> None:

@@ -250,6 +250,9 @@ class Level:
         return None
 
 
+_CERTAIN = 0.999  # probabilities that sum to 1 may sum to slightly less in float32
+
+
 class Selector(Level, TensorDictModuleBase):
     """The high level: chooses an option at every decision and holds it until the next one.
 
@@ -286,7 +289,7 @@ class Selector(Level, TensorDictModuleBase):
     `[*B, observation_dim]`, `is_decision` bool `[*B, 1]` and, if the problem forbids options, `option_mask` bool
     `[*B, num_options]`. Forbidden options must neither be chosen nor count in a target. `forward` writes `out_keys`:
     `option` int64 `[*B]`. If `learn` needs to know more about a choice, such as its log-probability, append a key to
-    `out_keys`. Return it from `choose` and `choose_uniformly`, with first dimensions `[*B]`. The key is held with the
+    `out_keys`. Return it from `choose` and `choose_to_practise`, with first dimensions `[*B]`. The key is held with the
     option and is in the batch that `learn` gets.
 
     State: the same module acts in training and evaluation, with different numbers of environments. So the state of an
@@ -311,16 +314,16 @@ class Selector(Level, TensorDictModuleBase):
         modes: what the selector can learn from: its own choices (`train`), or a data set of other choices (`offline`).
             A data set lacks keys that a selector adds to `out_keys`, so such a selector usually has `train` alone.
         memory_key: key of the selector's memory of earlier decisions in a step; None if it has no memory.
-        learns_by_state: whether the selector learns which option suits which state. By default the options of such a
-            selector practise first, see `agent.practice`.
-        practice: with which probability an exploring choice is left to each option to practise, `[num_options]`, a
+        sees_state: whether the selector tells by the state which option is best. If true, `agent.practice=auto` can
+            mean `curves`.
+        practice: probability that an exploring decision is overruled in favour of each option, `[num_options]`, a
             buffer that the agent sets. With the remaining probability the selector chooses.
         pending: how many decisions for each option have not yet reached `learn`, int64 `[num_options]`. The agent sets
             this buffer after every batch. A selector that needs the number within a batch adds its own choices.
     """
 
     asks_learners: ClassVar[bool] = False
-    learns_by_state: ClassVar[bool] = False
+    sees_state: ClassVar[bool] = False
     added_later: ClassVar[tuple[str, ...]] = ("practice",)  # checkpoints of 0.3 have `is_uniform` in its place
     is_bandit: ClassVar[bool] = False
     ends_options: ClassVar[bool] = False
@@ -396,8 +399,20 @@ class Selector(Level, TensorDictModuleBase):
         mask = td.get(keys.OPTION_MASK, None)
         if mask is None:
             return practice
-        allowed = practice.clamp(min=1e-9) * mask  # of options that may all have no practice, one is drawn
-        return allowed * (practice.sum(-1, keepdim=True) / allowed.sum(-1, keepdim=True))
+        if self.practice.sum() < _CERTAIN:  # the selector chooses where an option that should practise is forbidden
+            return practice * mask
+        allowed = practice.clamp(min=1e-9) * mask  # if no allowed option has practice, sample one uniformly
+        return allowed / allowed.sum(-1, keepdim=True).clamp(min=1e-9)
+
+    def exploring_probabilities(self, td: TensorDictBase, own: Tensor) -> Tensor:
+        """Return with which probability exploring decisions fall on each option, by practice or by choice.
+
+        Args:
+            td: the step `[*B]`.
+            own: the selector's own probabilities, `[*B, num_options]`, 0 where forbidden.
+        """
+        practice = self.practice_in(td)
+        return (1.0 - practice.sum(-1, keepdim=True)) * own + practice
 
     def ends(self, td: TensorDictBase) -> Tensor:
         """Return whether the held `option` of `td` ends in each environment, bool `[*B]`.
@@ -510,14 +525,16 @@ class Selector(Level, TensorDictModuleBase):
 
     def _choose_or_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return what `choose` does, or `choose_to_practise` with the probability of practice if exploring."""
-        probability = float(self.practice.sum())
-        if is_greedy() or probability == 0.0:
+        if is_greedy() or not self.practice.any():
             return self.choose(td)
         practising = self.choose_to_practise(td)
-        if probability > 0.999:  # a sum of rounded numbers
+        if self.practice.sum() > _CERTAIN:
             return practising
-        practises = torch.rand(td.batch_size, device=self.practice.device, dtype=torch.float32) < probability
-        return {key: _where(practises, practising[key], value) for key, value in self.choose(td).items()}
+        draw = torch.rand(td.batch_size, device=self.practice.device, dtype=torch.float32)
+        practises = draw < self.practice_in(td).sum(-1)
+        is_decision = td.get(keys.IS_DECISION) & ~practises.unsqueeze(-1)
+        chosen = self.choose(td.copy().set(keys.IS_DECISION, is_decision))
+        return {key: _where(practises, practising[key], value) for key, value in chosen.items()}
 
 
 def _where(rows: Tensor, value: Tensor, other: Tensor) -> Tensor:

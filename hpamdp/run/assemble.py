@@ -263,7 +263,7 @@ def _practice(config: Config, selector: Selector | None) -> Practice | None:
     run = config.run
     practice = run.agent.practice
     if practice == "auto":
-        practises = selector is not None and selector.learns_by_state and not run.low.freeze
+        practises = selector is not None and selector.sees_state and not run.low.freeze
         lasts = run.agent.termination == "episode" and not compatibility.has_trips(config)
         practice = "curves" if practises and lasts and run.agent.sharing == "per_option" else 0
     if selector is None:

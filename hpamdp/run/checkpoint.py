@@ -485,7 +485,9 @@ class _Opened:
         own = module.state_dict(keep_vars=True)
         any_size = buffers_sized_by_data(module)
         if isinstance(saved, Mapping):
-            saved = {key: value for key, value in saved.items() if not key.endswith(".is_uniform")}  # of 0.3
+            # A selector of 0.3 has `is_uniform` in the place of `practice`.
+            dropped = {key.removesuffix("practice") + "is_uniform" for key in own if key.endswith(".practice")}
+            saved = {key: value for key, value in saved.items() if key not in dropped}
             later = added_later(module)
             lacks = {key for key in own if key in later or (may_lack and key.startswith(may_lack))} - saved.keys()
             own = {key: value for key, value in own.items() if key not in lacks}

@@ -28,6 +28,7 @@ from hpamdp.metrics_file import (
     rows_up_to,
     what_is_lost,
 )
+from hpamdp.policies.base import Learner
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.closing_table import ONE_OPTION, SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight
@@ -225,9 +226,12 @@ class Recorder:
     def _one_option(self) -> list[str]:
         """Return a line if the selector cannot tell states apart, in which another option may be better."""
         selector = self.parts.agent.selector
-        if selector is None or not selector.is_bandit or selector.learns_by_state or selector.memory_key is not None:
+        if selector is None or not selector.is_bandit or selector.sees_state or selector.memory_key is not None:
             return []
-        return [f"{self.config.high} holds the option that is best on average; high=value chooses one for each episode"]
+        learners = [type(each) for each in self.parts.agent.learners]
+        have_value = all(cls.value is not Learner.value and cls.value_setting is None for cls in learners)
+        better = "high=value" if have_value else "high=meta_critic"
+        return [f"{self.config.high} holds the option that is best on average; {better} chooses one for each episode"]
 
     def _write(self, folder: Path, played: Mapping[str, np.ndarray]) -> None:
         """Write the last evaluation, the summary, the figures and the film, and close the logger."""

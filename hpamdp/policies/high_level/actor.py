@@ -68,7 +68,7 @@ class Actor(OnPolicy, RemembersDecisions):
 
     Options = ActorOptions
     takes_pictures = True
-    learns_by_state = True
+    sees_state = True
     modes: ClassVar[tuple[str, ...]] = ("train",)
 
     def __init__(
@@ -112,9 +112,8 @@ class Actor(OnPolicy, RemembersDecisions):
 
     def _weight(self, td: TensorDictBase, log_probs: Tensor, option: Tensor) -> Tensor:
         """Return an option's probability under the policy over that of policy and practice together, `[*B]`."""
-        practice, policy = self.practice_in(td), log_probs.exp()
-        of_both = (1.0 - practice.sum(-1, keepdim=True)) * policy + practice
-        return (policy / of_both).gather(-1, option.unsqueeze(-1)).squeeze(-1)
+        policy = log_probs.exp()
+        return (policy / self.exploring_probabilities(td, policy)).gather(-1, option.unsqueeze(-1)).squeeze(-1)
 
     @torch.no_grad()
     def option_probabilities(self, td: TensorDictBase) -> Tensor:

@@ -97,10 +97,8 @@ class Exp3(Bandit):
         mask = td.get(keys.OPTION_MASK, None)
         if mask is not None:
             own = own * mask
-        own = own / own.sum(-1, keepdim=True)
-        practice = self.practice_in(td)
-        of_all = (1.0 - practice.sum(-1, keepdim=True)) * own + practice
-        return of_all.gather(-1, option.unsqueeze(-1)).squeeze(-1)
+        probabilities = self.exploring_probabilities(td, own / own.sum(-1, keepdim=True))
+        return probabilities.gather(-1, option.unsqueeze(-1)).squeeze(-1)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add the importance-weighted rewards of finished decisions to the gains.

@@ -66,7 +66,7 @@ class MetaCritic(RemembersDecisions):
 
     Options = MetaCriticOptions
     takes_pictures = True
-    learns_by_state = True
+    sees_state = True
     ends_options: ClassVar[bool] = True
     num_decisions: Tensor
 
@@ -150,7 +150,7 @@ class MetaCritic(RemembersDecisions):
         is_worse = masked_values(value, td.get(keys.OPTION_MASK, None)).argmax(-1) != td.get(keys.OPTION)
         if is_greedy():
             return is_worse
-        random_probability = max(self.epsilon, float(self.practice.sum()))
+        random_probability = 1.0 - (1.0 - self.epsilon) * (1.0 - float(self.practice.sum()))
         return is_worse | (torch.rand(is_worse.shape, device=is_worse.device, dtype=torch.float32) < random_probability)
 
     def decisions_to_update(self) -> dict[str, int]:

@@ -146,7 +146,7 @@ class OptionCritic(RemembersDecisions):
         """
         # If one option never terminated, the others would collect no data. Their values would stay wrong, and so would
         # the terminations learned from them. Therefore beta counts only as much as Q does in the choice.
-        random_probability = 0.0 if is_greedy() else max(self.epsilon, float(self.practice.sum()))
+        random_probability = 0.0 if is_greedy() else 1.0 - (1.0 - self.epsilon) * (1.0 - float(self.practice.sum()))
         beta = self.beta(self.seen(td), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None), random_probability)
         return beta > 0.5 if is_greedy() else torch.rand_like(beta) < beta
 

@@ -56,7 +56,7 @@ class Value(Selector):
     Options = ValueOptions
     learners_memory_key: str | None = None
     asks_learners = True
-    learns_by_state = True
+    sees_state = True
     takes_pictures = True
 
     def __init__(self, specs: PAMDPSpecs, options: ValueOptions | None = None, **settings: Any) -> None:

@@ -105,7 +105,7 @@ class LinearBandit(Selector):
     """
 
     is_bandit: ClassVar[bool] = True
-    learns_by_state = True
+    sees_state = True
     Options: ClassVar[type[LinearBanditOptions]] = LinearBanditOptions
     options: LinearBanditOptions
 
