@@ -135,7 +135,7 @@ def test_what_a_forbidden_action_is_worth_does_not_change_a_value(name):
 
     def value() -> torch.Tensor:
         torch.manual_seed(1)
-        return learner.value(observation, mask)
+        return learner.target_value(observation, mask)
 
     before = value()
     inflate(learner, 1)

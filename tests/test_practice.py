@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from hpamdp import keys
 from hpamdp.policies.high_level.linucb import LinUCB
+from hpamdp.policies.high_level.ucb import UCB
 from hpamdp.policies.practice import CurvePractice
 from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
@@ -61,9 +62,26 @@ def test_an_option_that_nobody_may_choose_does_not_keep_the_selector_waiting():
 def test_a_run_without_end_practises_equally():
     practice = CurvePractice(2, 10**12)
     for i in range(10):
-        option = practice.probabilities(20 * i).argmax().expand(20)
-        practice.add(option, option, torch.randn(20))
-    assert practice.own_steps.tolist() == [100.0, 100.0]
+        practice.add(torch.zeros(20).long(), torch.zeros(20).long(), torch.randn(20))
+        assert practice.probabilities(20 * i).tolist() == [0.5, 0.5]
+
+
+def test_a_resumed_run_that_is_longer_than_planned_keeps_its_curves():
+    practice = CurvePractice(1, TOTAL)
+    for i in range(2 * TOTAL // 20):
+        option = torch.zeros(20).long()
+        practice.add(option, option, torch.full((20,), float(i)))
+    assert practice.counts.sum() == 2 * TOTAL and practice.width == 2 * TOTAL / 100
+    means = practice.sums[0] / practice.counts[0]
+    assert (means.diff() > 0.0).all()
+
+
+def test_a_choice_that_practice_overrules_is_no_choice_of_the_bandit():
+    bandit = UCB(PAMDPSpecs(2, ("a", "b"), (1,), (-1.0,), (1.0,)))
+    bandit.practice.copy_(torch.tensor([0.0, 0.9]))
+    td = TensorDict({keys.OBSERVATION: torch.zeros(1000, 2), keys.IS_DECISION: torch.ones(1000, 1).bool()}, [1000])
+    bandit(td)
+    assert bandit.pending.sum() < 200
 
 
 def test_forbidden_options_do_not_practise():
