@@ -18,7 +18,7 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock_unseen import fleet, rules
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.env.boatdock_unseen.fleet import FleetRules
-from hpamdp.env.boatdock_unseen.registration import UNSEEN_BOATS_IDS
+from hpamdp.env.boatdock_unseen.registration import IDS
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.settings import SettingError
 
@@ -301,7 +301,7 @@ def test_the_kernel_does_what_the_tensor_functions_do(family, settings, is_evalu
 
 def test_tensors_are_as_the_specs_say_and_gymnasium_accepts_the_ids():
     check_env_specs(UnseenBoatsEnv(3), return_contiguous=True)
-    for env_id in UNSEEN_BOATS_IDS.values():
+    for env_id in IDS:
         env = gymnasium.make(env_id)
         observation, _ = env.reset(seed=0)
         assert observation in env.observation_space

@@ -258,31 +258,6 @@ def test_closing_closes_every_copy():
     assert not any(inner.unwrapped.is_open for inner in env.envs)
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_a_four_value_environment_behaves_like_its_gymnasium_form(form):
-    one = make(2, form=form, kwargs={"length": 4})
-    other = make(2, form=form, entry_point="toy_environments:OldToy")
-    for env in other.envs:
-        env.unwrapped.env.toy.length = 4
-    assert torch.equal(one.reset()["observation"], other.reset()["observation"])
-    assert one.parameter_dims == other.parameter_dims
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(5):
-        discrete = torch.randint(3, (2,), generator=generator)
-        parameters = 30.0 * torch.rand(2, sum(one.parameter_dims), generator=generator)
-        assert (step(one, discrete, parameters) == step(other, discrete, parameters)).all()
-    old_actions = other.envs[1].unwrapped.env.toy.actions
-    assert len(native(one, 1)) == 4 and all(map(equal, native(one, 1), old_actions))
-
-
-def test_the_time_limit_of_a_four_value_environment_is_a_truncation():
-    for length, flags in ((0, (False, True)), (3, (True, False))):
-        env = make(entry_point="toy_environments:OldToy", kwargs={"length": length, "limit": 3})
-        env.reset()
-        last = [step(env) for _ in range(3)][-1]
-        assert (last["terminated"].item(), last["truncated"].item()) == flags
-
-
 def mistake_in(**options) -> str:
     node = {"_target_": "hpamdp.env.gymnasium.environment.GymnasiumEnv", **options}
     with pytest.raises(ConfigError) as raised:
@@ -315,7 +290,7 @@ def mistake_in(**options) -> str:
         ({"entry_point": "nowhere:Toy"}, "nowhere:Toy: No module named 'nowhere'"),
         ({"entry_point": "toy_environments:Nobody"}, "there is no class or function Nobody in toy_environments"),
         ({"entry_point": "toy_environments"}, "must be a class or function, as package.module:name"),
-        ({"entry_point": "builtins:object", "max_steps": 5}, "is no environment"),
+        ({"entry_point": "builtins:object", "max_steps": 5}, "wrap an environment of gym with shimmy"),
         ({"id": "Toy-v0", "parameter_dims": [1, 1, 1]}, "is for one Box for all discrete actions, but each has"),
         (
             {"entry_point": "toy_environments:Mixed", "max_steps": 5, "kwargs": {"is_text": True}},

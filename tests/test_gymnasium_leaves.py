@@ -144,13 +144,12 @@ def test_numbers_outside_their_bounds_are_clipped_or_kept_if_asked():
         ObservationSpace(UNIT, None, "wrap")
 
 
-@pytest.mark.parametrize("entry_point", ["toy_environments:Toy", "toy_environments:OldToy"])
-def test_bounds_hold_for_resets_and_steps(entry_point, monkeypatch):
+def test_bounds_hold_for_resets_and_steps(monkeypatch):
     monkeypatch.setattr(Toy, "_observation", lambda self: np.array([0.0, -1.0 - self.steps]))
-    clipped, kept = (make(entry_point=entry_point, out_of_bounds=setting) for setting in ("clip", "allow"))
+    clipped, kept = (make(out_of_bounds=setting) for setting in ("clip", "allow"))
     assert [clipped.reset()["observation"][0, 1], step(clipped)["observation"][0, 1]] == [0.0, 0.0]
     assert [kept.reset()["observation"][0, 1], step(kept)["observation"][0, 1]] == [-1.0, -2.0]
-    env = make(entry_point=entry_point)
+    env = make()
     with pytest.raises(
         ProblemError, match=r"^GymnasiumEnv: .* environment 0: .* value is -1 at index 1, outside its b"
     ):

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
 from conftest import compose_config
 from gymnasium_players import step
-from toy_environments import OldToy, Toy
+from toy_environments import Toy
 
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
@@ -30,14 +29,6 @@ class Limited(Toy):
     def __init__(self, limit: object = 4):
         super().__init__()
         self.spec = gymnasium.envs.registration.EnvSpec("Limited-v0", max_episode_steps=limit)
-
-
-class OldLimited(OldToy):
-    """The same with the interface of gym."""
-
-    def __init__(self, limit: object = 4):
-        super().__init__()
-        self.spec = SimpleNamespace(max_episode_steps=limit)
 
 
 def wrapped(*limits: int) -> gymnasium.Env:
@@ -118,11 +109,9 @@ def episode_length(env: GymnasiumEnv) -> int:
     ("options", "length"),
     [
         ({"entry_point": "Limited"}, 4),
-        ({"entry_point": "OldLimited"}, 4),
         ({"entry_point": "Limited", "kwargs": {"limit": np.int64(3)}}, 3),
         ({"entry_point": "Limited", "max_steps": 2}, 2),
         ({"entry_point": "Limited", "max_steps": 6}, 6),
-        ({"entry_point": "OldLimited", "max_steps": 6}, 6),
         ({"entry_point": "Limited", "kwargs": {"limit": "ten"}, "max_steps": 5}, 5),
     ],
 )
@@ -147,13 +136,12 @@ def test_a_limit_above_the_environments_own_is_refused(monkeypatch):
 
 
 @pytest.mark.parametrize("limit", [0, -5, "ten", 10.0, True, float("nan"), [3]])
-@pytest.mark.parametrize("name", ["Limited", "OldLimited"])
-def test_a_limit_that_is_no_number_of_steps_is_reported_in_one_line(name, limit):
+def test_a_limit_that_is_no_number_of_steps_is_reported_in_one_line(limit):
     expected = (
         r"imited: its spec has max_episode_steps=.*, which must be a whole number of at least 1; set env.max_steps$"
     )
     with pytest.raises(ValueError, match=expected):
-        GymnasiumEnv(entry_point=f"{__name__}:{name}", kwargs={"limit": limit})
+        GymnasiumEnv(entry_point=f"{__name__}:Limited", kwargs={"limit": limit})
 
 
 @pytest.mark.parametrize("limit", [None, -1])

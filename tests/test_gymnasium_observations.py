@@ -99,11 +99,11 @@ def test_an_environment_for_evaluation_follows_the_statistics_without_updating_t
 
 
 def test_an_entry_outside_its_space_is_named_with_the_setting_that_leaves_it_out():
-    env = GymnasiumEnv(2, entry_point="toy_environments:OldGoal", kwargs={"tick": 198}, max_steps=9)
+    env = GymnasiumEnv(2, entry_point="toy_environments:TickingGoal", kwargs={"tick": 198}, max_steps=9)
     assert env.reset()["observation"].shape == (2, 217)
     with pytest.raises(ProblemError) as raised:
         env.rollout(5)
-    line = "OldGoal: environment 0: gave an observation whose entry 1 is 200, outside Discrete(200); "
+    line = "TickingGoal: environment 0: gave an observation whose entry 1 is 200, outside Discrete(200); "
     assert str(raised.value).endswith(f"{line}env.observation_keys=[0] leaves the entry out")
 
 
@@ -128,13 +128,18 @@ def test_entries_are_chosen_in_their_order():
 @pytest.mark.parametrize("entries", [[], ["a"], [0, 0], [2]])
 def test_entries_that_are_not_there_are_refused(entries):
     with pytest.raises(ValueError, match=r"observation_keys=.*: must name different entries of \[0, 1\]"):
-        GymnasiumEnv(entry_point="toy_environments:OldGoal", max_steps=9, observation_keys=entries)
+        GymnasiumEnv(entry_point="toy_environments:TickingGoal", max_steps=9, observation_keys=entries)
     with pytest.raises(ValueError, match="has no entries; use null"):
         make(observation_keys=entries)
 
 
 def test_an_environment_with_a_counter_that_leaves_its_space_trains_unchanged(tmp_path):
-    words = ["env=gymnasium", "env.entry_point=toy_environments:OldGoal", "env.max_steps=9", "env.kwargs={tick:197}"]
+    words = [
+        "env=gymnasium",
+        "env.entry_point=toy_environments:TickingGoal",
+        "env.max_steps=9",
+        "env.kwargs={tick:197}",
+    ]
     words += ["high=none", "low=hppo", "num_envs=4", "steps_per_batch=4", "total_frames=64", "eval.layouts=2"]
     words += ["low.minibatch_size=16"]
     assert run(compose_config([*words, "env.observation_keys=[0]"]), tmp_path / "chosen") == 0

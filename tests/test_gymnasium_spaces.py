@@ -1,4 +1,4 @@
-"""Spaces of Gymnasium and of gym are read as documented, and all others are refused in one line."""
+"""Spaces of Gymnasium are read as documented, and all others are refused in one line."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.spaces import Box, Dict, Discrete, Graph, OneOf, Sequence, Text, Tuple
-from toy_environments import FORMS, MIXED, ONE, PAIR, TWO, Toy, old_space
+from toy_environments import FORMS, MIXED
 
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
-from hpamdp.env.gymnasium.four_value import FourValueEnv, to_gymnasium
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 from hpamdp.env.gymnasium.scaling import ObservationScaling
 
@@ -133,28 +132,3 @@ def test_running_statistics_keep_the_unit_of_constant_entries_and_clip():
     for _ in range(300):
         assert space.scaled(np.array([[3.0, 1e8]])).tolist() == [[0.0, 0.0]]
     assert space.scaled(np.array([[4.0, 1e8]]))[0].tolist() == [10.0, 0.0]
-
-
-def test_spaces_of_gym_are_recognised_by_their_attributes():
-    parts = [spaces.Discrete(3, start=2), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(4), TWO, ONE, PAIR]
-    parts += [spaces.Dict([("b", TWO), ("a", ONE)]), spaces.Box(0.0, 1.0, ())]
-    space = spaces.Tuple(parts)
-    assert to_gymnasium(old_space(space)) == space
-    assert list(to_gymnasium(old_space(parts[6])).spaces) == ["b", "a"]
-    with pytest.raises(ValueError, match="is no known space"):
-        to_gymnasium(object())
-
-
-class Halfway(Toy):
-    """An environment with Gymnasium's interface that is wrapped as if it had that of gym."""
-
-
-def test_an_environment_without_the_interface_of_gym_is_refused():
-    env = FourValueEnv(Halfway())
-    with pytest.raises(ValueError, match=r"Halfway returned an info, too; .* must inherit"):
-        env.reset()
-    env.env.reset()
-    with pytest.raises(ValueError, match=r"Halfway returned 5 values, not 4; .* must inherit"):
-        env.step(env.action_space.sample())
-    with pytest.raises(ValueError, match="is no environment: it has no reset, step, action_space, observation_space"):
-        FourValueEnv(object())

@@ -2,14 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-import os
 import re
-import struct
-import time
-import tracemalloc
-import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,31 +13,21 @@ import torch
 
 from hpamdp.data.errors import DataError
 from hpamdp.data.human import released_file
-from hpamdp.data.human.released_file import HumanData, read
+from hpamdp.data.human.released_file import read
 from hpamdp.env.boatdock import harbour, physics
 
-REAL = os.environ.get(released_file.PATH_VARIABLE)
-needs_real = pytest.mark.skipif(not REAL, reason=f"{released_file.PATH_VARIABLE} is not set")
 OUTCOMES = {1: physics.OUT_OF_FUEL, 2: physics.SUCCESS, 3: physics.TOO_FAST, 4: physics.OUT_OF_BOUNDS}
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory) -> list[bytes]:
-    """Two people, eight episodes each, compressed and plain."""
-    people = [episodes[:8] for episodes in synthetic_human.recording()[:2]]
-    folder = tmp_path_factory.mktemp("small")
-    return [synthetic_human.write(folder / "a.mat", people, compressed=c).read_bytes() for c in (True, False)]
-
-
-def assert_same_as_scipy(loaded: dict[str, np.ndarray], data: HumanData) -> None:
-    """Compare the tables with what `scipy.io.loadmat` returned, episode by episode."""
+def test_tables_hold_the_recording(tmp_path):
+    people = synthetic_human.recording()
+    data = read(synthetic_human.write(tmp_path / "people.mat", people), checksum=None)
     row = 0
-    people = loaded["trajectories"].ravel()
-    assert len(data.episodes) == sum(person.size for person in people)
-    flat = [(p, i, e[0, 0]) for p, person in enumerate(people) for i, e in enumerate(person.ravel())]
+    flat = [(p, i, raw) for p, person in enumerate(people) for i, raw in enumerate(person)]
+    assert len(data.episodes) == len(flat)
     episodes, columns = ({name: values.numpy() for name, values in table.items()} for table in data)
     for number, (p, i, raw) in enumerate(flat):
-        fields = {name: np.ravel(raw[name]).astype(float) for name in raw.dtype.names}
+        fields = {name: np.ravel(values).astype(float) for name, values in raw.items()}
         episode = {name: values[number] for name, values in episodes.items()}
         num = fields["gas"].size
         assert (episode["person"], episode["index"], episode["presses"]) == (p, i, num)
@@ -71,22 +54,6 @@ def assert_same_as_scipy(loaded: dict[str, np.ndarray], data: HumanData) -> None
         assert num == 0 or np.isnan(columns["next_position"][rows][-1]).all()
         row += num
     assert row == len(data.presses)
-
-
-def test_tables_hold_what_scipy_reads(tmp_path):
-    path = synthetic_human.write(tmp_path / "people.mat")
-    assert_same_as_scipy(scipy.io.loadmat(path), read(path, checksum=None))
-
-
-@needs_real
-@pytest.mark.slow
-def test_tables_of_the_released_file_hold_what_scipy_reads_in_at_most_twenty_times_its_time():
-    start = time.process_time()
-    loaded = scipy.io.loadmat(REAL)
-    scipys = time.process_time() - start
-    data = read(REAL)
-    assert time.process_time() - start - scipys < 20.0 * scipys
-    assert_same_as_scipy(loaded, data)
 
 
 def test_released_file_has_the_published_counts(people):
@@ -135,124 +102,16 @@ def test_default_path_is_that_of_the_environment_variable_or_in_the_cache(monkey
     assert released_file.default_path().name == "BDtrajectory40.mat"
 
 
-def damaged(data: bytes, case: int, rng: np.random.Generator) -> bytes:
-    """Return the bytes cut, with bits flipped, or with foreign bytes in them, by the case's number."""
-    if case % 3 == 0:
-        return data[: rng.integers(len(data))]
-    altered = bytearray(data)
-    if case % 3 == 1:
-        for place in rng.integers(len(data), size=rng.integers(1, 4)):
-            altered[place] ^= 1 << rng.integers(8)
-        return bytes(altered)
-    at, length = rng.integers(len(data)), rng.integers(1, 64)
-    foreign = rng.bytes(length) if case % 2 else bytes([0xFF, 0x7F, 0, 0x0E][case % 4 : case % 4 + 1]) * length
-    altered[at : at + (length if case % 4 else 0)] = foreign
-    return bytes(altered)
-
-
-@pytest.mark.parametrize("form", ["compressed", "plain"])
-def test_damaged_files_are_refused_or_still_consistent(small, tmp_path, form):
-    """300 cases of each form. Where the damaged values are not redundant, the tables are still well formed."""
-    data, path = small[form == "plain"], tmp_path / "damaged.mat"
-    rng, refused = np.random.default_rng(0), 0
-    for case in range(300):
-        path.write_bytes(damaged(data, case, rng))
-        try:
-            episodes, presses = read(path, checksum=None)
-        except DataError as error:
-            assert "\n" not in str(error)
-            refused += 1
-            continue
-        assert len(presses) == episodes["presses"].sum() and len(episodes) == 16
-        assert presses.select("position", "duration", "speed", "distance", "gas").isfinite().all()
-        assert ((presses["duration"] > 0) & (presses["duration"] <= 2)).all()
-        assert set(episodes["outcome"].tolist()) <= {1, 2, 3, 4}
-        assert set(episodes["controller"].tolist()) <= {0, 1} and set(episodes["keymap"].tolist()) <= {1, 2}
-        offset = presses["position"] - episodes["centre"][presses["episode"]]
-        assert (offset.norm(dim=1) <= 120.01).all()
-        assert torch.isnan(presses["next_position"]).all(1).equal(presses["is_final"])
-    assert refused > (290 if form == "compressed" else 180)
-
-
-HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
-
-
-def element(kind: int, content: bytes) -> bytes:
-    return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
-
-
-def array(kind: int, dims: tuple[int, ...], content: bytes, name: bytes = b"trajectories") -> bytes:
-    flags = element(6, struct.pack("<II", kind, 0))
-    return element(14, flags + element(5, struct.pack(f"<{len(dims)}i", *dims)) + element(1, name) + content)
-
-
-def deep(levels: int) -> bytes:
-    head = array(1, (1, 1), b"")[8:]
-    sizes = [len(head) + (levels - level) * (len(head) + 8) for level in range(levels + 1)]
-    return b"".join(struct.pack("<II", 14, size) + head for size in sizes)
-
-
-def zeros(size: int) -> bytes:
-    squeeze = zlib.compressobj()
-    body = squeeze.compress(struct.pack("<II", 14, size))
-    for _ in range(size >> 20):
-        body += squeeze.compress(bytes(1 << 20))
-    body += squeeze.flush()
-    return struct.pack("<II", 15, len(body)) + body
-
-
-HOSTILE = {
-    "a billion cells": array(1, (1, 2**30), b""),
-    "overflowing dimensions": array(1, (2**31 - 1,) * 8, b""),
-    "negative dimensions": array(1, (-1, 4), b""),
-    "a hundred thousand nested cells": deep(100_000),
-    # Packed by the test alone, since that takes seconds.
-    "a gigabyte of zeros": functools.partial(zeros, 1 << 30),
-    "an element larger than the file": struct.pack("<II", 14, 0xFFFFFFF0) + bytes(64),
-    "a matrix of another class": array(6, (1, 1), element(9, bytes(8))),
-    "cells of numbers": array(1, (1, 1), array(6, (1, 1), element(9, bytes(8)), b"")),
-    "structs without fields": array(1, (1, 1), array(1, (1, 1), array(2, (1, 1), element(5, bytes(4)), b""), b"")),
-    "no cells": array(1, (1, 0), b""),
-    "another variable": array(6, (1, 1), element(9, bytes(8)), b"x"),
-    "a hundred thousand variables": array(6, (1, 1), element(9, bytes(8)), b"x") * 100_000,
-    "nothing": b"",
-}
-
-
-def seconds_traced(function: Callable[[], object]) -> float:
-    """Return the CPU seconds of a call that takes less than 300 MB."""
-    tracemalloc.start()
-    start = time.process_time()
-    try:
-        function()
-        taken = time.process_time() - start
-        assert tracemalloc.get_traced_memory()[1] < 300e6
-    finally:
-        tracemalloc.stop()
-    return taken
-
-
-@pytest.fixture(scope="module")
-def seconds_of_a_valid_file(tmp_path_factory) -> float:
-    path = synthetic_human.write(tmp_path_factory.mktemp("valid") / "people.mat")
-    return seconds_traced(lambda: read(path, checksum=None))
-
-
-@pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=[pytest.mark.slow] if "gigabyte" in case else []) for case in HOSTILE]
-)
-def test_hostile_files_are_refused_in_little_time_and_memory(tmp_path, case, seconds_of_a_valid_file):
-    path = tmp_path / "hostile.mat"
-    content = HOSTILE[case]
-    path.write_bytes(HEADER + (content() if callable(content) else content))
-    # The valid file has 31 kB and takes about 0.2 s.
-    assert seconds_traced(lambda: refusal(path, checksum=None)) < 10.0 * seconds_of_a_valid_file
-
-
-@pytest.mark.parametrize("data", [b"", b"PK\x03\x04" * 100, bytes(4096), HEADER[:124] + b"\x01\x00MI" + bytes(64)])
-def test_foreign_files_are_refused(tmp_path, data):
-    (tmp_path / "foreign.mat").write_bytes(data)
-    refusal(tmp_path / "foreign.mat", checksum=None)
+@pytest.mark.parametrize("form", ["empty", "zip", "zeros", "cut", "another variable", "numbers"])
+def test_foreign_files_are_refused(tmp_path, form):
+    path = synthetic_human.write(tmp_path / "foreign.mat", [synthetic_human.recording()[0][:2]])
+    variables = {"another variable": {"x": 1.0}, "numbers": {"trajectories": np.ones((1, 2))}}
+    if form in variables:
+        scipy.io.savemat(path, variables[form])
+    else:
+        whole = path.read_bytes()
+        path.write_bytes({"empty": b"", "zip": b"PK\x03\x04" * 100, "zeros": bytes(4096), "cut": whole[:-99]}[form])
+    assert "this is not a MATLAB file with people's trajectories" in refusal(path, checksum=None)
 
 
 WRONG = {

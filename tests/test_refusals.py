@@ -143,7 +143,7 @@ REFUSED = [
     ("logger=wandb logger.project=''", 'logger.project="": must have at least 1 character (WandbLogger'),
     # Observations of others.
     (
-        GYMNASIUM + "env.entry_point=toy_environments:OldGoal env.observation_keys=[2]",
+        GYMNASIUM + "env.entry_point=toy_environments:TickingGoal env.observation_keys=[2]",
         "observation_keys=[2]: must name different entries of [0, 1]; null: all",
     ),
     (

@@ -8,10 +8,7 @@ import hpamdp.env
 from hpamdp.env.registration import register
 
 REGISTRATION = """
-import gymnasium
-
-def register():
-    gymnasium.register("MadeUp-v0", entry_point="nowhere:MadeUp")
+IDS = {"MadeUp-v0": {"entry_point": "nowhere:MadeUp"}}
 """
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections import OrderedDict
-from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import gymnasium
@@ -188,43 +186,8 @@ class Killed(Toy):
         return super().step(action)
 
 
-def old_space(space: spaces.Space) -> Any:
-    """Return an object with the attributes of a `gym` space and no others."""
-    if isinstance(space, spaces.Tuple):
-        return SimpleNamespace(spaces=[old_space(part) for part in space.spaces], shape=None)
-    if isinstance(space, spaces.Dict):
-        return SimpleNamespace(spaces=OrderedDict((name, old_space(part)) for name, part in space.spaces.items()))
-    names = ("low", "high", "shape", "dtype") if isinstance(space, spaces.Box) else ("n", "start", "nvec", "shape")
-    return SimpleNamespace(**{name: getattr(space, name) for name in names if hasattr(space, name)})
-
-
-class OldToy:
-    """Toy with the four-value interface and the time limit of `gym`, and no `gymnasium.Env`."""
-
-    def __init__(self, form: str = "nested", length: int = 0, limit: int = 0):
-        self.toy = Toy(form, length)
-        self.limit = limit
-        self.action_space, self.observation_space = map(old_space, (self.toy.action_space, self.toy.observation_space))
-        self.seeds: list[int | None] = []
-
-    def seed(self, seed: int | None = None) -> list[int | None]:
-        self.seeds.append(seed)
-        return [seed]
-
-    def reset(self) -> Any:
-        seed = self.seeds.pop() if self.seeds else None
-        return self.toy.reset(seed=seed)[0]
-
-    def step(self, action: Any) -> tuple[Any, float, bool, dict]:
-        observation, reward, done, _, info = self.toy.step(action)
-        if self.toy.steps == self.limit:
-            info["TimeLimit.truncated"] = not done
-            done = True
-        return observation, reward, done, info
-
-
-class OldGoal:
-    """Has the spaces and the interface of gym-goal, and its counter of ticks, which leaves the space after 200 of them.
+class TickingGoal(gymnasium.Env):
+    """Has the spaces of gym-goal, and its counter of ticks, which leaves the space after 200 of them.
 
     Args:
         tick: of an episode's start.
@@ -232,22 +195,21 @@ class OldGoal:
 
     def __init__(self, tick: int = 0):
         boxes = [spaces.Box(-np.ones(size, np.float32), np.ones(size, np.float32)) for size in (2, 1, 1)]
-        self.action_space = old_space(spaces.Tuple([spaces.Discrete(3), spaces.Tuple(boxes)]))
-        self.observation_space = old_space(
-            spaces.Tuple([spaces.Box(-np.ones(17), np.ones(17), dtype=np.float32), spaces.Discrete(200)])
-        )
+        self.action_space = spaces.Tuple([spaces.Discrete(3), spaces.Tuple(boxes)])
+        state = spaces.Box(-np.ones(17), np.ones(17), dtype=np.float32)
+        self.observation_space = spaces.Tuple([state, spaces.Discrete(200)])
         self.first = tick
         self.tick = tick
 
-    def reset(self) -> Any:
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
         self.tick = self.first
-        return np.zeros(17, np.float32), self.tick
+        return (np.zeros(17, np.float32), self.tick), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, dict]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
         discrete, parameters = action
         self.tick += 1
         state = np.full(17, parameters[discrete][0] / 2.0, np.float32)
-        return (state, self.tick), float(state[0]), self.tick >= self.first + 5, {}
+        return (state, self.tick), float(state[0]), self.tick >= self.first + 5, False, {}
 
 
 def make_toy(**kwargs: Any) -> gymnasium.Env:

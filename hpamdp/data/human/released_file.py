@@ -19,7 +19,6 @@ from tensordict import TensorDict
 
 from hpamdp.data.errors import DataError
 from hpamdp.data.human import schema
-from hpamdp.data.human.matfile import read_variable
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.files import read_regular
 from hpamdp.messages import reason_of
@@ -79,7 +78,8 @@ def read(path: Path | str | None = None, *, checksum: str | None = SHA256, one_f
 
     Args:
         path: the file. If None, `default_path`.
-        checksum: the SHA-256 that the file must have. If None, any file with consistent contents is accepted.
+        checksum: the SHA-256 that the file must have. If None, any file with consistent contents is accepted. A
+            damaged file can then crash SciPy's reader or fill the memory, so read only files that you trust.
         one_frame: whether to move every position so that all harbours have the environment's centre, (640, 512). Half
             the people saw theirs at (672, 504).
 
@@ -91,7 +91,7 @@ def read(path: Path | str | None = None, *, checksum: str | None = SHA256, one_f
     if checksum is not None:
         check_sum(data, checksum, path)
     try:
-        columns = schema.columns(read_variable(data, "trajectories"))
+        columns = schema.columns(data)
         schema.check(columns)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error

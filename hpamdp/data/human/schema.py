@@ -7,14 +7,15 @@ Much of the recording is redundant, so the rules find most damaged files. Distan
 from __future__ import annotations
 
 from collections.abc import Iterator
+from io import BytesIO
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from hpamdp.data.errors import DataError
-from hpamdp.data.human.matfile import MatArray, some
 from hpamdp.env.boatdock import harbour, physics, task
+from hpamdp.messages import first_line
 
 SPEED_UNIT = 10.0  # px/s of the column `velocity`
 _DIRECTION_UNIT = 10.0
@@ -47,30 +48,45 @@ class Columns(NamedTuple):
     fields: dict[str, np.ndarray]
 
 
-def columns(trajectories: MatArray) -> Columns:
-    """Return the columns of the variable `trajectories`.
+def columns(data: bytes) -> Columns:
+    """Return the columns of the variable `trajectories` of a MATLAB file.
 
     It is a cell array of people. Each person is a cell array of episodes, and each episode is a struct.
 
     Raises:
-        DataError: the variable has another structure, or a field is missing or has the wrong size.
+        DataError: the file is damaged or has another structure, or a field is missing or has the wrong size.
     """
-    gathered: dict[str, list[np.ndarray]] = {name: [] for name in sorted(_WIDTHS)}
-    rows: list[tuple[int, int, int]] = []
-    for person, cell in enumerate(trajectories.cells()):
-        for index, episode in enumerate(cell.cells()):
-            try:
-                fields = {name: array.numbers() for name, array in episode.fields().items()}
-                rows.append((person, index, _num_presses(fields)))
-            except DataError as error:
-                raise DataError(f"person {person}, episode {index}: {error}") from error
-            for name, values in gathered.items():
-                values.append(fields[name])
-    if not rows:
+    try:
+        episodes = list(_episodes(data))
+    except Exception as error:  # SciPy raises errors of many types
+        message = f"{type(error).__name__}: {first_line(error)}"
+        raise DataError(f"this is not a MATLAB file with people's trajectories ({message})") from error
+    if not episodes:
         raise DataError("the file has no episodes")
-    person, episode_index, num_presses = np.array(rows, np.int64).T
-    stacked = {name: np.concatenate(values).reshape(-1, _WIDTHS[name]) for name, values in gathered.items()}
-    return Columns(person, episode_index, num_presses, stacked)
+    rows: list[tuple[int, int, int]] = []
+    for person, index, fields in episodes:
+        try:
+            rows.append((person, index, _num_presses(fields)))
+        except DataError as error:
+            raise DataError(f"person {person}, episode {index}: {error}") from error
+    people, indices, num_presses = np.array(rows, np.int64).T
+    stacked = {
+        name: np.concatenate([fields[name] for _, _, fields in episodes]).reshape(-1, _WIDTHS[name])
+        for name in sorted(_WIDTHS)
+    }
+    return Columns(people, indices, num_presses, stacked)
+
+
+def _episodes(data: bytes) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
+    """Yield the person, the number and the fields of each episode."""
+    from scipy.io import loadmat
+
+    people = loadmat(BytesIO(data), variable_names=["trajectories"])["trajectories"]
+    for person, episodes in enumerate(people.ravel("F")):
+        for index, episode in enumerate(episodes.ravel("F")):
+            # SciPy returns whole numbers as uint8 or uint16, whose differences wrap.
+            fields = {name: episode[name].item().ravel("F").astype(np.float64) for name in episode.dtype.names}
+            yield person, index, fields
 
 
 def _num_presses(fields: dict[str, np.ndarray]) -> int:
@@ -80,7 +96,7 @@ def _num_presses(fields: dict[str, np.ndarray]) -> int:
         DataError: a field is missing or unknown, or has the wrong size.
     """
     if set(fields) != set(_WIDTHS):
-        raise DataError(f"the fields are {some(sorted(fields))}")
+        raise DataError(f"the fields are {', '.join(sorted(fields))}")
     num = len(fields["gas"])
     sizes = {
         **{name: width * num for name, width in _PER_PRESS.items()},

@@ -1,12 +1,5 @@
 """The Gymnasium id of Catch Point."""
 
-from __future__ import annotations
+from hpamdp.env.registration import batched
 
-from hpamdp.env.registration import register_batched_env
-
-CATCH_POINT_ID = "hpamdp/CatchPoint-v0"
-
-
-def register() -> None:
-    """Register the id with Gymnasium; calling it again changes nothing."""
-    register_batched_env(CATCH_POINT_ID, "hpamdp.env.catch_point.environment:CatchPointEnv")
+IDS = {"hpamdp/CatchPoint-v0": batched("hpamdp.env.catch_point.environment:CatchPointEnv")}

@@ -52,11 +52,7 @@ class GymnasiumOptions(Settings):
     id: str | None = None
     """The registered name, as `gymnasium.make` takes it; `module:Name-v0` imports the module, which registers it."""
     entry_point: str | None = None
-    """Instead of `id`, a class or function `package.module:name` that returns the environment.
-
-    The environment may have the interface of gym, with four values from `step`; `gym:make` makes environments that are
-    registered with gym.
-    """
+    """Instead of `id`, a class or function `package.module:name` that returns the environment."""
     kwargs: dict[str, Any] | None = None
     """Arguments of the environment's constructor, as in `env.kwargs={size:5}`."""
     max_steps: PositiveInt | None = None

@@ -13,7 +13,6 @@ import gymnasium
 
 from hpamdp.env.errors import ProblemError, fault_of
 from hpamdp.env.gymnasium.contract import checked
-from hpamdp.env.gymnasium.four_value import FourValueEnv
 from hpamdp.messages import one_line
 from hpamdp.settings import SettingError
 
@@ -82,7 +81,10 @@ class Maker:
         if isinstance(env, type):
             raise SettingError(f"{self.name}: returned the class {env.__name__}, not an environment; call it")
         if not isinstance(env, gymnasium.Env):
-            env = FourValueEnv(env)
+            raise SettingError(
+                f"{self.name}: {type(env).__name__} is no environment, because it does not inherit from gymnasium.Env; "
+                "wrap an environment of gym with shimmy's GymV21CompatibilityV0"
+            )
         for space in ("action_space", "observation_space"):
             if not hasattr(env, space):
                 raise SettingError(f"{self.name}: {type(env).__name__} has no {space}")
