@@ -75,11 +75,14 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows, Rows]:
     curves: Rows = []
     choices: Rows = []
     for run in runs:
+        practice = run.config["agent"].get("practice", run.config["agent"].get("uniform_option_steps", 0))
+        if not isinstance(practice, int):  # runs whose options practise by curves belong to ../whole_map
+            continue
         name = {
             "high": run.summary["high"],
             "low": run.summary["low"],
             "total": run.config["total_frames"],
-            "uniform_option_steps": run.config["agent"].get("uniform_option_steps", 0),
+            "uniform_option_steps": practice,
             "seed": run.summary["seed"],
         }
         figures = {column: round(run.summary[key], 4) for column, key in COLUMNS.items()}

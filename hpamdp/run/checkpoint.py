@@ -39,6 +39,7 @@ from hpamdp.files import regular_size, replacing
 from hpamdp.messages import first_line, reason_of, warn
 from hpamdp.policies.agent import FOR_TRAINING, HierarchicalAgent
 from hpamdp.policies.base import Learner, Level, added_later
+from hpamdp.policies.practice import Practice
 from hpamdp.policies.shared.on_policy import WAITING
 from hpamdp.run.state_checks import (
     Progress,
@@ -511,7 +512,7 @@ class _Opened:
                 raise ValueError(f"{key} differs from another name of the same weights")
             state[key] = first
         for prefix, part in module.named_modules():
-            if isinstance(part, Level):
+            if isinstance(part, Level | Practice):
                 start = f"{prefix}." if prefix else ""
                 part.check_state({key.removeprefix(start): state[key] for key in state if key.startswith(start)})
         return state
