@@ -36,7 +36,7 @@ from hpamdp.messages import exit_code
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = ("*.md", "agents/*.md", "docs/**/*.md", "experiments/*/README.md")
 DATA = re.compile(r"^<!--data (\w+): (.+)-->$", re.MULTILINE)
-NUMBER = re.compile(r"(<!--n (\S.*?):(\S*)-->)(.*?)(<!--/n-->)")
+NUMBER = re.compile(r"(<!--n (\S.*?):([^-\s]*)-->)(.*?)(<!--/n-->)")
 WORDS = ["zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 
 
