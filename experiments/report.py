@@ -1,8 +1,9 @@
 """Draw and tabulate every study again from its csv files, and collect all pages in one report.
 
-python experiments/report.py    runs `main([])` of every study.py; renews the tables in the Markdown pages; says which
-                                numbers in their sentences differ from the csv files (claims.py); writes
-                                report/report.html, and every figure as SVG
+python experiments/report.py    runs `main([])` of every study.py; renews the tables in the Markdown pages, and the
+                                numbers in their sentences (fill_numbers.py), of which it names
+                                those that differed; writes report/report.html, and every
+                                figure as SVG
 
 In the page of a study, `<!-- table -->` and `<!-- /table -->` enclose all its tables, and `<!-- table 2 of STUDY -->`
 and `<!-- /table -->` the second one. So they do in the project's README, in that of agents/ and in docs/, there for
@@ -23,6 +24,7 @@ from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from unittest import mock
 
+import fill_numbers
 import markdown
 import modules
 from matplotlib.figure import Figure
@@ -79,7 +81,7 @@ def report(experiments: Path, target: Path) -> list[str]:
         if page.exists():
             failures += renew_numbered(page, tables)
     failures += renew_filled(root / "docs")
-    failures += differing_sentences(experiments)
+    failures += fill_numbers.differences(root, write=True)
     (target / "report.html").write_text(bind(pages), encoding="utf-8")
     return failures
 
@@ -206,12 +208,6 @@ def renew_filled(docs: Path) -> list[str]:
         if renewed != text:
             page.write_text(renewed, encoding="utf-8")
     return failures
-
-
-def differing_sentences(experiments: Path) -> list[str]:
-    """Return a line for each number in a page's sentence that differs from the csv files; see claims.py."""
-    script = experiments / "claims.py"
-    return modules.load(script).differences() if script.exists() else []
 
 
 def to_html(text: str, folder: Path) -> tuple[str, list[str]]:
