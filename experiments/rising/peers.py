@@ -14,7 +14,7 @@ import numpy as np
 import vowpalwabbit
 from bandits import ON_BEARINGS, Ridge, features
 from cases import BEARINGS, HERE, Case, all_cases, best_split, final_values, row
-from SMPyBandits.Policies import SWUCB, UCB, DiscountedUCB
+from SMPyBandits.Policies import SWUCB, UCB
 
 NUM_SEEDS = 10
 LOWEST, HIGHEST = -4.0, 6.0  # of returns, which these libraries want in [0, 1]
@@ -80,7 +80,6 @@ class Cover:
 
 PEERS: dict[str, Callable[[Case, int], Peer | Cover]] = {
     "SMPyBandits UCB": lambda case, seed: Peer(UCB(case.num_options), case),
-    "SMPyBandits discounted UCB": lambda case, seed: Peer(DiscountedUCB(case.num_options, gamma=0.999), case),
     "SMPyBandits sliding-window UCB": lambda case, seed: Peer(SWUCB(case.num_options, tau=500), case),
     "Vowpal Wabbit cover": Cover,
 }

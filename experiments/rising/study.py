@@ -17,7 +17,6 @@ from hpamdp.messages import exit_code
 HERE = Path(__file__).resolve().parent
 TABLES = {
     "by_context_share": "Share of the best split's gain over option 0 alone, if the final choice sees the context",
-    "best_choice_share": "The same share if the final choice is the truly better option: the practice alone",
     "practice": "Practice of each option in percent of the decisions",
 }
 
