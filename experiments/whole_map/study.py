@@ -1,4 +1,4 @@
-"""Gather the runs of the whole map, every selector that learns over every learner with defaults alone, and tabulate it.
+"""Tabulate runs of six selectors over eight learners with default settings.
 
 python experiments/whole_map/study.py FOLDER...    adds the runs in these folders to the csv files
 python experiments/whole_map/study.py              prints both tables, and draws practice and value over time
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import PercentFormatter
 
 from hpamdp.analysis.study import Rows, Run, add_to_tables, gathered, groups, interval_text, read_csv, spread
@@ -19,7 +20,7 @@ from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 LEARNERS = ("hppo", "pdqn", "hyar", "hsac", "paddpg", "dlpa", "qpamdp", "pets")
-SELECTORS = ("value", "meta_critic", "linucb", "actor", "ucb")
+SELECTORS = ("value", "meta_critic", "linucb", "lin_thompson", "actor", "ucb")
 # With `high=none` the choice is that of `env.controller`.
 CELL = ("high", "controller", "low", "frames")
 COLUMNS = {
@@ -56,8 +57,8 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
             if "eval/score_congruent" in row:
                 of_run = ("eval/score", "eval/score_congruent", "eval/score_incongruent", "eval/oracle_agreement")
                 values = {column.removeprefix("eval/"): _rounded(row[column]) for column in of_run}
-                options = {option: _rounded(row.get(f"train/option_{option}")) for option in ("congruent",)}
-                curves.append({**name, "step": row["frames"], **values, **options})
+                congruent = _rounded(row.get("train/option_congruent"))
+                curves.append({**name, "step": row["frames"], **values, "congruent": congruent})
     return results, curves
 
 
@@ -101,11 +102,12 @@ def choosing(rows: Rows) -> str:
         "regret | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for (high, _, low, frames), runs in groups(rows, *CELL).items():
+    for (high, low, frames), runs in groups(rows, "high", "low", "frames").items():
         if high == "none" or len(runs) < 3:
             continue
         alone = single(rows, low)
-        mean = {column: np.mean([row[column] for row in runs]) for column in COLUMNS}
+        columns = ("score", "ceiling", "agreement", "weighted", "regret", "cpu_s")
+        mean = {column: np.mean([row[column] for row in runs]) for column in columns}
         over = f"{mean['score'] - np.mean([row['score'] for row in alone]):+.3f}" if alone else ""
         lines.append(
             f"| {high} | {low} | {frames:,.0f} | {len(runs)} | {mean['score']:.3f} "
@@ -123,22 +125,23 @@ def draw(curves: Rows, path: Path) -> None:
     axes = figure.subplots(2, len(lows), sharey="row", squeeze=False)
     for place, low in enumerate(lows):
         of_low = [row for row in curves if row["low"] == low]
-        usual = min(max(row["step"] for row in run) for run in groups(of_low, "high", "seed", "frames").values())
-        for (high, seed), run in groups(of_low, "high", "seed").items():
-            steps = [row["step"] for row in run if row["step"] <= usual]
-            colour = f"C{SELECTORS.index(high)}"
-            label = high if seed == min(row["seed"] for row in of_low if row["high"] == high) else None
-            axes[0][place].plot(
-                steps, [row["score"] for row in run][: len(steps)], color=colour, alpha=0.7, label=label
-            )
+        lengths = groups(of_low, "frames")
+        usual = max(lengths, key=lambda length: len({row["high"] for row in lengths[length]}))
+        for (high, seed), run in groups(lengths[usual], "high", "seed").items():
+            is_first = seed == min(row["seed"] for row in lengths[usual] if row["high"] == high)
+            style = {"color": f"C{SELECTORS.index(high)}", "alpha": 0.7, "label": high if is_first else None}
+            steps = [row["step"] for row in run]
+            axes[0][place].plot(steps, [row["score"] for row in run], **style)
             practice = [np.nan if row["congruent"] == "" else row["congruent"] for row in run]
-            axes[1][place].plot(steps, practice[: len(steps)], color=colour, alpha=0.7)
+            axes[1][place].plot(steps, practice, color=style["color"], alpha=0.7)
         axes[0][place].set_title(low, fontsize=10)
         axes[1][place].set_xlabel("presses")
     axes[0][0].set_ylabel("score")
     axes[1][0].set_ylabel("congruent boat, training")
     axes[1][0].yaxis.set_major_formatter(PercentFormatter(1.0))
-    figure.legend(loc="outside lower center", ncols=len(SELECTORS), frameon=False, fontsize=8)
+    labelled = {line.get_label(): line for line in figure.findobj(Line2D) if not line.get_label().startswith("_")}
+    handles = [labelled[high] for high in SELECTORS if high in labelled]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(SELECTORS), frameon=False, fontsize=8)
     figure.savefig(path, dpi=130)
 
 

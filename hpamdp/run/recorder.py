@@ -228,8 +228,8 @@ class Recorder:
         selector = self.parts.agent.selector
         if selector is None or not selector.is_bandit or selector.sees_state or selector.memory_key is not None:
             return []
-        learners = [type(each) for each in self.parts.agent.learners]
-        have_value = all(cls.value is not Learner.value and cls.value_setting is None for cls in learners)
+        learners = [each for each in self.parts.agent.learners if isinstance(each, Learner)]
+        have_value = all(type(each).value is not Learner.value and each.value_setting is None for each in learners)
         better = "high=value" if have_value else "high=meta_critic"
         return [f"{self.config.high} holds the option that is best on average; {better} chooses one for each episode"]
 
