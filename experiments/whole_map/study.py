@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
 from hpamdp.analysis.study import Rows, Run, add_to_tables, gathered, groups, interval_text, read_csv, spread
 from hpamdp.messages import exit_code
@@ -120,7 +120,7 @@ def choosing(rows: Rows) -> str:
 
 def draw(curves: Rows, path: Path) -> None:
     """Draw the score, and the practice of one controller, over a run: a column for each learner that has curves."""
-    lows = [low for low in LEARNERS if any(row["low"] == low for row in curves)]
+    lows = [low for low in LEARNERS if len({row["step"] for row in curves if row["low"] == low}) > 3]
     figure = Figure(figsize=(2.7 * len(lows), 4.6), layout="constrained")
     axes = figure.subplots(2, len(lows), sharey="row", squeeze=False)
     for place, low in enumerate(lows):
@@ -136,6 +136,9 @@ def draw(curves: Rows, path: Path) -> None:
             axes[1][place].plot(steps, practice, color=style["color"], alpha=0.7)
         axes[0][place].set_title(low, fontsize=10)
         axes[1][place].set_xlabel("presses")
+        for each in axes[:, place]:
+            each.xaxis.set_major_locator(MaxNLocator(3))
+            each.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes[0][0].set_ylabel("score")
     axes[1][0].set_ylabel("congruent boat, training")
     axes[1][0].yaxis.set_major_formatter(PercentFormatter(1.0))
