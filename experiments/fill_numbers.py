@@ -19,12 +19,14 @@ names to rows: a file and the values that columns have. GitHub and the site show
 
 from __future__ import annotations
 
+import ast
 import functools
 import json
+import operator
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +84,53 @@ FUNCTIONS: dict[str, Any] = {
 }
 
 
+OPERATORS: dict[type[ast.AST], Any] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.FloorDiv: operator.floordiv,
+    ast.Pow: operator.pow,
+    ast.USub: operator.neg,
+    ast.BitAnd: operator.and_,
+    ast.BitOr: operator.or_,
+    ast.Invert: operator.invert,
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
+
+
+def value_of(node: ast.AST, tables: Mapping[str, Table]) -> Any:
+    """Return the value of an expression.
+
+    Raises:
+        SyntaxError: it has a part that is not among those at the head of this file.
+    """
+    of = functools.partial(value_of, tables=tables)
+    match node:
+        case ast.Constant(value):
+            pass
+        case ast.Name(name):
+            value = tables[name]
+        case ast.Attribute(table, column):
+            value = of(table)[column]
+        case ast.Subscript(values, place):
+            value = of(values)[of(place)]
+        case ast.Call(ast.Name(name), arguments, []):
+            value = FUNCTIONS[name](*map(of, arguments))
+        case ast.UnaryOp(sign, operand):
+            value = OPERATORS[type(sign)](of(operand))
+        case ast.BinOp(left, sign, right) | ast.Compare(left, [sign], [right]):
+            value = OPERATORS[type(sign)](of(left), of(right))
+        case _:
+            raise SyntaxError(f"{ast.unparse(node)}: no such expression")
+    return value
+
+
 def text_of(value: Any, style: str) -> str:
     """Return a number, or several, as a page writes it."""
     if isinstance(value, Several):
@@ -124,8 +173,8 @@ def filled(page: str) -> str:
     tables = {name: table(source) for name, source in DATA.findall(page)}
 
     def number(found: re.Match[str]) -> str:
-        # The pages are as much our own as this script.
-        return found[1] + text_of(eval(found[2], {"__builtins__": {}} | FUNCTIONS, tables), found[3]) + found[5]
+        value = value_of(ast.parse(found[2], mode="eval").body, tables)
+        return found[1] + text_of(value, found[3]) + found[5]
 
     return NUMBER.sub(number, page)
 

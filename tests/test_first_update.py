@@ -26,9 +26,21 @@ TINY = ["num_envs=16", "steps_per_batch=4", "eval.layouts=4", "eval.every=0"]
         (65, "high=ucb low=pets low.updates_per_step=0.005", "low.updates_per_step=0.005 (low=pets)", "200", "128"),
         (64, "high=ucb low=qpamdp low.warmup_steps=64", "low.warmup_steps=64 (low=qpamdp)", "65", "64"),
         (640, "low=random +low.per_option={congruent:pdqn}", "low.warmup_steps=5000 (low=pdqn)", "5,000", "640"),
-        (640, "low=random high=meta_critic", "high.warmup_decisions=1000 (high=meta_critic)", "1,000", "640"),
+        (
+            640,
+            "low=random high=meta_critic high.warmup_decisions=1000",
+            "high.warmup_decisions=1000 (high=meta_critic)",
+            "1,000",
+            "640",
+        ),
         (640, "low=random high=option_critic", "high.warmup_steps=2000 (high=option_critic)", "2,000", "640"),
-        (640, "low.freeze=true low=random high=actor", "high.minibatch_size=1024 (high=actor)", "1,024", "640"),
+        (
+            640,
+            "low.freeze=true low=random high=actor high.minibatch_size=1024",
+            "high.minibatch_size=1024 (high=actor)",
+            "1,024",
+            "640",
+        ),
     ],
 )
 def test_a_run_that_ends_before_a_first_update_is_refused(total, words, setting, needed, most, tmp_path):
@@ -50,7 +62,10 @@ def test_the_last_batch_counts_as_a_whole():
     [
         (["high=ucb", "low=hppo", *SHORT["hppo"]], []),
         (["high=uniform", "low=random"], []),
-        (["high=fixed", "low=pets", *SHORT["pets"], "high.option=congruent"], ["low/incongruent"]),
+        (
+            ["high=fixed", "low=pets", *SHORT["pets"], "high.option=congruent", "agent.sharing=per_option"],
+            ["low/incongruent"],
+        ),
         (["high=meta_critic", "high.warmup_decisions=60", "high.updates_per_decision=0.1", "low=random"], ["high"]),
     ],
 )

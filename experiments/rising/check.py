@@ -5,11 +5,14 @@ python experiments/rising/check.py
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from bandits import RSR, RUCBE, Policy, RedUCB, Rising, features
+
+from hpamdp.messages import exit_code
 
 Curve = Callable[[np.ndarray], np.ndarray]
 
@@ -81,4 +84,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))
