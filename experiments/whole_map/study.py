@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
-from hpamdp.analysis.study import Rows, Run, add_to_tables, gathered, groups, interval_text, read_csv, spread
+from hpamdp.analysis.study import Rows, Run, add_to_tables, gathered, groups, read_csv, spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -96,22 +96,21 @@ def table(rows: Rows) -> str:
 
 
 def choosing(rows: Rows) -> str:
-    """Return a line for each cell of choosing selectors with three seeds or more: score, and score over one boat."""
+    """Return a line for each cell of choosing selectors with two seeds or more: score, and score over one boat."""
     lines = [
-        "| selector | learner | presses | n | score (95 %) | below the ceiling | over one boat | oracle's | weighted | "
+        "| selector | learner | presses | n | score | below the ceiling | over one boat | oracle's | weighted | "
         "regret | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for (high, low, frames), runs in groups(rows, "high", "low", "frames").items():
-        if high == "none" or len(runs) < 3:
+        if high == "none" or len(runs) < 2:
             continue
         alone = single(rows, low)
         columns = ("score", "ceiling", "agreement", "weighted", "regret", "cpu_s")
         mean = {column: np.mean([row[column] for row in runs]) for column in columns}
         over = f"{mean['score'] - np.mean([row['score'] for row in alone]):+.3f}" if alone else ""
         lines.append(
-            f"| {high} | {low} | {frames:,.0f} | {len(runs)} | {mean['score']:.3f} "
-            f"({interval_text([row['score'] for row in runs])}) | "
+            f"| {high} | {low} | {frames:,.0f} | {len(runs)} | {spread([row['score'] for row in runs])} | "
             f"{mean['ceiling'] - mean['score']:.3f} | {over} | {mean['agreement']:.1%} | {mean['weighted']:.1%} | "
             f"{mean['regret']:.3f} | {mean['cpu_s']:.0f} s |"
         )
