@@ -503,7 +503,7 @@ class HierarchicalAgent(nn.Module):
                 steps = self.next_options.with_steps_before(seen)
                 if self.selector_values_end_with_trips:  # the step before the batch may have ended a trip
                     steps = ended_with_trips(steps)
-            scalars.update(self._practise(seen, finished_decisions(steps)))
+            scalars.update(self._practise(seen, steps))
             learned = self.selector.learn_from_options(steps)
             learned = {**learned, **self.selector.learn_from_steps(seen), **self._mean_length(batch)}
             scalars.update({f"high/{name}": value for name, value in learned.items()})
@@ -651,10 +651,18 @@ class HierarchicalAgent(nn.Module):
     def _prefix_of(self, learner: int) -> str:
         return "low" if len(self.learners) == 1 else f"low/{self.specs.option_names[learner]}"
 
-    def _practise(self, batch: TensorDictBase, decisions: TensorDictBase) -> dict[str, float]:
-        """Count the practice in a batch `[*B, T]` with these decisions `[N]`; return the next probabilities to log."""
+    def _practise(self, batch: TensorDictBase, steps: TensorDictBase) -> dict[str, float]:
+        """Count the practice in a batch `[*B, T]`, and return the next probabilities to log.
+
+        Args:
+            batch: its steps.
+            steps: those of them whose ends are known, see `Selector.learn_from_options`.
+        """
         if self.selector is None or self.practice is None:
             return {}
+        decisions = finished_decisions(
+            steps.select(keys.OPTION, ("next", keys.IS_DECISION), ("next", keys.OPTION_RETURN))
+        )
         returns = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1)
         self.practice.add(batch.get(keys.OPTION).flatten(), decisions.get(keys.OPTION), returns)
         self._set_practice()
