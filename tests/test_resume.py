@@ -103,6 +103,10 @@ def test_a_resumed_run_is_the_run_that_was_never_stopped(high, low, tmp_path, mo
     stop_and_resume(words_of(high, low), tmp_path, monkeypatch, signal.SIGINT)
 
 
+def test_a_run_of_the_selector_alone_resumes_to_the_last_bit(tmp_path, monkeypatch):
+    stop_and_resume([*words_of("linucb", "random"), "low.freeze=true"], tmp_path, monkeypatch, signal.SIGINT)
+
+
 SIGTERM, *OTHERS = STOP_SIGNALS[1:]
 
 

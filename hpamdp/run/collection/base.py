@@ -75,7 +75,7 @@ def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, 
         example = example.unsqueeze(1).expand(len(example), done.shape[1])
     else:
         example = example.exclude("next")
-        if keys.DISCRETE not in TensorDict(saved).keys(include_nested=True):  # before the first step
+        if not {*parts.policy.out_keys} & {*TensorDict(saved).keys(include_nested=True)}:  # before the first step
             example = example.exclude(*parts.policy.out_keys).filter_empty_()
     own = example.to_dict()
     if "collector" in saved:  # TorchRL's numbers of trajectories
