@@ -40,6 +40,8 @@ from hpamdp.messages import as_code
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 PositiveFraction = Annotated[float, Field(gt=0.0, le=1.0)]
+# Environments, steps or episodes that are in memory at once.
+NumAtOnce = Annotated[PositiveInt, Field(le=10_000_000)]
 Expectile = Annotated[float, Field(ge=0.5, lt=1.0)]  # 0.5 is the mean
 
 

@@ -1244,10 +1244,10 @@ def test_a_folder_of_experiments_is_named_with_what_is_in_it():
         hpamdp.train(experiment="domains", low="random")
 
 
-def test_more_episodes_or_environments_than_fit_into_memory_are_named(platform_agent):
-    with pytest.raises(hpamdp.ConfigError, match=r"^episodes=1000000000000000: takes at least .* of memory, and "):
+def test_more_episodes_or_environments_than_fit_into_memory_are_refused(platform_agent):
+    with pytest.raises(hpamdp.ConfigError, match=r"^episodes=1000000000000000: must be less than or equal to \d+"):
         platform_agent.evaluate(episodes=10**15)
-    with pytest.raises(hpamdp.ConfigError, match=r"^num_envs=1000000000000: takes at least .* of memory, and there "):
+    with pytest.raises(hpamdp.ConfigError, match=r"^num_envs=1000000000000: must be less than or equal to \d+"):
         hpamdp.make("platform", num_envs=10**12)
-    with pytest.raises(hpamdp.ConfigError, match="num_envs=1000000000000: takes more memory "):
+    with pytest.raises(hpamdp.ConfigError, match=r"^num_envs=1000000000000: must be less than or equal to \d+"):
         hpamdp.make_gymnasium("hpamdp/Platform-v0", num_envs=10**12)

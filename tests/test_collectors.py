@@ -24,10 +24,10 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.gymnasium.values import MisfitError
+from hpamdp.limits import limit_of
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.base import CollectionError, WorkerDiedError
-from hpamdp.run.collection.limits import limit_of
 from hpamdp.run.collection.ray import check_answers
 from hpamdp.run.collection.worker import (
     EnvShard,

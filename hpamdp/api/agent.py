@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from pydantic import NonNegativeInt, PositiveInt
+from pydantic import NonNegativeInt
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType
@@ -33,15 +33,14 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.renamed import no_member
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env, make_evaluation, option_length
-from hpamdp.run.capacity import check_number
-from hpamdp.settings import Settings
+from hpamdp.settings import NumAtOnce, Settings
 from hpamdp.specs import PAMDPSpecs
 
 
 class _Asked(Settings):
     """The numbers that `Agent.evaluate` takes."""
 
-    episodes: PositiveInt
+    episodes: NumAtOnce
     seed: NonNegativeInt
 
 
@@ -245,10 +244,6 @@ class Agent:
         asked = {"episodes": episodes, "seed": seed}
         numbers = {name: int(value) if isinstance(value, np.integer) else value for name, value in asked.items()}
         checked = validated(_Asked, numbers, "", "argument", "hpamdp.Agent.evaluate")
-        device = self._env.device
-        check_number(
-            f"episodes={checked.episodes}", checked.episodes, device, lambda: make_env(config, 1, device, seed=0)
-        )
         eval_config = config.run.eval.model_copy(update={"layouts": checked.episodes, "seed": checked.seed})
         evaluation = make_evaluation(config.with_run(eval=eval_config, film=False), self._env)
         try:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 from typing import Any
 
 import gymnasium
-from pydantic import NonNegativeInt, PositiveInt
+from pydantic import NonNegativeInt
 
 from hpamdp.api.arguments import plain_name, problem_arguments, without_env_prefix
 from hpamdp.api.gymnasium_arguments import check_single, checked_arguments, names_of_arguments, vector_arguments
@@ -19,18 +18,17 @@ from hpamdp.config.outside_jobs import composed, word
 from hpamdp.config.schema import Device, usable_device
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
-from hpamdp.memory import is_about_memory
+from hpamdp.limits import is_about_memory
 from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run.assemble import grouped
-from hpamdp.run.capacity import check_number
 from hpamdp.run.compatibility import lack_of, settings_without_effect
-from hpamdp.settings import SettingError, Settings
+from hpamdp.settings import NumAtOnce, SettingError, Settings
 
 
 class _Sizes(Settings):
     """The arguments of `make` that are no settings of the problem."""
 
-    num_envs: PositiveInt = 1
+    num_envs: NumAtOnce = 1
     seed: NonNegativeInt = 0
     oracle: bool = False
     human: bool = False
@@ -72,9 +70,7 @@ def make(name: Any, num_envs: int | None = None, *, device: Any = "cpu", seed: i
         lack = lack_of(need, config)
         if lack is not None:
             raise ConfigError(f"{need}=True: {lack}")
-    build = partial(config.env.build, device=config.run.resolve_device(), seed=sizes.seed, **needs)
-    check_number(f"num_envs={num_envs}", sizes.num_envs, config.run.resolve_device(), lambda: build(num_envs=1))
-    env = build(num_envs=sizes.num_envs)
+    env = config.env.build(num_envs=sizes.num_envs, device=config.run.resolve_device(), seed=sizes.seed, **needs)
     return grouped(env, config)
 
 

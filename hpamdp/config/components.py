@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, PydanticUserError, create_model
 from hpamdp.complaints import as_json
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.config.stand_ins import check_works_with_stand_ins
-from hpamdp.memory import is_about_memory
+from hpamdp.limits import is_about_memory
 from hpamdp.messages import first_line
 from hpamdp.settings import SettingError, Settings
 

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeInt, Pos
 from hpamdp.complaints import as_json
 from hpamdp.config.components import CALLBACK, GROUPS, TARGET, Component, PlaceOf, check_base_class, component, file_of
 from hpamdp.config.errors import ConfigError, validated
-from hpamdp.settings import FromList, Settings
+from hpamdp.settings import FromList, NumAtOnce, Settings
 
 if TYPE_CHECKING:
     import torch  # takes seconds
@@ -131,7 +131,7 @@ class EvalConfig(Settings):
 
     every: NonNegativeInt
     """Steps between two evaluations. If 0, only at the start and at the end. Default: the learner's recommendation."""
-    layouts: PositiveInt = 1000
+    layouts: NumAtOnce = 1000
     """Number of episodes of an evaluation. The agent acts greedily, and every evaluation has the same episodes."""
     seed: Seed = 0
     """Seed of these episodes."""
@@ -159,9 +159,9 @@ class RunConfig(Settings):
     low: LowConfig = LowConfig()
     total_frames: PositiveInt
     """Steps of training, over all environments. Default: the learner's recommendation."""
-    num_envs: PositiveInt
+    num_envs: NumAtOnce
     """Number of parallel environments. Default: the learner's recommendation."""
-    steps_per_batch: PositiveInt
+    steps_per_batch: NumAtOnce
     """Steps of each environment in a batch, after which the agent learns. Default: the learner's recommendation."""
     log_every: NonNegativeInt = 5000
     """Steps between two rows of metrics.csv. If 0, rows are written only with evaluations."""

@@ -83,7 +83,6 @@ def assemble(config: Config) -> AssembledRun:
     run = config.run
     compatibility.check(config)
     device = run.resolve_device()
-    capacity.check_run(run, device, lambda: make_env(config, 1, device, run.seed))
     env = make_env(config, run.num_envs, device, run.seed)
     with closed_on_error(env):
         return _assemble(config, env, device)
@@ -94,7 +93,7 @@ def _assemble(config: Config, env: PAMDPEnv, device: torch.device) -> AssembledR
     run = config.run
     check_built(config, env)
     specs = PAMDPSpecs.from_env(env)
-    capacity.check_agent(config, specs, learners_of(config, specs), device)
+    capacity.check_buffers(config, specs, learners_of(config, specs), device)
     agent = make_agent_of_run(config, specs, device)
     if run.mode != "eval":
         set_up_updates(config, agent)

@@ -1,9 +1,10 @@
-"""Refuse runs that need too much memory, or whose budget is too small for a first update."""
+"""Refuse replay buffers larger than memory, and budgets too small for a first update; explain errors about memory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
@@ -16,75 +17,21 @@ from torch.nn.modules.module import (
 from hpamdp.complaints import as_json
 from hpamdp.config.components import Component
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.schema import Config, RunConfig
-from hpamdp.env.base import PAMDPEnv
+from hpamdp.config.schema import Config
 from hpamdp.env.errors import EnvironmentFaultError
-from hpamdp.memory import in_gigabytes, is_about_memory, total_memory
+from hpamdp.limits import is_about_memory
 from hpamdp.messages import first_line
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
 from hpamdp.specs import PAMDPSpecs
 
-# The memory of fewer steps or episodes than this is not estimated, because the estimate has to build an environment.
-_MANY = 1_000_000
-# Each weight takes four numbers: itself, its gradient and two moments of Adam.
-_BYTES_A_WEIGHT = 16
 # An agent that is loaded has at most so many numbers, for each number in its file and in all.
 _SLACK, _FEW_NUMBERS = 4, 4_000_000
+_CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")  # where Linux keeps a container's limit of memory
 
 
-def check_run(run: RunConfig, device: torch.device, build_one: Callable[[], PAMDPEnv]) -> None:
-    """Refuse more environments, steps or episodes than there is memory for, before any of them is built.
-
-    The estimate counts the tensors of a step and the paths that an evaluation records.
-
-    Args:
-        run: the values of the run.
-        device: device of the tensors.
-        build_one: builds a single environment; called only if the numbers are large.
-
-    Raises:
-        ConfigError: memory does not suffice; the message names the least number of bytes.
-    """
-    num_steps = 0 if run.mode != "train" else run.num_envs * run.steps_per_batch
-    if max(run.num_envs, num_steps, run.eval.layouts) < _MANY:
-        return
-    step, path = _bytes_of_one(build_one)
-    needs = {
-        f"num_envs={run.num_envs}": run.num_envs * step,
-        f"num_envs={run.num_envs}, steps_per_batch={run.steps_per_batch}": num_steps * step,
-        f"eval.layouts={run.eval.layouts}": run.eval.layouts * (step + path),
-    }
-    _check_memory(needs, device)
-
-
-def check_number(argument: str, num: int, device: torch.device, build_one: Callable[[], PAMDPEnv]) -> None:
-    """Refuse more environments than there is memory for, before any of them is built.
-
-    Args:
-        argument: the argument that gives the number, as `name=value`.
-        num: number of environments, one for each episode of an evaluation.
-        device: device of the tensors.
-        build_one: builds a single environment; called only if the number is large.
-
-    Raises:
-        ConfigError: memory does not suffice; the message names the least number of bytes.
-    """
-    if num >= _MANY:
-        _check_memory({argument: num * _bytes_of_one(build_one)[0]}, device, "takes")
-
-
-def _bytes_of_one(build_one: Callable[[], PAMDPEnv]) -> tuple[int, int]:
-    """Return the bytes of a step in one environment, and of the path that an evaluation records there."""
-    with closing(build_one()) as one:
-        return one.fake_tensordict().bytes(), 0 if one.position is None else 8 * one.max_steps
-
-
-def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component], device: torch.device) -> None:
-    """Refuse replay buffers, batches and layers that are too large for memory, before any of them is built.
-
-    They are recognised by the names of their settings: `buffer_size`, and names that end in `batch_size` or
-    `hidden_dims`.
+def check_buffers(config: Config, specs: PAMDPSpecs, learners: Sequence[Component], device: torch.device) -> None:
+    """Refuse replay buffers larger than memory before they are built, since they fill only while the run goes on.
 
     Args:
         config: config of the run.
@@ -93,50 +40,28 @@ def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component]
         device: device of the tensors.
 
     Raises:
-        ConfigError: memory does not suffice; the message names the least number of bytes.
+        ConfigError: a buffer is larger than the machine's memory.
     """
     # Two observations, the action, reward and flags. A pixel takes one byte.
-    observation = sum(entry.size if entry.is_picture else 4 * entry.size for entry in specs.entries)
-    observation = observation if specs.entries else 4 * specs.observation_dim
-    row = 2 * observation + 4 * (specs.num_parameters + 2)
-    row += specs.num_discrete**2 if specs.has_pair_mask else 0
-    needs = {}
-    for component, num in ((config.high, 1), *((low, learners.count(low)) for low in learners)):
-        for name, value in component.settings.items():
-            setting = f"{component.group}.{name}={as_json(value)}"
-            if name == "buffer_size":
-                needs[setting] = num * value * (row + _bytes_remembered(component, specs))
-            elif name.endswith("batch_size") and value is not None:
-                needs[setting] = value * row
-            elif name.endswith("hidden_dims"):
-                # Behind pictures is an encoder, whose few features are not counted here.
-                sizes = [0 if specs.has_pictures else specs.observation_dim, *value]
-                weights = sum(a * b for a, b in zip(sizes, value, strict=False))
-                needs[setting] = num * weights * _BYTES_A_WEIGHT
-    _check_memory(needs, device)
-
-
-def _bytes_remembered(component: Component, specs: PAMDPSpecs) -> int:
-    """Return the bytes of a memory's state, which a replay buffer holds in every row."""
-    settings = component.settings
-    if settings.get("memory") == "gru":
-        return 4 * int(settings["memory_size"])
-    if settings.get("memory") == "stack":
-        return 4 * int(settings["stack_steps"]) * specs.observation_dim
-    return 0
-
-
-def _check_memory(needs: Mapping[str, int], device: torch.device, takes: str = "the run takes") -> None:
-    """Refuse settings that together need more bytes than there are; the error names the largest one."""
-    if not needs:
-        return
+    row = 2 * specs.observation_dim * (1 if specs.has_pictures else 4) + 4 * (specs.num_parameters + 2)
     available = total_memory(device)
-    setting = max(needs, key=needs.__getitem__)
-    if sum(needs.values()) > available:
-        raise ConfigError(
-            f"{setting}: {takes} at least {in_gigabytes(sum(needs.values()))} of memory, and there are "
-            f"{in_gigabytes(available)}"
-        )
+    for part, num in ((config.high, 1), *((low, learners.count(low)) for low in learners)):
+        size = part.settings.get("buffer_size") or 0
+        if num * size * row > available:
+            raise ConfigError(
+                f"{part.group}.buffer_size={size}: takes at least {num * size * row / 1e9:,.1f} GB of memory, and "
+                f"there are {available / 1e9:,.1f} GB"
+            )
+
+
+def total_memory(device: torch.device) -> int:
+    """Return the memory of a device in bytes; of the CPU's memory, as much as a container may use."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_properties(device).total_memory
+    sizes = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    with suppress(OSError, ValueError):  # not there, or without a limit
+        sizes.append(int(_CONTAINER_LIMIT.read_text()))
+    return min(sizes)
 
 
 @contextmanager

@@ -13,9 +13,9 @@ from torchrl.collectors import MultiSyncCollector
 
 from hpamdp.config.schema import Config
 from hpamdp.files import read_regular
+from hpamdp.limits import full_shared_memory
 from hpamdp.messages import warn
 from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.collection.limits import full_shared_memory
 from hpamdp.run.collection.worker import EnvShard, SharedMemoryCollector
 from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, children_without, modules_here_last
 from hpamdp.run.stopping import STOP_SIGNALS

@@ -20,10 +20,10 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError
+from hpamdp.limits import limit_of
 from hpamdp.messages import first_line
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state, random_seeds
-from hpamdp.run.collection.limits import limit_of
 from hpamdp.run.collection.worker import EnvShard, RemoteError, pack_state
 from hpamdp.search_path import protect_children, unprotect_children
 from hpamdp.settings import Settings
