@@ -2,27 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
-# Old names of settings and the new ones. A dotted name belongs to one group, a plain name to any group.
-_NEW_NAMES = {
-    "agent.uniform_option_frames": "practice",
-    "agent.uniform_option_steps": "practice",
-    "env.options": "grouping",
-    "warmup_frames": "warmup_steps",
-    "updates_per_frame": "updates_per_step",
-    "epsilon_frames": "epsilon_steps",
-    "lr_frames": "lr_steps",
-    "anneal_frames": "anneal_steps",
-    "lr_final": "lr_final_fraction",  # of replay learners; that of H-PPO is a rate, and keeps its name
-    "weight_decay_frames": "weight_decay_steps",
-    "twin_q": "twin",
-    "rl": "twin",
-    "target_noise": "target_smoothing",
-    "target_noise_clip": "target_smoothing_clip",
-    "exploration_noise": "parameter_noise",
-}
+# Settings that files of 0.3 have by another name. H-PPO still has an `lr_final`, which is a rate.
+_NEW_NAMES = {"agent.uniform_option_steps": "practice", "low.lr_final": "lr_final_fraction"}
 # Names of settings in Stable-Baselines3, CleanRL and Spinning Up, and ours.
 _ELSEWHERE: dict[str, tuple[str, ...]] = {
     "learning_rate": ("lr", "actor_lr", "critic_lr"),
@@ -66,29 +50,12 @@ _MEMBERS_ELSEWHERE = {
 }
 # Names that stand for values of the run, which a group does not have.
 _OF_RUN = ("steps_per_batch", "total_frames", "num_envs", "eval.every", "eval.layouts")
-# Old values whose meaning changed with the name.
-_NEW_VALUES: dict[tuple[str, Any], Any] = {("rl", "td3"): True, ("rl", "ddpg"): False}
 
 
 def renamed(setting: str, known: Iterable[str]) -> str | None:
-    """Return a message with the new name of a setting; None if it was not renamed.
-
-    Args:
-        setting: the old name as on the command line, such as `low.warmup_frames`.
-        known: names of the group's settings. The new name of a setting of any group must be among them.
-    """
+    """Return a message with the new name of a setting, if it is among the group's known names; otherwise None."""
     new = _NEW_NAMES.get(setting)
-    if new is None:
-        new = _NEW_NAMES.get(setting.rpartition(".")[2])
-        if new is None or new not in known:
-            return None
-    values = [
-        f"{old}={value} is {new}={str(now).lower()}"
-        for (old, value), now in _NEW_VALUES.items()
-        if setting.endswith(f".{old}")
-    ]
-    meaning = f" ({', '.join(values)})" if values else ""
-    return f"is called {setting.removesuffix(setting.rpartition('.')[2])}{new} now{meaning}"
+    return f"is called {setting.rpartition('.')[0]}.{new} now" if new is not None and new in known else None
 
 
 def elsewhere(name: str, known: Iterable[str]) -> list[str]:
@@ -104,20 +71,7 @@ def no_member(owner: object, name: str) -> AttributeError:
     return AttributeError(f"{type(owner).__name__!r} object has no attribute {name!r}{hint}", name=name, obj=owner)
 
 
-def with_new_names(group: str, settings: Mapping[str, Any], known: Iterable[str]) -> dict[str, Any]:
-    """Return the settings of a saved run under today's names.
-
-    Args:
-        group: such as `low`.
-        settings: the saved values by their names at the time.
-        known: today's names of the group's settings.
-    """
-    known = set(known)
-    values: dict[str, Any] = {}
-    for name, value in settings.items():
-        new = _NEW_NAMES.get(f"{group}.{name}") or _NEW_NAMES.get(name)
-        is_renamed = new is not None and name not in known and new in known and new not in settings
-        if is_renamed and isinstance(value, str | bool):
-            value = _NEW_VALUES.get((name, value), value)
-        values[new if is_renamed and new is not None else name] = value
-    return values
+def with_new_names(group: str, settings: Mapping[str, Any], known: Collection[str]) -> dict[str, Any]:
+    """Return the settings of a group of a saved run under today's names, which are known."""
+    new = {name: _NEW_NAMES.get(f"{group}.{name}", name) for name in settings if name not in known}
+    return {new.get(name, name): value for name, value in settings.items()}

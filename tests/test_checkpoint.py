@@ -23,7 +23,7 @@ from hpamdp.run.trainer import Trainer
 from hpamdp.run_files import DIVERGED_NAME
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=256", "eval.layouts=4", "eval.every=0", "high=ucb"]
-PROGRESS = {"config": {}, "frames": 0, "wall_s": 0.0, "cpu_s": 0.0, "last_score": None}
+PROGRESS = {"config": {}, "option_names": [], "frames": 0, "wall_s": 0.0, "cpu_s": 0.0, "last_score": None}
 PDQN = [*SMALL, "low=pdqn", *SHORT["pdqn"]]
 
 
@@ -62,28 +62,6 @@ def refusal(file, parts) -> str:
     now = parts.agent.state_dict()
     assert all(torch.equal(value, now[name]) for name, value in weights.items()), "the agent was changed"
     return str(error.value)
-
-
-def test_checkpoints_that_name_the_optimizer_as_earlier_versions_did_are_resumed(tmp_path):
-    words = [*SMALL, "low=hppo", "low.minibatch_size=16"]
-    assert run(compose_config(words), tmp_path / "run", words) == 0
-    today = tmp_path / "run" / "checkpoint.zip"
-
-    def change(name, data):
-        return data.replace(b"_optimizer", b"_optimiser") if name == "manifest.json" else data
-
-    renamed = rewritten(today, tmp_path / "renamed.zip", change)
-    with zipfile.ZipFile(renamed) as archive, zipfile.ZipFile(tmp_path / "earlier.zip", "w") as copy:
-        for name in archive.namelist():
-            copy.writestr(name.replace("optimizer", "optimiser"), archive.read(name))
-    moments = []
-    for file in (today, tmp_path / "earlier.zip"):
-        parts = assemble(make_config(words))
-        load(file, parts)
-        moments.append(parts.agent.learners[0].optimizer.state_dict()["state"])
-    assert moments[0].keys() == moments[1].keys() and moments[0]
-    for number, state in moments[0].items():
-        assert all(torch.equal(value, moments[1][number][name]) for name, value in state.items())
 
 
 class Malicious:

@@ -19,9 +19,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import needs_trust, read_saved
 from hpamdp.config.schema import Config
 from hpamdp.messages import one_line
-from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.play import permissions
-from hpamdp.run.resume import check_saved_options
 from hpamdp.run.train import run
 
 TINY = ["num_envs=2", "steps_per_batch=2", "total_frames=8", "eval.layouts=2", "eval.every=0", "film=false"]
@@ -35,25 +33,10 @@ def saved(config: Config) -> dict:
     return json.loads(json.dumps(config.to_dict()))
 
 
-def first_form(config: Config) -> dict:
-    """Return the config as earlier versions saved it: a group's choice is its entry `name`, below the settings."""
-    values = saved(config)
-    names = values.pop("choices")
-    return values | {group: {"name": names[group], **values[group]} for group in GROUPS}
-
-
 @pytest.mark.parametrize("n", range(MOST))
 def test_every_value_of_every_group_is_read_back_as_it_was_saved(n):
     config = make_config([f"{group}={choices(group)[n % len(choices(group))]}" for group in GROUPS])
     assert read_saved(saved(config)) == config
-    if n == 0:
-        assert read_saved(first_form(config)) == config
-
-
-@pytest.mark.parametrize("name", ["null", "csv", "wandb"])
-def test_a_wandb_run_of_an_earlier_version_is_known_by_its_settings(name):
-    config = make_config(["logger=wandb", f"logger.name={name}", "low=random"])
-    assert read_saved(first_form(config)) == config
 
 
 def assert_all_commands_work(command, *words: str, trust: str = "trust=false", own: tuple[str, ...] = ()) -> None:
@@ -322,42 +305,19 @@ def test_a_config_of_another_form_is_refused_in_one_short_line(change):
     assert "\n" not in str(error.value) and len(line) < 1000 and line.isprintable()
 
 
-def test_an_earlier_checkpoint_without_the_names_of_its_options_is_compared_only_if_nothing_is_run(
-    of_toy, tmp_path, capsys
-):
-    words = ["low=random", "high=uniform", *TINY]
-    assert run(compose_config(words), tmp_path / "boats", words) == 0
-
-    def warning(folder: Path, *given: str) -> str:
-        config = make_config([*given, f"low.checkpoint={folder / 'policy.pt'}", "low=random"])
-        policy = torch.load(folder / "policy.pt", weights_only=True)
-        progress = json.loads(policy["progress"])
-        progress.pop("option_names", None)
-        torch.save(policy | {"progress": json.dumps(progress)}, folder / "policy.pt")
-        assert "option_names" not in progress_of(folder / "policy.pt")
-        check_saved_options(config, config.env.build(num_envs=1))
-        return capsys.readouterr().err
-
-    swapped = ["env.boats=[incongruent1,congruent]", "high=uniform"]
-    assert "its agent chooses among incongruent, congruent, but" in warning(tmp_path / "boats", *swapped)
-    assert "its options cannot be compared" in warning(of_toy, *swapped)
-
-
-def test_old_names_are_read_in_the_learners_of_options_too():
-    saved = make_config(["low=random"]).to_dict()
-    saved["low"]["per_option"] = {"congruent": {"name": "pdqn", "warmup_frames": 77, "twin_q": False}}
-    learner = read_saved(saved).low_of["congruent"]
-    assert learner.settings["warmup_steps"] == 77 and learner.settings["twin"] is False
-
-
-@pytest.mark.parametrize(
-    ("learner", "name"), [("pdqn", "lr_final_fraction"), ("hyar", "lr_final_fraction"), ("hppo", "lr_final")]
-)
+@pytest.mark.parametrize(("learner", "name"), [("pdqn", "lr_final_fraction"), ("hppo", "lr_final")])
 def test_a_saved_final_learning_rate_stays_a_rate_or_a_fraction(learner, name):
     saved = make_config([f"low={learner}"]).to_dict()
     saved["low"].pop(name)
     saved["low"]["lr_final"] = 5e-4
     assert read_saved(saved).low.settings[name] == 5e-4
+
+
+def test_the_name_that_0_3_had_for_practice_is_read():
+    saved = make_config(["low=random"]).to_dict()
+    del saved["agent"]["practice"]
+    saved["agent"]["uniform_option_steps"] = 77
+    assert read_saved(saved).run.agent.practice == 77
 
 
 def test_a_word_may_need_a_setting_that_the_saved_run_has(command):

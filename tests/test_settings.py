@@ -62,7 +62,6 @@ def test_a_number_in_the_place_of_the_device_is_refused_by_python():
     [
         ({"hiden_dims": (8,)}, "hiden_dims: no such setting of HPPOOptions; did you mean hidden_dims? It has "),
         ({"learning_rate": 1e-3}, "learning_rate: no such setting of HPPOOptions; did you mean lr or critic_lr? It "),
-        ({"anneal_frames": 3}, "anneal_frames: is called anneal_steps now"),
         ({"lr": -1.0, "epochs": 0.5}, "epochs=0.5: must be a valid integer; lr=-1.0: must be above 0 and at most 1"),
         ({"lr": np.ones((9, 9))}, "lr=array([[1., 1., 1., 1., 1., 1., 1., 1., 1.], [1., "),
     ],

@@ -24,7 +24,6 @@ from hpamdp.config.errors import MissingChoiceError
 from hpamdp.files import replacing
 from hpamdp.messages import file_and_reason, first_line, one_line, warn
 from hpamdp.metrics_file import read_rows
-from hpamdp.renamed import with_new_names
 from hpamdp.run_files import (
     CONFIG_NAME,
     ENV_WITHOUT_INFLUENCE,
@@ -214,7 +213,7 @@ def _fault_in_problem(run: Run, settings: Mapping[str, Collection[Any] | None]) 
     if not isinstance(saved, Mapping):
         return "config.yaml has no settings of the problem"
     own = _own_settings(name, str(run.summary.get("low")))
-    for setting, value in with_new_names("env", saved, own).items():
+    for setting, value in saved.items():
         if setting in ENV_WITHOUT_INFLUENCE or setting not in own:
             continue
         allowed = settings.get(f"{name}.{setting}", (own[setting],))

@@ -67,8 +67,6 @@ _FORMAT = 2
 _MAX_JSON = 2**24
 _BLOCK = 2**20
 _CUDA_STATE_BYTES = 16
-# Names of parts of an agent in earlier versions' checkpoints, and today's names.
-_RENAMED = {"optimiser": "optimizer"}
 # Parts of a run that a checkpoint holds beside the agent.
 STATES = ("collection", "recorder")
 # The same, missing in checkpoints of earlier versions.
@@ -433,9 +431,7 @@ class _Opened:
             text = archive.read(MANIFEST_NAME)
             manifest = checked(_Manifest, _json(text))
             _check_format(manifest.format)
-            self._members = {
-                _todays_name(name): (f"{name}.pt", checksum) for name, checksum in manifest.members.items()
-            }
+            self._members = {name: (f"{name}.pt", checksum) for name, checksum in manifest.members.items()}
             self.names = {*self._members}
             progress = manifest.progress
         else:
@@ -572,12 +568,6 @@ def _json(text: Any) -> Any:
     if not isinstance(text, str | bytes) or len(text) > _MAX_JSON:
         raise ValueError(f"its progress is no text of at most {_MAX_JSON:,} bytes")
     return json.loads(text, parse_constant=refuse)
-
-
-def _todays_name(member: str) -> str:
-    """Return today's name of a member of a checkpoint."""
-    level, _, part = member.partition("_")
-    return f"{level}_{_RENAMED[part]}" if part in _RENAMED else member
 
 
 def _checksum(member: MemberFile) -> str:

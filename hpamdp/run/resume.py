@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hpamdp.complaints import as_json
@@ -23,9 +21,8 @@ from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import SOURCE_SETTINGS
 from hpamdp.messages import warn
-from hpamdp.renamed import with_new_names
 from hpamdp.run import checkpoint, compatibility
-from hpamdp.run.assemble import choose_selector, make_env
+from hpamdp.run.assemble import choose_selector
 from hpamdp.run_files import ENV_WITHOUT_INFLUENCE, are_same, flat_settings
 from hpamdp.shell import setting
 
@@ -106,7 +103,7 @@ def _check_same_run(saved: Mapping[str, Any], resolved: Config, file: Path, word
         raise ConfigError(f"{given[0]}: the run in {file} has env={before['choices']['env']}; {elsewhere}")
     if not given:
         return
-    earlier = with_new_names("env", before["env"], now["env"])
+    earlier = before["env"]
     for name, value in now["env"].items():
         has_moved = isinstance(value, str) and resolved.env.is_guarded(name, value)
         if name not in earlier or are_same(value, earlier[name]) or name in ENV_WITHOUT_INFLUENCE or has_moved:
@@ -212,7 +209,7 @@ def check_saved_options(config: Config, env: PAMDPEnv) -> None:
     saved, now_env = upgraded(progress["config"]), config.to_dict()
     if (saved["choices"]["env"], saved["env"]) == (now_env["choices"]["env"], now_env["env"]):
         return
-    before, now = _option_names(progress, where, source), env.option_names if env.has_choice else ()
+    before, now = tuple(progress["option_names"]), env.option_names if env.has_choice else ()
     if not before or not now or before == now:
         return
     both = f"{where}={source}: its agent chooses among {', '.join(before)}, but {config.env} has {', '.join(now)}"
@@ -221,22 +218,6 @@ def check_saved_options(config: Config, env: PAMDPEnv) -> None:
     if set(before) == set(now):
         raise ConfigError(f"{both}; keep the order")
     warn(f"{both}, which take their places")
-
-
-def _option_names(progress: Mapping[str, Any], where: str, source: str) -> tuple[str, ...]:
-    """Return the options of a saved run's agent; empty if they are unknown."""
-    if "option_names" in progress:
-        return tuple(progress["option_names"])
-    # Checkpoints of earlier versions lack the names. Problems of this package give them without guarded settings.
-    try:
-        config = read_saved(progress["config"], {"mode": "train", "resume": None, "checkpoint": None})
-        if config.env.cls is None or not config.env.cls.__module__.startswith("hpamdp."):
-            raise ConfigError(f"{config.env}: not a problem of this package")
-        with closing(make_env(config, 1, torch.device("cpu"), 0)) as env:
-            return env.option_names if env.has_choice else ()
-    except ConfigError as error:
-        warn(f"{where}={source}: its options cannot be compared with those of the environment ({error})")
-        return ()
 
 
 def _changes(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:

@@ -46,7 +46,7 @@ class Progress(SavedPart):
     model_config = ConfigDict(strict=True, extra="ignore", frozen=True)
 
     config: dict[str, Any]
-    option_names: list[str] | None = None
+    option_names: list[str]
     config_dirs: list[str] | None = None
     frames: Count
     wall_s: Amount

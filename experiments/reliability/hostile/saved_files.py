@@ -310,12 +310,7 @@ def _strange_settings() -> Iterator[Change]:
 
 
 def _choice(group: str, name: Any) -> Callable[[dict], None]:
-    """Return a change of the choice of a group, which earlier versions stored in the group."""
-
-    def change(config: dict) -> None:
-        config.get("choices", config[group])[group if "choices" in config else "name"] = name
-
-    return change
+    return lambda config: config["choices"].update({group: name})
 
 
 def _setting(group: str, setting: str, value: Any) -> Callable[[dict], None]:
@@ -326,8 +321,7 @@ def _gymnasium(**settings: Any) -> Callable[[dict], None]:
     def change(config: dict) -> None:
         _choice("env", "gymnasium")(config)
         _choice("high", "none")(config)
-        kept = {"name": config["env"]["name"]} if "name" in config["env"] else {}
-        config["env"] = {**kept, "max_steps": 5, **settings}
+        config["env"] = {"max_steps": 5, **settings}
 
     return change
 

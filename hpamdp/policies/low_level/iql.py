@@ -83,7 +83,6 @@ class IQL(ReplayLearner):
     explores_with: ClassVar[frozenset[str]] = frozenset()  # its policy stays near the actions in the data
     stores_own_parameters = True
     progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"actor_updates"}
-    added_later: ClassVar[tuple[str, ...]] = ("actor_updates",)  # checkpoints of 0.2 lack it
 
     options: IQLOptions
     actor_updates: Tensor

@@ -408,8 +408,6 @@ class PendingOptionEnds(SizedByData):
     If the selector decides where options end, the next batch shows whether one ended.
     """
 
-    added_later: ClassVar[tuple[str, ...]] = ("is_open", "value")  # checkpoints of 0.2 lack them
-
     is_open: Tensor  # bool [N]
     value: Tensor  # discounted, [N]
 

@@ -83,7 +83,7 @@ class HybridActor(nn.Module):
     """
 
     takes_pairs: ClassVar[bool] = False
-    added_later: ClassVar[tuple[str, ...]] = ("log_max_scale",)  # checkpoints of 0.2 lack it
+    added_later: ClassVar[tuple[str, ...]] = ("log_max_scale",)  # files in agents/ lack it
 
     log_min_scale: Tensor
     log_max_scale: Tensor
