@@ -38,7 +38,6 @@ from hpamdp.messages import (
     lost_output,
     one_line,
     reason_of,
-    reopen_standard_streams,
     say,
     warn,
 )
@@ -60,7 +59,6 @@ def main() -> None:
 
     The exit code is 0, 1 (a bug, with its traceback), 2 (a user's mistake, in one line) or 130 (interrupted).
     """
-    reopen_standard_streams()
     with lenient_streams():
         _main()
 
@@ -75,7 +73,6 @@ def _main() -> None:
     # Hydra warns about a missing folder, but `read` refuses it anyway.
     warnings.filterwarnings("ignore", message="provider=hydra.searchpath")
     try:
-        _check_surroundings()
         if sys.argv[1:2] and sys.argv[1] in _COMMANDS:
             with _limits_explained():
                 sys.exit(_run_command(sys.argv[1], sys.argv[2:]))
@@ -130,17 +127,6 @@ def _limits_explained() -> Iterator[None]:
                 _exit_with(f"{first_line(cause) or type(cause).__name__}: the program needs {_NEEDS[limit]}", FAILED)
             cause = cause.__cause__ or cause.__context__
         raise
-
-
-def _check_surroundings() -> None:
-    """Refuse a deleted working directory and words that are not valid text."""
-    try:
-        os.getcwd()
-    except OSError as error:
-        raise ConfigError(f"the working directory is gone ({error.strerror}); cd to another one") from error
-    for word in sys.argv[1:]:
-        if "\0" in word or word != word.encode(errors="ignore").decode():
-            raise ConfigError(f"{word!r}: not written in UTF-8")
 
 
 def _run_command(name: str, words: list[str]) -> int:

@@ -31,23 +31,6 @@ def first_line(text: object) -> str:
     return one_line(str(text).strip().partition("\n")[0])
 
 
-def reopen_standard_streams() -> None:
-    """Open the null device in place of closed standard streams, as in `2>&-` and in some daemons.
-
-    Otherwise the next file to be opened gets the number of the closed stream, and libraries write their messages into
-    that file. Call this function before anything else is opened.
-    """
-    for number, (name, mode) in enumerate({"stdin": "r", "stdout": "w", "stderr": "w"}.items()):
-        try:
-            os.fstat(number)
-        except OSError:
-            opened = os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, which is this one
-            os.set_inheritable(opened, True)
-        if getattr(sys, name) is None:
-            stream = open(number, mode, encoding="utf-8", closefd=False)  # noqa: SIM115  # stays open
-            setattr(sys, name, stream)
-
-
 class LenientStream:
     """A text stream on which writing never fails.
 
@@ -55,13 +38,13 @@ class LenientStream:
     written as its number.
 
     Args:
-        stream: the stream to write to. If None, like a closed `sys.stderr`, the text is dropped.
+        stream: the stream to write to.
 
     Attributes:
         error: the last error of a write; None if all text was written.
     """
 
-    def __init__(self, stream: TextIO | None) -> None:
+    def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self.error: OSError | ValueError | None = None
 
@@ -72,8 +55,6 @@ class LenientStream:
 
     def write(self, text: str) -> int:
         """Write the text if possible."""
-        if self._stream is None:
-            return len(text)
         try:
             self._stream.write(text)
         except UnicodeEncodeError:
@@ -90,8 +71,6 @@ class LenientStream:
 
     def flush(self) -> None:
         """Flush the stream if possible."""
-        if self._stream is None:
-            return
         try:
             self._stream.flush()
         except (OSError, ValueError) as error:
@@ -99,9 +78,8 @@ class LenientStream:
 
     def isatty(self) -> bool:
         """Return whether the stream is a terminal."""
-        if self._stream is not None:
-            with suppress(OSError, ValueError):
-                return self._stream.isatty()
+        with suppress(OSError, ValueError):
+            return self._stream.isatty()
         return False
 
 
@@ -109,15 +87,14 @@ class LenientStream:
 def lenient_streams() -> Iterator[None]:
     """Keep prints inside the block from failing, and the interpreter's last flush of stdout and stderr as well."""
     before = sys.stdout, sys.stderr
-    out, err = (stream if stream is None else LenientStream(stream) for stream in before)
+    out, err = map(LenientStream, before)
     sys.stdout, sys.stderr = cast(TextIO, out), cast(TextIO, err)
     try:
         yield
     finally:
         sys.stdout, sys.stderr = before
         for stream in (out, err):
-            if stream is not None:
-                _finish(stream)
+            _finish(stream)
 
 
 def _finish(stream: LenientStream) -> None:
@@ -144,7 +121,6 @@ def exit_code(program: Callable[[], int | None]) -> int:
     Args:
         program: returns its exit code. None stands for 0.
     """
-    reopen_standard_streams()
     with lenient_streams():
         try:
             code = program() or 0
@@ -170,7 +146,7 @@ def warn(message: str) -> None:
     _print(message, sys.stderr)
 
 
-def _print(text: str, stream: TextIO | None) -> None:
+def _print(text: str, stream: TextIO) -> None:
     lenient = LenientStream(stream)
     lenient.write(f"{text}\n")
     lenient.flush()

@@ -9,7 +9,6 @@ from typing import Any
 
 import yaml
 
-from hpamdp.config.yaml_files import check_size
 from hpamdp.files import read_regular
 
 # Files of a run that others read.
@@ -47,14 +46,22 @@ _BOOKKEEPING = (
 )
 
 
+class _WithoutAliases(yaml.SafeLoader):
+    """Refuses aliases, which no run writes: a short file of somebody else could stand for values without end."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("an alias")
+        return super().compose_node(parent, index)
+
+
 def saved_config(folder: Path) -> dict[str, Any]:
     """Return the config of the run in a folder; empty if it is missing, cut off or cannot be read."""
     try:
         text = read_regular(folder / CONFIG_NAME, MAX_TEXT_BYTES)
         if not text.endswith(b"\n"):  # cut off in the middle, which may still be yaml
             return {}
-        check_size(folder / CONFIG_NAME)
-        config = yaml.safe_load(text)
+        config = _WithoutAliases(text).get_single_data()
     except Exception:  # PyYAML raises errors of any kind, such as a KeyError for `!!bool x`
         return {}
     return config if isinstance(config, dict) else {}

@@ -22,10 +22,7 @@ def put_working_directory_last() -> None:
 
     Python still finds the user's own classes there. If this package lies there, as in a clone, the order stays.
     """
-    try:
-        directory = os.getcwd()
-    except OSError:  # it was deleted
-        return
+    directory = os.getcwd()
     if not _is_clone(directory):
         sys.path[:] = [entry for entry in sys.path if os.path.realpath(entry) != directory]
     if directory not in map(os.path.realpath, sys.path):

@@ -292,8 +292,6 @@ def test_other_sites_may_neither_send_nor_read(server):
     assert send(server, EPISODES[0], Origin="http://evil.example")[0] == 403
     assert send(server, EPISODES[0], Origin="null")[0] == 403
     assert send(server, EPISODES[0], Origin=f"ftp://127.0.0.1:{server.server_port}")[0] == 403
-    assert send(server, EPISODES[0], Host="evil.example")[0] == 403  # a name that was made to mean this address
-    assert ask(server, "GET", "/", headers={"Host": "evil.example"})[0] == 403
     assert ask(server, "GET", "/", headers={"Host": f"localhost:{port}"})[0] == 200
     assert ask(server, "POST", "/episodes", "{}", {"Content-Type": "text/plain"})[0] == 415  # as a form could send
 

@@ -18,13 +18,13 @@ from typing import IO, Any
 
 import pytest
 import torch
-from conftest import CONF, compose_config, forked
+from conftest import CONF, compose_config
 from test_grid import SHORT
 
 from hpamdp import cli, keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.messages import LenientStream, warn
+from hpamdp.messages import LenientStream
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.run import checkpoint
 from hpamdp.run.folder import is_about_folder
@@ -200,29 +200,6 @@ def test_a_run_whose_output_is_full_goes_on_and_saves(tmp_path):
         process.terminate()
         assert process.wait(60) == 130
     assert frames_of(tmp_path / "run") > 0
-
-
-def _main_without_streams(folder: Path) -> None:
-    os.chdir(folder)
-    _close(0)  # a file that is opened now gets the number of a standard stream
-    sys.stdin = sys.stdout = sys.stderr = sys.__stderr__ = None  # as Python starts then
-    sys.argv = [*PROGRAM, "total_frames=64", "film=false", "high=ucb", "hydra.run.dir=run"]
-    cli.main()
-    for number in range(3):
-        assert os.path.samestat(os.fstat(number), os.stat(os.devnull))
-        assert os.get_inheritable(number)
-
-
-def test_a_run_goes_on_without_standard_streams(tmp_path):
-    assert forked(_main_without_streams, tmp_path) == 0
-    assert frames_of(tmp_path / "run") == 64
-
-
-def test_without_stderr_nothing_is_said_on_stdout_in_its_place(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "stderr", None)
-    warn("a warning")
-    LenientStream(sys.stderr).write("a progress bar")
-    assert capsys.readouterr().out == ""
 
 
 def test_a_copy_of_a_lenient_stream_writes_where_it_does():

@@ -103,16 +103,10 @@ def written_yaml(folder: Path, text: str) -> list[str]:
     return ["--config-dir", str(folder / "mine"), "experiment=odd", "low=random"]
 
 
-LAUGHS = "".join(f"  l{i}: &l{i} [{', '.join([f'*l{i - 1}' if i else '1'] * 9)}]\n" for i in range(12))
-
-
 @pytest.mark.parametrize(
     ("text", "line"),
     [
         ("defaults:\n  - odd\n", "a yaml file names itself among its defaults"),
-        (f"env:\n  kwargs: {'{a: ' * 3000}1{'}' * 3000}\n", "odd.yaml: nests more than 50 levels deep"),
-        (f"env:\n{LAUGHS}", "odd.yaml: has more than 100,000 values"),
-        ("env: &a\n  x: *a\n", "odd.yaml: *a refers to nothing, or to a value that contains it"),
         ("seed: 1\nseed: 2\n", "odd.yaml, line 3: found duplicate key seed"),
         ("env:\n\tseed: 1\n", "odd.yaml, line 3: "),
         ("num_envs: ${seed}\nseed: ${num_envs}\n", "seed: "),
@@ -156,9 +150,6 @@ ODD_WORDS = [
     [f"seed={'choice(' * 300}"],
     [f"seed={'9' * 5000}"],
     ["watch", f"seed={'9' * 5000}"],
-    ["resume=a\0b"],
-    ["resume=\udcff"],
-    ["watch", "\udcff😀"],
     ["😀=1"],
     ["\n"],
 ]
@@ -215,14 +206,6 @@ def test_letters_that_a_terminal_cannot_show_are_replaced(tmp_path, monkeypatch,
         assert forked(ends_with, tmp_path, ["env=Ω"], file.fileno(), encoding, err) == 2
     text = out.read_text(encoding)
     assert text.count("\\u03a9") == 2 and "1 job: 1 finished" in text and "Traceback" not in err.read_text()
-
-
-def test_a_working_directory_that_is_gone_is_reported_in_one_line(command, tmp_path):
-    (tmp_path / "gone").mkdir()
-    os.chdir(tmp_path / "gone")
-    (tmp_path / "gone").rmdir()
-    code, _, err = command("--help")
-    assert code == 2 and err.startswith("the working directory is gone") and err.count("\n") == 1
 
 
 @pytest.fixture

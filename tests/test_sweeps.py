@@ -199,16 +199,12 @@ def test_the_problem_that_all_experiments_of_a_folder_choose_may_be_given():
     assert line.is_multirun and "env=circuit" in line.words
 
 
-@pytest.mark.parametrize(
-    ("values", "line"),
-    [("[1", "seed=[1: not understood; "), ("range(0,inf)", "seed=range(0,inf): more than 100,000 jobs; ")],
-)
-def test_wrong_values_of_an_experiments_sweep_are_told_in_one_line(command, jobs, tmp_path, values, line):
+def test_wrong_values_of_an_experiments_sweep_are_told_in_one_line(command, jobs, tmp_path):
     (tmp_path / "mine/experiment").mkdir(parents=True)
-    text = f"# @package _global_\nhydra: {{mode: MULTIRUN, sweeper: {{params: {{seed: '{values}'}}}}}}\n"
+    text = "# @package _global_\nhydra: {mode: MULTIRUN, sweeper: {params: {seed: '[1'}}}\n"
     (tmp_path / "mine/experiment/mine.yaml").write_text(text)
     code, _, err = command("--config-dir", str(tmp_path / "mine"), "experiment=mine", "low=random")
-    assert code == 2 and err.startswith(line) and err.count("\n") == 1 and not jobs
+    assert code == 2 and err.startswith("seed=[1: not understood; ") and err.count("\n") == 1 and not jobs
 
 
 def test_a_glob_stands_for_a_sweep_over_the_choices_that_match(command, jobs, tmp_path):

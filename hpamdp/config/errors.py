@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from hpamdp.complaints import as_json, complaints
-
-# Larger numbers leave the range that a computation can hold; infinity is refused as well.
-_LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
+from hpamdp.complaints import complaints
 
 # The class or the file that defines a value, and where the value was set if that is known.
 Where: TypeAlias = Callable[[str | None], str]
@@ -59,29 +56,12 @@ def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: st
 
     try:
         # As JSON, in which the strict mode takes what a yaml can hold: a list for a tuple, 1 for 1.0.
-        checked = model.model_validate_json(json.dumps(values, default=_plain))
+        return model.model_validate_json(json.dumps(values, default=_plain))
     except ValidationError as error:
         raise ConfigError(complaints(error, model, values, what, prefix=prefix, where=place)) from error
-    _refuse_huge(model, values, prefix, place)
-    return checked
 
 
 def _plain(value: Any) -> Any:
     """Return NumPy's numbers and truth values as Python's, and what else JSON does not know as text."""
     plain = value.item() if isinstance(value, np.generic) else value
     return plain if isinstance(plain, bool | int | float) else str(value)
-
-
-def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str, where: Where) -> None:
-    """Refuse numbers that are too large to compute with, in a model's fields and in lists there."""
-    for name in model.model_fields:
-        value = values.get(name)
-        for number in value if isinstance(value, list) else [value]:
-            if isinstance(number, bool) or not isinstance(number, int | float):
-                continue
-            largest = _LARGEST_INT if isinstance(number, int) else _LARGEST_FLOAT
-            if abs(number) > largest:
-                setting = f"{prefix}{name}"
-                raise ConfigError(
-                    f"{setting}={as_json(value)}: must lie between -{largest} and {largest} ({where(setting)})"
-                )

@@ -18,7 +18,6 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import IO, Any
-from urllib.parse import urlsplit
 
 from filelock import FileLock
 
@@ -38,7 +37,6 @@ _TYPES = {
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
 }
-_LOOPBACK = {"127.0.0.1", "localhost", "[::1]", "::1"}
 _HEADERS = {
     # No content from other sites, and no frame of another site. Alone in its process, the page has a finer clock.
     "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
@@ -200,7 +198,6 @@ class PageServer(ThreadingHTTPServer):
     Attributes:
         address: address of the page.
         is_local: whether only this computer reaches the address.
-        has_fixed_names: whether the page is served only under the names of 127.0.0.1.
 
     Raises:
         OSError: the server cannot listen on the address.
@@ -221,7 +218,6 @@ class PageServer(ThreadingHTTPServer):
         super().__init__(address, _Handler)
         host, port = str(self.server_address[0]), self.server_port
         self.is_local = ipaddress.ip_address(host).is_loopback
-        self.has_fixed_names = host in _LOOPBACK
         self.address = f"http://{host}:{port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -300,15 +296,9 @@ class _Handler(BaseHTTPRequestHandler):
     def _is_from_here(self) -> bool:
         """Return whether the request comes from the page itself, and not from another site in the browser.
 
-        A request of another site carries its Origin. If the site pointed its name at this address, Host has that name.
+        A request of another site carries its Origin.
         """
         host = self.headers.get("Host", "")
-        try:
-            name = urlsplit(f"//{host}").hostname or ""
-        except ValueError:
-            return False
-        if self.server.has_fixed_names and name not in _LOOPBACK:
-            return False
         origin = self.headers.get("Origin")
         # A web server in front of this one may use https.
         return origin is None or origin in (f"http://{host}", f"https://{host}")

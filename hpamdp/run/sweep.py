@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 import os
 import signal
 import sys
@@ -21,9 +20,6 @@ from typing import Any, ClassVar
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
-from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
@@ -44,8 +40,6 @@ _LOCK_PATIENCE_S = 2 * _PATIENCE_S  # for jobs of a killed sweep, which still sa
 # Settings of Hydra that only a sweep reads, and those that only a single run reads.
 _OF_SWEEPS = ("hydra.sweep.", "hydra.sweeper.", "hydra.launcher.", "hydra/sweeper", "hydra/launcher")
 _OF_RUNS = ("hydra.run.",)
-_BASIC_SWEEPER = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
-_MOST_JOBS = 100_000
 _HYDRA_NAME = "multirun.yaml"  # which Hydra writes into the sweep's folder
 # States of a job. The first one holds until the job ends.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
@@ -71,7 +65,6 @@ class SweepFolderCallback(Callback):
         SweepFolderCallback.path = Path(os.path.abspath(config.hydra.sweep.dir))
         try:
             _check_sweep_dir(SweepFolderCallback.path)
-            _check_number(config)
             first_job = first_job_of_search(config)
         except ConfigError as error:
             warn(str(error))
@@ -100,38 +93,6 @@ def _check_fixed(config: DictConfig, name: str) -> None:
     if config.resume == RESUME_AUTO and "${now:" in str(folder):
         warn(f"resume=auto: goes on with the run in a folder, so give {name}")
         sys.exit(MISTAKE)
-
-
-def _check_number(config: DictConfig) -> None:
-    """Refuse a sweep of so many jobs that Hydra, which lists all of them first, would run out of memory.
-
-    Raises:
-        ConfigError: there are too many jobs.
-    """
-    sweeper = config.hydra.sweeper
-    if sweeper._target_ != _BASIC_SWEEPER:  # others draw values from a range
-        return
-    words = {name: f"{name}={values}" for name, values in (sweeper.params or {}).items()}
-    words |= {setting_of(word): word for word in config.hydra.overrides.task}
-    try:
-        overrides = OverridesParser.create().parse_overrides([*words.values()])
-    except HydraException:  # which Hydra will report
-        return
-    swept = [each for each in overrides if each.is_discrete_sweep()]
-    if math.prod(map(_num_values, swept)) > _MOST_JOBS:
-        given = " ".join(each.input_line or "" for each in swept if _num_values(each) > 1)
-        raise ConfigError(f"{given}: more than {_MOST_JOBS:,} jobs; give fewer values")
-
-
-def _num_values(swept: Override) -> float:
-    values = swept.value()
-    if not isinstance(values, RangeSweep):
-        return len(values.list) if isinstance(values, ChoiceSweep) else 1
-    assert values.start is not None and values.stop is not None
-    length = float(values.stop) - float(values.start)
-    if math.isnan(length) or values.step == 0:
-        return 1  # which Hydra refuses
-    return max(0.0, length / values.step)
 
 
 def _check_sweep_dir(folder: Path) -> None:
