@@ -219,7 +219,6 @@ class Copies:
             for self._row, seed in seeds.items():
                 env = self.envs[self._row]
                 observation, info = env.reset(seed=seed)
-                self._masks.check_attributes(env)
                 if not self._write[self._row](observation):
                     settled.add(self._row)
                 self._masks.keep(self._row, observation, info)

@@ -71,7 +71,7 @@ class GymnasiumOptions(Settings):
     """Where the environment says which actions it forbids. `info`: `action_mask` and `option_mask` in each info.
 
     `ignore`: masks are ignored. If null, the entries `action_mask` and `option_mask` of a `Dict` of observations, if it
-    has them. A mask in another place, such as a method `action_masks()`, is refused unless masks are ignored.
+    has them. A mask in an info, or a method `action_masks()`, is then refused.
     """
     pair_mask: MaskSource | None = None
     """Where the environment says which discrete actions of different components go together, `pair_mask`.

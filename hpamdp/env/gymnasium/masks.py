@@ -1,12 +1,9 @@
-"""Read the masks of allowed discrete actions and options, and refuse masks in places that are not read."""
+"""Read the masks of allowed discrete actions and options, and refuse masks where they are not read."""
 
 from __future__ import annotations
 
 import inspect
-import re
-from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache
-from itertools import chain
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import gymnasium
@@ -17,35 +14,21 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
-from hpamdp.env.gymnasium.leaves import leaves
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers, shown
 from hpamdp.settings import SettingError
 
 MaskSource = Literal["info", "ignore"]
 
-_DEPTH = 4  # of nested dictionaries that are searched
-# Names of masks, and of lists of allowed or forbidden choices, in lower case without punctuation.
-_VERBS = "(?:get|compute|current)?"
-_ADJECTIVES = "(?:avail|available|legal|valid|allowed|permitted|possible|feasible|invalid|illegal|forbidden)"
-_MEANINGS = {
-    keys.ACTION_MASK: f"{_VERBS}(?:{_ADJECTIVES}actions?(?:masks?)?|actions?masks?|masks?actions?)",
-    keys.OPTION_MASK: f"{_VERBS}(?:{_ADJECTIVES}options?(?:masks?)?|options?masks?|masks?options?)",
-    keys.PAIR_MASK: f"{_VERBS}(?:{_ADJECTIVES}pairs?(?:masks?)?|pairs?masks?|masks?pairs?)",
-}
 # The setting that says where a mask is.
 _SETTINGS = {
     keys.ACTION_MASK: "env.action_mask",
     keys.OPTION_MASK: "env.action_mask",
     keys.PAIR_MASK: "env.pair_mask",
 }
-# Types that need no search, which takes longer.
-_NO_MAPPINGS = frozenset((bool, int, float, str, tuple, list, np.ndarray, np.float32, np.float64, np.int64, type(None)))
-# These names may also mean something else, so the values decide.
-_VAGUE = ("mask", "masks")
 
 
 class Masks:
-    """The masks of the copies of an environment, with a check for masks in places that are not read.
+    """The masks of the copies of an environment, with a check for masks that are not read.
 
     Args:
         env: one of the copies.
@@ -62,7 +45,7 @@ class Masks:
         in_observation: names of the masks that come with the observation.
 
     Raises:
-        ValueError: a source is none of these, or the environment has a mask in a place that is not read.
+        ValueError: a source is none of these, or the environment has a mask that is not read.
     """
 
     def __init__(
@@ -96,8 +79,14 @@ class Masks:
             if (sources[name] == "info" or name in entries) and (has_pairs or name != keys.PAIR_MASK)
         }
         self.in_observation = frozenset(name for name in self.rows if sources[name] is None)
-        self._unread = {name: size for name, size in sizes.items() if name not in self.rows}
-        self._refuse([*_in_space(space), *_in_attributes(env, is_new=True)], ValueError)
+        # Also in the plural, as sb3-contrib calls its method.
+        self._unread = {entry: name for name in sizes if name not in self.rows for entry in (name, f"{name}s")}
+        self._refuse("the entry {} of the observation", entries, SettingError)
+        layer: Any = env
+        while layer is not None:
+            found = {entry: inspect.getattr_static(layer, entry, None) for entry in self._unread}
+            self._refuse(f"{type(layer).__name__}.{{}}", found, SettingError)
+            layer = getattr(layer, "__dict__", {}).get("env")
 
     @property
     def needs_info(self) -> list[str]:
@@ -113,18 +102,16 @@ class Masks:
             info: as the environment gives it.
 
         Raises:
-            ProblemError: a mask is not made of 0 and 1 for each choice, or is in a place that is not read.
+            ProblemError: a mask is not made of 0 and 1 for each choice, or is not read.
         """
         for name, masks in self.rows.items():
             given = (observation if name in self.in_observation else info).get(name)
             if given is None and name == keys.OPTION_MASK:
-                self._refuse([*in_mapping("info", info, _meaning)], ProblemError, {name: masks.shape[1]})
                 masks[row] = True
                 continue
             masks[row] = self._flat(name, given, masks.shape[1])
-        if self._unread and not (_is_plain(info) and _is_plain(observation)):
-            places = in_mapping("info", info, _meaning), in_mapping("observation", observation, _meaning)
-            self._refuse([*chain(*places)], ProblemError)
+        if not self._unread.keys().isdisjoint(info):
+            self._refuse("info[{!r}]", info, ProblemError)
 
     def _flat(self, name: str, given: Any, size: int) -> np.ndarray:
         """Return a mask as bool `[size]`."""
@@ -143,122 +130,18 @@ class Masks:
             raise ProblemError(f"gave {shown(given)} as {name}, which must be {wanted}, 0 or 1")
         return (mask != 0).ravel()
 
-    def check_attributes(self, env: gymnasium.Env) -> None:
-        """Check the attributes that a copy has set since it was made.
-
-        Raises:
-            ProblemError: one of them is a mask.
-        """
-        if self._unread:
-            self._refuse([*_in_attributes(env, is_new=False)], ProblemError)
-
-    def _refuse(
-        self, places: list[tuple[str, str, Any]], error: type[ValueError], unread: Mapping[str, int] | None = None
-    ) -> None:
-        """Raise an error about the first mask that is not read, among candidates of a place, a name and a value."""
-        unread = self._unread if unread is None else unread
-        for place, entry, value in places:
-            name = _meaning(entry)
-            if name is None or name not in unread or _cannot_be_mask(value):
-                continue
-            if _is_vague(entry) and not _is_like_mask(value, unread[name]):
+    def _refuse(self, place: str, values: Mapping[str, Any], error: type[ValueError]) -> None:
+        """Raise an error about the first mask among values that is not read."""
+        for entry, name in self._unread.items():
+            if values.get(entry) is None:
                 continue
             setting, article = _SETTINGS[name], "a" if name == keys.PAIR_MASK else "an"
             raise error(
-                f"gave {article} {name} as {place}, which is not read; give it as {name} in a Dict of observations, or "
-                f"in the info of every reset and step with {setting}=info; {setting}=ignore ignores it"
+                f"gave {article} {name} as {place.format(entry)}, which is not read; give it as {name} in a Dict of "
+                f"observations, or in the info of every reset and step with {setting}=info; {setting}=ignore ignores it"
             )
 
 
 def as_leaf(name: str, mask: Tensor, num_discrete: int) -> Tensor:
     """Return one of `Masks.rows` in the shape of its leaf: `[N, K, K]` for `pair_mask`, otherwise as it is."""
     return mask.unflatten(-1, (num_discrete, num_discrete)) if name == keys.PAIR_MASK else mask
-
-
-def _in_space(space: spaces.Space) -> Iterator[tuple[str, str, Any]]:
-    """Yield the entries of an observation space that may be masks: place, name and a value."""
-    for leaf in leaves(space):
-        for entry in leaf.path:
-            yield f"{leaf.what} of the observation", str(entry), np.zeros(leaf.space.shape or ())
-
-
-def in_mapping(
-    place: str, values: Any, meaning: Callable[[str], str | None], depth: int = _DEPTH
-) -> Iterator[tuple[str, str, Any]]:
-    """Yield the entries of nested dictionaries whose names have a meaning: place, name and value.
-
-    Args:
-        place: what the place of `values` is called.
-        values: a dictionary; anything else has no entries.
-        meaning: returns what a name suggests, or None.
-        depth: how many dictionaries inside each other are searched.
-    """
-    if not isinstance(values, Mapping) or depth == 0:
-        return
-    for entry, value in values.items():
-        if isinstance(entry, str) and meaning(entry) is not None:
-            yield f"{place}[{entry!r}]", entry, value
-        if isinstance(value, Mapping):
-            yield from in_mapping(f"{place}[{entry!r}]", value, meaning, depth - 1)
-
-
-def _is_plain(values: Any) -> bool:
-    """Return whether values are no dictionary, or one without nested dictionaries and names of masks."""
-    if type(values) in _NO_MAPPINGS or not isinstance(values, Mapping):
-        return True
-    for entry, value in values.items():
-        if type(value) not in _NO_MAPPINGS and isinstance(value, Mapping):
-            return False
-        if type(entry) is str and _meaning(entry) is not None:
-            return False
-    return True
-
-
-def _in_attributes(env: Any, *, is_new: bool) -> Iterator[tuple[str, str, Any]]:
-    """Yield the attributes and methods of an environment and its wrappers that may be masks: place, name and value.
-
-    Args:
-        env: the outermost wrapper.
-        is_new: whether to look at the attributes of classes, too. They never change, so one look is enough.
-    """
-    layer: Any = env
-    while layer is not None:
-        for attribute in dir(layer) if is_new else [*getattr(layer, "__dict__", ())]:
-            if attribute.startswith("_") or _meaning(attribute) is None:
-                continue
-            value = inspect.getattr_static(layer, attribute, None)
-            if not _cannot_be_mask(value):
-                kind = "method" if callable(value) else "attribute"
-                yield f"the {kind} {type(layer).__name__}.{attribute}", attribute, value
-        layer = getattr(layer, "__dict__", {}).get("env")
-
-
-@lru_cache(maxsize=4096)  # an environment may name its entries anew in each episode
-def _meaning(entry: str) -> str | None:
-    """Return the mask that the name of an entry suggests, if any."""
-    letters = _letters(entry)
-    if letters in _VAGUE:
-        return keys.ACTION_MASK
-    return next((name for name, pattern in _MEANINGS.items() if re.fullmatch(pattern, letters)), None)
-
-
-def _is_vague(entry: str) -> bool:
-    return _letters(entry) in _VAGUE
-
-
-def _letters(entry: str) -> str:
-    return re.sub(r"[^a-z]", "", entry.lower())
-
-
-def _is_like_mask(value: Any, size: int) -> bool:
-    if callable(value) or isinstance(value, property):
-        return True
-    numbers = as_numbers(value)
-    if numbers is None or not numbers.size == size == max(numbers.shape, default=0):
-        return False
-    return bool(((numbers == 0) | (numbers == 1)).all())
-
-
-def _cannot_be_mask(value: Any) -> bool:
-    """Return whether a value is no mask, whatever its name: a flag, a number, a text or None."""
-    return value is None or isinstance(value, str | bool | int | float | np.generic)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from functools import cache
 from typing import Any
 
 import gymnasium
@@ -14,16 +12,11 @@ from gymnasium import spaces
 from hpamdp import keys
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
-from hpamdp.env.gymnasium.masks import MaskSource, in_mapping
+from hpamdp.env.gymnasium.masks import MaskSource
 from hpamdp.env.gymnasium.values import MisfitError
 from hpamdp.settings import SettingError
 
 _NAMES = (keys.PARAMETER_LOW, keys.PARAMETER_HIGH)
-# What may name them, in lower case without punctuation.
-_MEANINGS = {
-    keys.PARAMETER_LOW: "param(?:eter)?s?(?:low|lower|min|minimum)(?:bounds?|limits?)?",
-    keys.PARAMETER_HIGH: "param(?:eter)?s?(?:high|upper|max|maximum)(?:bounds?|limits?)?",
-}
 # A bound may exceed those of the space by this fraction of their size. It is then clipped, as a rounding error.
 _ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
 
@@ -56,7 +49,7 @@ class ParameterBounds:
         if self.names and not sum(actions.parameter_dims):
             raise SettingError(f"{' and '.join(self.names)}: the action has no parameters")
         self.in_observation = source is None and bool(self.names)
-        self._is_searched = source != "ignore" and sum(actions.parameter_dims) > 0
+        self._may_be_unread = source is None and not self.names and sum(actions.parameter_dims) > 0
         self._actions = actions
         self.low = np.tile(actions.own_low, (num_envs, 1))
         self.high = np.tile(actions.own_high, (num_envs, 1))
@@ -70,17 +63,15 @@ class ParameterBounds:
             info: as the environment gives it.
 
         Raises:
-            ProblemError: the bounds are missing, have another structure than the space, or are in a place that is not
-                read. Or a bound is not finite or whole, lies outside the bounds of the space, or crosses the other one.
+            ProblemError: the bounds are missing, have another structure than the space, or are not read. Or a bound is
+                not finite or whole, lies outside the bounds of the space, or crosses the other one.
         """
-        source = observation if self.in_observation else info
-        given = {name: source.get(name) for name in self.names}
-        if self._is_searched:
-            self._refuse_unread("info", info, given)
-            if self.in_observation or not self.names:
-                self._refuse_unread("observation", observation, given)
+        if self._may_be_unread:
+            self._refuse_unread(info)
         if not self.names:
             return
+        source = observation if self.in_observation else info
+        given = {name: source.get(name) for name in self.names}
         if all(value is None for value in given.values()):
             raise ProblemError(f"gave no {' or '.join(self.names)}, one of which must come with every reset and step")
         actions = self._actions
@@ -90,13 +81,13 @@ class ParameterBounds:
         self.low[row], self.high[row] = bounds
 
     @staticmethod
-    def _refuse_unread(place: str, values: Any, given: Mapping[str, Any]) -> None:
-        for where, entry, value in in_mapping(place, values, _meaning):
-            if value is not None and given.get(str(_meaning(entry))) is None:
+    def _refuse_unread(info: Mapping[str, Any]) -> None:
+        for name in _NAMES:
+            if info.get(name) is not None:
                 raise ProblemError(
-                    f"gave {where}, which is not read; give bounds of the state as parameter_low and parameter_high in "
-                    "a Dict of observations, or in the info of every reset and step with env.parameter_bounds=info; "
-                    "env.parameter_bounds=ignore ignores them"
+                    f"gave info[{name!r}], which is not read; give bounds of the state as parameter_low and "
+                    "parameter_high in a Dict of observations, or in the info of every reset and step with "
+                    "env.parameter_bounds=info; env.parameter_bounds=ignore ignores them"
                 )
 
     def _checked(self, name: str, given: Any, static: np.ndarray) -> np.ndarray:
@@ -119,13 +110,6 @@ class ParameterBounds:
             place = int(is_wrong.argmax())
             reason = why.format(*(f"{other[place]:.10g}" for other in others))
             raise ProblemError(f"gave {name}={bound[place]:.10g} for parameter {place}, {reason}")
-
-
-@cache
-def _meaning(entry: str) -> str | None:
-    """Return the bound that the name of an entry suggests, if any."""
-    letters = re.sub(r"[^a-z]", "", entry.lower())
-    return next((name for name, pattern in _MEANINGS.items() if re.fullmatch(pattern, letters)), None)
 
 
 def agent_bounds(actions: ActionSpace, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
