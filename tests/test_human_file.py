@@ -114,33 +114,12 @@ def test_foreign_files_are_refused(tmp_path, form):
     assert "this is not a MATLAB file with people's trajectories" in refusal(path, checksum=None)
 
 
-WRONG = {
-    "R": ("R is not the harbour's radius", lambda v: v - 1),
-    "outcome": ("outcome is not 1, 2, 3 or 4", lambda v: v + 4),
-    "tank": ("tank is not a number of ticks", lambda v: v + 361),
-    "boatchoice": ("boatchoice is not 0 or 1", lambda v: v + 2),
-    "incongkm": ("incongkm is not 1 or 2", lambda v: v + 2),
-    "boatdir": ("boatdir does not hold the directions", lambda v: -v),
-    "center": ("not within 110 px", lambda v: v + 150),
-    "SG": ("distance does not follow", lambda v: v + 0.01 * np.eye(4)[1]),
-    "distance": ("distance does not follow", lambda v: v + 0.01),
-    "gas": ("gas does not follow", lambda v: v - 0.01),
-    "velocity": ("velocity does not follow", lambda v: v * 1.01),
-    "obs": ("does not follow from its position", lambda v: v + 0.01),
-    "actions": ("does not have exactly one key", lambda v: v + 0.01),
-    "next_obs": ("", lambda v: v + 0.01),
-    "terminals": ("terminals does not mark the final press", lambda v: v[:, ::-1]),
-}
-
-
-@pytest.mark.parametrize("field", WRONG)
-def test_a_field_that_breaks_a_rule_is_named_with_its_episode(tmp_path, field):
+def test_an_unknown_code_is_refused(tmp_path):
     people = synthetic_human.recording()
-    index = next(i for i, episode in enumerate(people[1]) if episode["gas"].size > 2)
-    rule, alter = WRONG[field]
-    people[1][index][field] = alter(people[1][index][field])
-    message = refusal(synthetic_human.write(tmp_path / "a.mat", people), checksum=None)
-    assert f"person 1, episode {index}: " in message and rule in message
+    people[1][0]["outcome"] = people[1][0]["outcome"] + 4
+    assert "outcome is not 1 or 2 or 3 or 4" in refusal(
+        synthetic_human.write(tmp_path / "a.mat", people), checksum=None
+    )
 
 
 def test_missing_fields_and_wrong_sizes_are_named(tmp_path):

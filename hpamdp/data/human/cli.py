@@ -152,7 +152,7 @@ def _check(options: argparse.Namespace) -> None:
     episodes, presses = data
     people = episodes["person"].unique()
     say(f"{options.file or default_path()}: {checksum}")
-    say(f"{len(people)} people, {len(episodes)} episodes, {len(presses)} presses; contents are consistent")
+    say(f"{len(people)} people, {len(episodes)} episodes, {len(presses)} presses")
     num_empty = (episodes["presses"] == 0).sum()
     num_single = (episodes["presses"] == 1).sum()
     say(

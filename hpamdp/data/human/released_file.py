@@ -78,13 +78,13 @@ def read(path: Path | str | None = None, *, checksum: str | None = SHA256, one_f
 
     Args:
         path: the file. If None, `default_path`.
-        checksum: the SHA-256 that the file must have. If None, any file with consistent contents is accepted. A
-            damaged file can then crash SciPy's reader or fill the memory, so read only files that you trust.
+        checksum: the SHA-256 that the file must have. If None, any file with these fields is accepted, and its
+            numbers are not checked. A damaged file can crash SciPy's reader, so read only files that you trust.
         one_frame: whether to move every position so that all harbours have the environment's centre, (640, 512). Half
             the people saw theirs at (672, 504).
 
     Raises:
-        DataError: the file does not exist, has another checksum, or has inconsistent contents.
+        DataError: the file does not exist, has another checksum, or other fields.
     """
     path = default_path() if path is None else Path(path)
     data = load_bytes(path)
@@ -92,7 +92,6 @@ def read(path: Path | str | None = None, *, checksum: str | None = SHA256, one_f
         check_sum(data, checksum, path)
     try:
         columns = schema.columns(data)
-        schema.check(columns)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
     return _tables(columns, one_frame)

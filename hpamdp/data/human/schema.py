@@ -1,8 +1,4 @@
-"""The schema of the released file: the fields of an episode, and the rules between them.
-
-Much of the recording is redundant, so the rules find most damaged files. Distances follow from positions, speeds and
-`gas` from durations, and the directions of the keys from controller and key map.
-"""
+"""The schema of the released file: the fields of an episode."""
 
 from __future__ import annotations
 
@@ -11,17 +7,12 @@ from io import BytesIO
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from hpamdp.data.errors import DataError
-from hpamdp.env.boatdock import harbour, physics, task
 from hpamdp.messages import first_line
 
 SPEED_UNIT = 10.0  # px/s of the column `velocity`
-_DIRECTION_UNIT = 10.0
 GAS_SECONDS = 5.0  # logged seconds at which the column `gas` is 0; the tank itself has 6
-_EXACT = 1e-6  # px, s: tolerance for redundant values, which agree up to rounding
-_MAX_OVERBURN = 15.0  # ticks by which the presses may exceed the fuel that the tank lost; 10.9 in the released file
 
 # The fields, and how many numbers each has per press, per non-final press or per episode. `terminals` has one number
 # per press, and one in an episode without a press.
@@ -29,8 +20,8 @@ _PER_PRESS = {"actions": 3, "velocity": 3, "gas": 1, "distance": 1}
 _PER_NON_FINAL_PRESS = {"obs": 2, "next_obs": 2}
 _PER_EPISODE = {"center": 2, "SG": 4, "R": 1, "outcome": 1, "boatdir": 6, "boatchoice": 1, "incongkm": 1, "tank": 1}
 _WIDTHS = {**_PER_PRESS, **_PER_NON_FINAL_PRESS, **_PER_EPISODE, "terminals": 1}
-
-_Rules = Iterator[tuple[str, np.ndarray]]
+# The codes that stand for an outcome, a controller and a key map.
+_CODES = {"outcome": (1, 2, 3, 4), "boatchoice": (0, 1), "incongkm": (1, 2)}
 
 
 class Columns(NamedTuple):
@@ -54,7 +45,8 @@ def columns(data: bytes) -> Columns:
     It is a cell array of people. Each person is a cell array of episodes, and each episode is a struct.
 
     Raises:
-        DataError: the file is damaged or has another structure, or a field is missing or has the wrong size.
+        DataError: the file is damaged or has another structure, or a field is missing or has the wrong size
+            or an unknown code.
     """
     try:
         episodes = list(_episodes(data))
@@ -74,6 +66,9 @@ def columns(data: bytes) -> Columns:
         name: np.concatenate([fields[name] for _, _, fields in episodes]).reshape(-1, _WIDTHS[name])
         for name in sorted(_WIDTHS)
     }
+    for name, codes in _CODES.items():
+        if not np.isin(stacked[name], codes).all():
+            raise DataError(f"{name} is not {' or '.join(map(str, codes))} in every episode")
     return Columns(people, indices, num_presses, stacked)
 
 
@@ -126,101 +121,3 @@ def positions(columns: Columns) -> np.ndarray:
     position[final[num > 1]] = columns.fields["next_obs"][last_non_final[num > 1]]
     position[final[num == 1]] = columns.fields["SG"][num == 1][:, [0, 2]]
     return position
-
-
-def check(columns: Columns) -> None:
-    """Check the rules that hold for the released file.
-
-    Raises:
-        DataError: a rule is broken. The message names the rule and the first episode that breaks it.
-    """
-    for name, values in columns.fields.items():
-        if not np.isfinite(values).all():
-            raise DataError(f"{name} has numbers that are not finite")
-    every_episode = np.arange(len(columns.num_presses))
-    episode_of_press = np.repeat(every_episode, columns.num_presses)
-    _check_rules(columns, _episode_rules(columns, episode_of_press), every_episode)
-    _check_rules(columns, _press_rules(columns, episode_of_press), episode_of_press)
-
-
-def _check_rules(columns: Columns, rules: _Rules, episode_of_row: np.ndarray) -> None:
-    for broken, holds in rules:
-        if not holds.all():
-            episode = episode_of_row[np.argmin(holds)]
-            person = columns.person[episode]
-            raise DataError(f"person {person}, episode {columns.episode_index[episode]}: {broken}")
-
-
-def _is_one_of(values: np.ndarray, *allowed: float) -> np.ndarray:
-    return np.isin(values[:, 0], allowed)
-
-
-def _episode_rules(columns: Columns, episode_of_press: np.ndarray) -> _Rules:
-    """Yield, for each rule, the message for an episode that breaks it, and which episodes keep it, `[E]`."""
-    fields = columns.fields
-    yield "R is not the harbour's radius, 120 px", fields["R"][:, 0] == physics.HARBOUR_RADIUS
-    yield "outcome is not 1, 2, 3 or 4", _is_one_of(fields["outcome"], 1, 2, 3, 4)
-    yield "boatchoice is not 0 or 1", _is_one_of(fields["boatchoice"], 0, 1)
-    yield "incongkm is not 1 or 2", _is_one_of(fields["incongkm"], 1, 2)
-    yield "tank is not a number of ticks from 0 to 360", _is_one_of(fields["tank"], *range(361))
-    num_terminals = np.maximum(columns.num_presses, 1)
-    last = np.cumsum(num_terminals) - 1
-    num_marked = np.add.reduceat(fields["terminals"][:, 0] != 0, last - num_terminals + 1)
-    is_last_marked = fields["terminals"][last, 0] == 1
-    yield "terminals does not mark the final press alone", is_last_marked & (num_marked == 1)
-    on_screen = (fields["center"] >= 0) & (fields["center"] <= 10_000)
-    yield "center is not on the screen", np.all(on_screen, axis=1)
-    x, y = directions(fields["boatchoice"][:, 0], fields["incongkm"][:, 0])
-    expected = _DIRECTION_UNIT * np.stack([x, y], 2).reshape(-1, 6)
-    error = np.abs(fields["boatdir"] - expected).max(1)
-    yield "boatdir does not hold the directions of this controller and key map", error < _EXACT
-    start = fields["SG"][:, [0, 2]]
-    goal = fields["SG"][:, [1, 3]]
-    for name, point in (("start", start), ("goal", goal)):
-        from_centre = np.linalg.norm(point - fields["center"], axis=1)
-        yield f"the {name} is not within 110 px of the harbour's centre", from_centre <= harbour.LAYOUT_RADIUS + _EXACT
-    separation = np.linalg.norm(start - goal, axis=1)
-    yield "start and goal are less than 30 px apart", separation >= harbour.MIN_SEPARATION - _EXACT
-    pressed = np.bincount(episode_of_press, fields["actions"].sum(1), minlength=len(separation))
-    yield "the presses take more fuel than the tank lost", fields["tank"][:, 0] + 60 * pressed <= 360 + _MAX_OVERBURN
-
-
-def directions(controller: np.ndarray, keymap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit directions of the three keys, x and y, each `[E, 3]`."""
-    x, y = harbour.direction(
-        torch.from_numpy(controller.astype(np.int64)).unsqueeze(1),
-        torch.from_numpy(keymap.astype(np.int64)).unsqueeze(1),
-        torch.arange(harbour.NUM_KEYS).unsqueeze(0),
-    )
-    return x.double().numpy(), y.double().numpy()
-
-
-def _press_rules(columns: Columns, episode_of_press: np.ndarray) -> _Rules:
-    """Yield, for each rule, the message for a press that breaks it, and which presses keep it, `[N]`."""
-    fields = columns.fields
-    actions = fields["actions"]
-    num_presses = columns.num_presses
-    first = np.cumsum(num_presses) - num_presses
-    number = np.arange(len(episode_of_press)) - first[episode_of_press]
-    is_final = number == num_presses[episode_of_press] - 1
-    duration = actions.sum(1)
-    yield "a press does not have exactly one key", (actions != 0).sum(1) == 1
-    yield "a press does not take between 0 and 2 s", (duration > 0) & (duration <= physics.MAX_DURATION)
-    speed = np.where(actions > 0, task.speed(actions) / SPEED_UNIT, 0.0)
-    speed_error = np.abs(fields["velocity"] - speed).max(1)
-    yield "a press's velocity does not follow from its time", speed_error < _EXACT
-    elapsed = np.cumsum(duration)
-    if len(duration):
-        elapsed = elapsed - (elapsed - duration)[first[episode_of_press]]
-    gas_error = np.abs(fields["gas"][:, 0] - 1 + elapsed / GAS_SECONDS)
-    yield "a press's gas does not follow from the times", gas_error < _EXACT
-    position = positions(columns)
-    from_centre = np.linalg.norm(position - fields["center"][episode_of_press], axis=1)
-    yield "a press begins outside the harbour", from_centre <= physics.HARBOUR_RADIUS
-    distance = np.linalg.norm(position - fields["SG"][episode_of_press][:, [1, 3]], axis=1)
-    distance_error = np.abs(distance - fields["distance"][:, 0])
-    yield "a press's distance does not follow from its position", distance_error < _EXACT
-    follows = np.ones(len(duration), bool)
-    non_final = np.flatnonzero(~is_final)
-    follows[non_final] = (fields["next_obs"] == position[non_final + 1]).all(1)
-    yield "a press does not begin where the previous one ended", follows
