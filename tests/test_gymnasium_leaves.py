@@ -29,7 +29,7 @@ def quickly(space: ObservationSpace, value) -> np.ndarray:
     """Return an observation as a vector, in the way of an environment with many copies."""
     vectors, pixels = np.zeros((1, space.dim)), np.zeros(space.num_pixels, np.uint8)
     if space.writer(vectors[0], pixels)(value) and space.unsettled(vectors):
-        vectors[0] = space.settled(vectors[0])
+        vectors[0] = space.flat(value)
     return space.rounded(vectors)[0]
 
 

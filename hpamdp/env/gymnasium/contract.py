@@ -19,7 +19,7 @@ class ContractCheck(gymnasium.Wrapper):
     assertions of several lines.
 
     Raises:
-        ProblemError: from `reset` and `step`, if these break their contract or end the program.
+        ProblemError: from `reset` and `step`, if these break their contract.
     """
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -30,8 +30,6 @@ class ContractCheck(gymnasium.Wrapper):
             if not _is_about_the_call(error):
                 raise
             raise ProblemError(f"reset must take seed and options: {one_line(error)}") from error
-        except SystemExit as error:
-            raise ProblemError(f"reset called sys.exit({shown(error.code)})") from error
         if not isinstance(values, tuple) or len(values) != 2 or not isinstance(values[1], Mapping):
             raise ProblemError("reset must return an observation and an info, a dictionary")
         return values[0], dict(values[1])
@@ -40,31 +38,27 @@ class ContractCheck(gymnasium.Wrapper):
         """Take a step."""
         try:
             values: Any = self.env.step(action)
-        except (TypeError, SystemExit) as error:
+        except TypeError as error:
             refuse_step(error)
             raise
         return checked_step(values)
 
     def close(self) -> None:
-        """Close the environment; if it raises an error or calls `sys.exit`, warn and let the run go on."""
+        """Close the environment; if it raises an error, warn and let the run go on."""
         what = f"{type(self.unwrapped).__name__}: close"
         try:
             self.env.close()
-        except SystemExit as error:
-            warn(f"{what} called sys.exit({shown(error.code)}); the run goes on")
         except Exception as error:
             told = fault_of(error, what) or f"{what} raised {type(error).__name__}: {error}"
             warn(one_line(f"{told}; the run goes on"))
 
 
-def refuse_step(error: TypeError | SystemExit) -> None:
+def refuse_step(error: TypeError) -> None:
     """Explain an error of `step` if it breaks the contract; call this in the frame that called `step`.
 
     Raises:
-        ProblemError: `step` does not take an action, or it ended the program.
+        ProblemError: `step` does not take an action.
     """
-    if isinstance(error, SystemExit):
-        raise ProblemError(f"step called sys.exit({shown(error.code)})") from error
     if _is_about_the_call(error):
         raise ProblemError(f"step must take an action: {one_line(error)}") from error
 

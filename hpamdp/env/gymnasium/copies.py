@@ -186,7 +186,7 @@ class Copies:
         rows = zip(self.results.observation, self.pixels, strict=True)
         self._write = [self.observations.writer(*row) for row in rows]
         # Without the outer check, whose work `step` does in its loop.
-        self._unchecked = [env.env if isinstance(env, ContractCheck) else env for env in self.envs]
+        self._inner = [env.env if isinstance(env, ContractCheck) else env for env in self.envs]
         self._num_steps = [0] * num
         self._after = self.table[:, self.layout.dim : self.layout.dim + _NUM_AFTER]
         self._has_masks = bool(mask_sizes)
@@ -214,17 +214,17 @@ class Copies:
             EnvironmentFaultError: its `reset` raised an error.
         """
         rows = np.array([*seeds], np.int64)
-        settled: set[int] = set()
+        unchecked: dict[int, Any] = {}
         try:
             for self._row, seed in seeds.items():
                 env = self.envs[self._row]
                 observation, info = env.reset(seed=seed)
-                if not self._write[self._row](observation):
-                    settled.add(self._row)
+                if self._write[self._row](observation):
+                    unchecked[self._row] = observation
                 self._masks.keep(self._row, observation, info)
                 self._bounds.keep(self._row, observation, info)
                 self._num_steps[self._row] = 0
-            self._settle(rows, settled)
+            self._settle(rows, unchecked)
         except Exception as error:
             self._explain("reset", error)
         self._after[rows] = 0.0
@@ -244,21 +244,21 @@ class Copies:
         """
         index: Any = _ALL if len(rows) == len(self.envs) else rows
         natives = self._natives(index, option, discrete, parameters)
-        unchecked, write, num_steps, limits = self._unchecked, self._write, self._num_steps, self._limits
+        envs, write, num_steps, limits = self._inner, self._write, self._num_steps, self._limits
         rewards: list[float] = []
         flags: dict[int, tuple[bool, ...]] = {}  # of the few copies that have one
-        settled: set[int] = set()
+        unchecked: dict[int, Any] = {}
         try:
             for row, action in zip(rows, natives, strict=True):
                 self._row = row
                 try:
-                    values = unchecked[row].step(action)
-                except (TypeError, SystemExit) as error:
+                    values = envs[row].step(action)
+                except TypeError as error:
                     refuse_step(error)
                     raise
                 observation, reward, terminated, truncated, info = checked_step(values)
-                if not write[row](observation):
-                    settled.add(row)
+                if write[row](observation):
+                    unchecked[row] = observation
                 rewards.append(reward)
                 num_steps[row] += 1
                 truncated = not terminated and (truncated or num_steps[row] >= limits[row])
@@ -270,7 +270,7 @@ class Copies:
                 if terminated or truncated or success is not None:
                     flags[row] = (terminated, truncated, bool(success), success is not None)
             if rows:
-                self._settle(index, settled)
+                self._settle(index, unchecked)
         except Exception as error:
             self._explain("step", error)
         self.results.flags[:, index] = 0.0
@@ -292,20 +292,20 @@ class Copies:
         chosen = zip(natives, option[index].tolist(), strict=True)
         return [self.options.with_option(native, number) for native, number in chosen]
 
-    def _settle(self, rows: Any, settled: set[int]) -> None:
+    def _settle(self, rows: Any, unchecked: Mapping[int, Any]) -> None:
         """Check the observations that these copies have written, and keep their masks and bounds.
 
         Args:
             rows: index of the copies' rows.
-            settled: rows whose numbers need no further check.
+            unchecked: observations whose numbers may be outside their bounds, by row.
         """
         observations = self.results.observation
         vectors = observations[rows]
         for number in self.observations.unsettled(vectors):
             row = number if rows is _ALL else int(rows[number])
-            if row not in settled:
+            if row in unchecked:
                 self._row = row
-                vectors[number] = self.observations.settled(vectors[number])
+                vectors[number] = self.observations.flat(unchecked[row])
         observations[rows] = self.observations.rounded(vectors)
         for name, masks in self._masks.rows.items():
             self.results.masks[name][:] = masks

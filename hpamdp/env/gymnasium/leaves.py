@@ -42,7 +42,7 @@ class Leaf:
     Attributes:
         what: the leaf in words, such as `entry a.b`.
         size: length of its vector.
-        lowest, highest: bounds `[size]` of what a `writer` leaves unchecked. Numbers within them need no `settled`.
+        lowest, highest: bounds `[size]` of what a `writer` leaves unchecked. `flat` checks others.
         clip_low, clip_high: bounds `[size]` that numbers are moved to; infinite if they are kept or refused.
         rounding: dtype that the vector is rounded to; None if it needs no rounding.
     """
@@ -137,20 +137,6 @@ class Leaf:
             vector[:] = 0.0
             vector[self._offsets + whole.ravel()] = 1.0
         return is_inside
-
-    def settled(self, vector: np.ndarray, cure: str = "") -> np.ndarray:
-        """Return a vector that a `writer` wrote, after a full check.
-
-        Raises:
-            ProblemError: a number is not in the space.
-        """
-        shape = self.space.shape
-        assert shape is not None
-        if isinstance(self.space, spaces.Box):
-            return self._within_bounds(vector.reshape(shape), self._own).ravel()
-        if isinstance(self.space, spaces.MultiBinary):
-            return self._one_hot(vector.reshape(shape), cure)
-        return vector
 
     def flat(self, observation: Any, cure: str = "") -> np.ndarray:
         """Return the leaf's part of an observation as a vector, float64; discrete values are one-hot.

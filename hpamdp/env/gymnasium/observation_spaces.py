@@ -152,7 +152,7 @@ class ObservationSpace:
     def writer(self, vector: np.ndarray, pixels: np.ndarray) -> Callable[[Any], bool]:
         """Return a function that writes an observation into a vector, float64 `[dim]`, and pixels uint8 `[num_pixels]`.
 
-        The function returns whether the numbers are still to be checked, by `unsettled` and `settled`. It raises a
+        The function returns whether the numbers are still to be checked, by `unsettled` and `flat`. It raises a
         ProblemError if an entry is missing, or if a value that is not plain is not in its space.
         """
         writers = [leaf.writer(vector[own]) for leaf, own in zip(self.leaves, self.slices, strict=True)]
@@ -169,18 +169,9 @@ class ObservationSpace:
         return lambda observation: all([write(observation) for write in writers]) or write_any(observation)
 
     def unsettled(self, vectors: np.ndarray) -> list[int]:
-        """Return which of the vectors `[M, dim]` that a `writer` wrote need a check by `settled`, one after another."""
+        """Return which of the vectors `[M, dim]` that a `writer` wrote need a check by `flat`, one after another."""
         is_inside = (vectors >= self._lowest) & (vectors <= self._highest)
         return [] if np.logical_and.reduce(is_inside, None) else np.flatnonzero(~is_inside.all(1)).tolist()
-
-    def settled(self, vector: np.ndarray) -> np.ndarray:
-        """Return a vector that a `writer` wrote, after a full check.
-
-        Raises:
-            ProblemError: a number is not in its space.
-        """
-        parts = zip(self.leaves, self.slices, self._cures, strict=True)
-        return _joined([leaf.settled(vector[own], cure) for leaf, own, cure in parts])
 
     def rounded(self, vectors: np.ndarray) -> np.ndarray:
         """Return checked vectors `[M, dim]`, moved to their bounds if asked, in the precision of their spaces."""

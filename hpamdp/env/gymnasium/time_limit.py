@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import numbers
-from typing import Any, TypeGuard
-
 import gymnasium
 from gymnasium.wrappers import TimeLimit
 
-from hpamdp.env.gymnasium.values import shown
 from hpamdp.settings import SettingError
 
 
@@ -21,11 +17,11 @@ def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
         max_steps: a limit of at most the environment's own. If None, the latter.
 
     Raises:
-        SettingError: the environment has no valid limit of its own and none is given, or `max_steps` is above its own.
+        SettingError: the environment has no limit of its own and none is given, or `max_steps` is above its own.
     """
     limits = _applied_limits(env)
     own = getattr(env.unwrapped, "own_time_limit", None)  # of this package's problems, which end their episodes
-    if _is_whole(own) and own >= 1:
+    if own is not None:
         limits.append(own)
     if max_steps is None:
         return min(limits) if limits else _limit_of_spec(env)
@@ -46,17 +42,8 @@ def _applied_limits(env: gymnasium.Env) -> list[int]:
     return limits
 
 
-def _is_whole(limit: Any) -> TypeGuard[int]:
-    return isinstance(limit, numbers.Integral) and not isinstance(limit, bool)
-
-
 def _limit_of_spec(env: gymnasium.Env) -> int:
     limit = getattr(env.unwrapped.spec, "max_episode_steps", None)
-    if limit is None or (_is_whole(limit) and limit == -1):  # `gymnasium.make` takes -1 as no limit
+    if limit is None or limit < 1:  # `gymnasium.make` takes -1 as no limit
         raise SettingError("has no time limit of its own; set env.max_steps")
-    if not _is_whole(limit) or limit < 1:
-        raise SettingError(
-            f"its spec has max_episode_steps={shown(limit)}, which must be a whole number of at least 1; "
-            "set env.max_steps"
-        )
     return int(limit)
