@@ -108,10 +108,7 @@ def regular_size(path: Path, *, follow_links: bool = True) -> int:
     Raises:
         OSError: the file is missing or not regular; `strerror` says what it is.
     """
-    try:
-        found = os.stat(path, follow_symlinks=follow_links)
-    except ValueError as error:  # a null byte in the name
-        raise OSError(errno.EINVAL, "is no file name", str(path)) from error
+    found = os.stat(path, follow_symlinks=follow_links)
     kind = stat.S_IFMT(found.st_mode)
     if kind != stat.S_IFREG:
         raise _not_regular(path, kind)

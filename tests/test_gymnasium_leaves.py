@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from fractions import Fraction
 
 import numpy as np
 import pytest
-import torch
 from gymnasium import spaces
 from gymnasium_players import make, step
 from toy_environments import Toy
@@ -38,9 +36,6 @@ def quickly(space: ObservationSpace, value) -> np.ndarray:
     [
         (INT64, [0.7, 0.0], "value is 0.7 at index 0, which int64 cannot hold"),
         (INT64, [0.0, np.nan], "value is nan at index 1, which is not finite"),
-        (INT64, [10**400, 1], "not numbers that NumPy can hold"),
-        (INT64, [10**5000, 1], "value is a value of type list, not numbers"),
-        (INT64, np.uint64([2**64 - 1, 0]), r"value is 1.844674407e\+19 at index 0, outside its bounds -9 to 9"),
         (BYTES, [0, 300], "value is 300 at index 1, outside its bounds 0 to 255"),
         (BYTES, [-1, 0], "value is -1 at index 0, outside its bounds 0 to 255"),
         (BYTES, [np.inf, 0], "value is inf at index 0, which is not finite"),
@@ -51,17 +46,11 @@ def quickly(space: ObservationSpace, value) -> np.ndarray:
         (UNIT, [0.0, 1.001], "value is 1.001 at index 1, outside its bounds -1 to 1; env.out_of_bounds=clip moves it "),
         (UNIT, [[0.0, 0.0]], r"value has shape \(1, 2\), but its space has \(2,\)"),
         (UNIT, 0.0, r"value has shape \(\), but its space has \(2,\)"),
-        (UNIT, [0.0, 1j], "not numbers"),
         (UNIT, np.array([0.0, 1.0], object), "not numbers"),
-        (UNIT, [Fraction(1, 2), 0.0], "not numbers"),
         (UNIT, [[0.0], [0.0, 0.0]], "not numbers"),
-        (UNIT, np.ma.masked_array([0.0, 0.0], [True, False]), "not numbers"),
-        (UNIT, torch.zeros(2, requires_grad=True), "not numbers"),
-        (UNIT, b"ab", "not numbers"),
         (spaces.Box(-1.0, 1.0, ()), [0.0], r"value has shape \(1,\), but its space has \(\)"),
         (spaces.Discrete(3), 0.7, r"value is 0.7, outside Discrete\(3\)"),
         (spaces.Discrete(3), np.nan, r"value is nan, outside Discrete\(3\)"),
-        (spaces.Discrete(3), np.uint64(2**64 - 1), r"outside Discrete\(3\)"),
         (spaces.Discrete(3), [1, 1], r"value has shape \(2,\), but its space has \(\)"),
         (spaces.Discrete(3), None, "value is None, not numbers"),
         (spaces.MultiDiscrete([2, 3]), [1.0, 2.5], r"value is \[1.0, 2.5\], outside MultiDiscrete"),

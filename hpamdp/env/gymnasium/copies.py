@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -367,9 +366,7 @@ class Copies:
 
 
 def _rate_of(env: gymnasium.Env) -> float:
-    rate: Any = env.metadata.get("render_fps")
-    is_rate = isinstance(rate, int | float | np.number) and not isinstance(rate, bool) and 0.0 < rate < math.inf
-    return float(rate) if is_rate else _PICTURES_PER_SECOND
+    return float(env.metadata.get("render_fps") or _PICTURES_PER_SECOND)
 
 
 def _kind(picture: Any) -> str:

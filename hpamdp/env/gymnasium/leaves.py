@@ -252,16 +252,13 @@ class Leaf:
         assert dtype is not None
         is_inside = True
         if numbers.dtype.kind == "f":
-            with np.errstate(invalid="ignore"):
-                is_inside = bool((numbers == np.floor(numbers)).all() and (np.abs(numbers) < 2.0**62).all())
+            is_inside = bool((numbers == np.floor(numbers)).all() and np.isfinite(numbers).all())
         if is_inside:
             whole = numbers.astype(np.int64)
             low: Any = getattr(self.space, "start", 0)
             size: Any = getattr(self.space, "nvec", 2 if isinstance(self.space, spaces.MultiBinary) else None)
             size = self.space.n if isinstance(self.space, spaces.Discrete) else size
-            is_inside = bool(
-                (numbers <= np.iinfo(np.int64).max).all() and ((whole >= low) & (whole < low + size)).all()
-            )
+            is_inside = bool(((whole >= low) & (whole < low + size)).all())
         if not is_inside:
             raise self._problem(f"is {shown(numbers.tolist())}, outside {self.space}{cure}")
         return np.asarray(flatten(self.space, whole.astype(dtype)), np.float64)
