@@ -167,9 +167,11 @@ def test_the_levels_do_not_know_each_other():
 
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_learners_do_not_know_each_other(learner):
-    # A learner may be a folder, such as pets, or have a second file named after the first: only qpamdp knows qpamdp_*.
+    # A learner may be a folder, such as pets, or have files named after the first: only qpamdp knows qpamdp_*. All of
+    # them know its settings.
     def is_one_learner(module: str) -> bool:
-        return module.split(".")[3] == learner.split(".")[3] or learner.startswith(f"{module}_")
+        name = learner.split(".")[3].removesuffix("_options")
+        return module.split(".")[3] == name or learner.startswith(f"{module}_") or module.startswith(f"{LOW}.{name}_")
 
     assert not {module for module in importers(learner, inside=LOW) if not is_one_learner(module)}
 

@@ -12,7 +12,8 @@ from hpamdp.policies.high_level.epsilon_greedy import EpsilonGreedy
 from hpamdp.policies.high_level.exp3 import PROBABILITY, Exp3
 from hpamdp.policies.high_level.thompson import Thompson
 from hpamdp.policies.high_level.ucb import UCB
-from hpamdp.policies.shared.bandit import Bandit, BanditOptions, RewardStatistics
+from hpamdp.policies.shared.bandit import Bandit, RewardStatistics
+from hpamdp.policies.shared.bandit_options import BanditOptions
 
 MEMORIES = ("all", "discounted", "sliding_window")
 BANDITS = {

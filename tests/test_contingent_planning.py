@@ -5,7 +5,8 @@ import torch
 
 from hpamdp.policies.shared import contingent_planning
 from hpamdp.policies.shared.contingent_planning import ContingentSearch
-from hpamdp.policies.shared.planning import SequenceSearch, SequenceSearchOptions, absolute_temperature
+from hpamdp.policies.shared.options import SequenceSearchOptions
+from hpamdp.policies.shared.planning import SequenceSearch, absolute_temperature
 
 ASKS, GUESSES = 1, 0
 TARGETS = torch.tensor([-0.5, 0.5])  # of the second step's parameter, under either hypothesis

@@ -24,9 +24,10 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Bonus
-from hpamdp.policies.exploration.counts import Counts, CountsOptions, VisitTable
-from hpamdp.policies.exploration.held import Held, HeldOptions, HeldPolicy, zeta_distribution
+from hpamdp.policies.exploration.counts import Counts, VisitTable
+from hpamdp.policies.exploration.held import Held, HeldPolicy, zeta_distribution
 from hpamdp.policies.exploration.novelty import Novelty
+from hpamdp.policies.exploration.options import CountsOptions, HeldOptions
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.hppo import HPPO, OWN
 from hpamdp.policies.low_level.hyar import LATENT, HyAR

@@ -12,7 +12,8 @@ from hpamdp.config.components import component
 from hpamdp.config.errors import ConfigError
 from hpamdp.policies.high_level.lin_thompson import LinThompson
 from hpamdp.policies.high_level.linucb import LinUCB
-from hpamdp.policies.shared.linear_bandit import ContextFeatures, LinearBandit, LinearBanditOptions
+from hpamdp.policies.shared.bandit_options import LinearBanditOptions
+from hpamdp.policies.shared.linear_bandit import ContextFeatures, LinearBandit
 from hpamdp.specs import PAMDPSpecs
 
 MEMORIES = ("all", "discounted", "sliding_window")

@@ -11,7 +11,8 @@ from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.pets.policy import MEMBER
-from hpamdp.policies.shared.end_values import EndValueOptions, EndValues
+from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.options import EndValueOptions
 from hpamdp.policies.shared.planning import (
     PlannedAction,
     Prediction,

@@ -10,16 +10,9 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.low_level.qpamdp import (
-    PARAMETERS,
-    QPAMDP,
-    RAW,
-    SARSA,
-    NaturalActorCritic,
-    QPAMDPOptions,
-    SarsaLambda,
-)
+from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP, RAW, SARSA, NaturalActorCritic, SarsaLambda
 from hpamdp.policies.low_level.qpamdp_features import fourier_coefficients, num_fourier_features
+from hpamdp.policies.low_level.qpamdp_options import QPAMDPOptions
 from hpamdp.specs import PAMDPSpecs
 
 # Two discrete actions with a parameter each and one without.

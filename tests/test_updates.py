@@ -29,7 +29,8 @@ from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.pets.model import MemberNet
 from hpamdp.policies.shared.gradients import gradients_of
 from hpamdp.policies.shared.networks import EnsembleMLP, HybridCritics, InitialLayer, mlp
-from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
+from hpamdp.policies.shared.options import ReplayOptions
+from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.run.assemble import assemble
 from hpamdp.specs import PAMDPSpecs
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pydantic import PositiveFloat
 from torch import Tensor
 
-from hpamdp.policies.shared.bandit import Bandit, BanditOptions
+from hpamdp.policies.shared.bandit import Bandit
+from hpamdp.policies.shared.bandit_options import BanditOptions
 
 
 class SoftmaxOptions(BanditOptions):

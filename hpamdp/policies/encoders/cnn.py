@@ -13,16 +13,16 @@ Differs from the sources:
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
-from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 from torchrl.modules import ConvNet
 
 from hpamdp.observation_entries import ObservationEntry
 from hpamdp.policies.encoders.base import Encoder
-from hpamdp.settings import FromList, SettingError, Settings
+from hpamdp.policies.encoders.options import CNNOptions
+from hpamdp.settings import SettingError
 
 _NATURE_KERNELS = [8, 4, 3]
 _NATURE_STRIDES = [4, 2, 1]
@@ -32,25 +32,6 @@ _NATURE_SMALLEST = 36  # px a side; of smaller pictures nothing is left for the 
 
 _IMPALA_CHANNELS = (16, 32, 32)
 _IMPALA_FEATURES = 256
-
-Channels = Annotated[tuple[PositiveInt, PositiveInt, PositiveInt], FromList]
-
-
-class CNNOptions(Settings):
-    """Settings of `CNN`."""
-
-    net: Literal["auto", "nature", "impala"] = "auto"
-    """`nature`: three convolutions. `impala`: three stages of residual blocks, slower.
-
-    `auto`: `impala` for pictures below 36 px a side, which are too small for `nature`, else `nature`.
-    """
-    channels: Channels | None = None
-    """Channels of the three layers or stages. If null, those of the papers.
-
-    `nature`: [32, 64, 64]; `impala`: [16, 32, 32].
-    """
-    num_features: Annotated[int, Field(ge=1, le=65536)] | None = None
-    """Number of features of a picture. If null, those of the papers: 512 for `nature`, 256 for `impala`."""
 
 
 class CNN(Encoder):

@@ -16,10 +16,9 @@ Differs from the source:
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveFloat
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -29,41 +28,11 @@ from hpamdp.devices import checked_device
 from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.exploration.base import Explored
 from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
-from hpamdp.settings import FromList, SettingError, Settings
+from hpamdp.policies.exploration.options import CountsOptions
+from hpamdp.settings import SettingError
 
 _HASH_SEED = 0  # of the factors of the hash, which are the same in every run
 _LARGEST_FACTOR = 2**40
-_COARSEST, _FINEST = 1e-12, 1e6  # resolutions in float32; finer cells of observations above 1e6 overflow int64
-
-
-def _check_resolution(resolution: float | tuple[float, ...]) -> float | tuple[float, ...]:
-    numbers = resolution if isinstance(resolution, tuple) else (resolution,)
-    if not any(numbers):
-        raise ValueError("must have a number above 0, or all states are one cell")
-    if not all(number == 0.0 or _COARSEST <= number <= _FINEST for number in numbers):
-        raise ValueError(f"must be from {_COARSEST:g} to {_FINEST:g}; in a list, 0 leaves an entry out")
-    return resolution
-
-
-class CountsOptions(Settings):
-    """Settings of `Counts`."""
-
-    weight: PositiveFloat = 0.01
-    """Reward of a bonus of 1, in the unit of the problem's rewards. A bonus is n^-1/2 after n visits of a cell.
-
-    A batch is counted before its bonuses: if ten environments enter a new cell in one batch, each gets 10^-1/2.
-    """
-    resolution: Annotated[
-        PositiveFloat | Annotated[tuple[NonNegativeFloat, ...], FromList, Field(min_length=1)],
-        AfterValidator(_check_resolution),
-    ] = 10.0
-    """Cells in a unit of each entry of the observation: entries are multiplied by it and rounded.
-
-    With 1, an entry in [0, 1], such as a tile, has two cells, and an entry in [-1, 1] has three. A list has a number
-    for each entry, and 0 leaves an entry out: `[10,10,0,0]` counts the places of a ball at any speed.
-    """
-    table_size: Annotated[int, Field(ge=1, le=10_000_000)] = 262_139
-    """Slots in the table of counts, best a prime. Cells that share a slot share their count."""
 
 
 class VisitTable(nn.Module):

@@ -16,48 +16,22 @@ Differs from the source:
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, PositiveInt, model_validator
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
 from hpamdp.policies.base import Learner
 from hpamdp.policies.exploration.base import Exploration, Explored
+from hpamdp.policies.exploration.options import HeldOptions
 from hpamdp.policies.masks import random_discrete
 from hpamdp.policies.shared.exploration import linear_schedule
-from hpamdp.settings import Fraction, OnlyWith, Settings
 from hpamdp.specs import PAMDPSpecs
-
-
-class HeldOptions(Settings):
-    """Settings of `Held`."""
-
-    epsilon: Fraction = 0.05
-    """Probability that a step begins a random action to hold, if none is held.
-
-    With `mu=2`, a hold lasts six steps on average, so 0.05 makes a quarter of all steps held ones.
-    """
-    epsilon_final: Fraction | None = None
-    """Probability after `epsilon_steps`; it falls linearly from `epsilon` to this value. If null, it stays."""
-    epsilon_steps: Annotated[PositiveInt, OnlyWith("epsilon_final")] = 100_000
-    """With `epsilon_final`: the learner's own steps, its warm-up included, within which the probability falls."""
-    mu: Annotated[float, Field(gt=1.0, le=10.0)] = 2.0
-    """Exponent of the lengths: the probability of n steps is proportional to n^-mu. Less gives longer holds."""
-    longest: Annotated[int, Field(ge=1, le=1_000_000)] = 10_000
-    """Largest number of steps of a hold."""
-
-    @model_validator(mode="after")
-    def _check_schedule(self) -> Self:
-        if self.epsilon_final is not None and self.epsilon_final > self.epsilon:
-            raise ValueError(f"epsilon_final={self.epsilon_final}: must be at most epsilon={self.epsilon}")
-        return self
 
 
 def zeta_distribution(mu: float, longest: int) -> Tensor:

@@ -31,10 +31,9 @@ bonus in the environment, where each worker would have statistics of its own and
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
-from pydantic import Field, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -48,39 +47,11 @@ from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.encoders.base import JoinedEncoders
 from hpamdp.policies.exploration.base import Explored
 from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
+from hpamdp.policies.exploration.options import NoveltyOptions, _OfNetworks
 from hpamdp.policies.shared.hybrid_actor import hidden_layers
 from hpamdp.policies.shared.networks import OutputLinear
-from hpamdp.settings import LearningRate, OnlyWith, SettingError, Settings, Widths
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
-
-_OfNetworks = OnlyWith("in_plans", "auto", "distillation")  # an ensemble's disagreement takes no networks
-
-
-class NoveltyOptions(Settings):
-    """Settings of `Novelty`."""
-
-    weight: PositiveFloat = 0.01
-    """Reward of a bonus of 1, in the unit of the problem's rewards.
-
-    A bonus is an error in standard deviations of all errors so far. With disagreement, it is the members' standard
-    deviation in units of the usual change of the state in a step.
-    """
-    hidden_dims: Annotated[Widths, Field(min_length=1), _OfNetworks] = (64, 64)
-    """Hidden layers of the random network and of the one that predicts it."""
-    num_features: Annotated[PositiveInt, _OfNetworks] = 32
-    """Outputs of the random network."""
-    lr: Annotated[LearningRate, _OfNetworks] = 1e-3
-    """Learning rate of the predicting network. With more, states are familiar sooner."""
-    batch_size: Annotated[PositiveInt, _OfNetworks] = 128
-    """Steps in an update of the predicting network, which learns from each collected step once."""
-    largest: Annotated[PositiveFloat, _OfNetworks] = 5.0
-    """Largest bonus before it is weighted, and largest normalised entry of an observation."""
-    in_plans: Literal["auto", "disagreement", "distillation"] = "auto"
-    """Bonus of learners that plan: an ensemble's `disagreement` about the next state, or random network `distillation`.
-
-    `auto` takes the disagreement if there is such an ensemble. The disagreement gives no bonus in new places whose
-    simple dynamics the ensemble predicts already.
-    """
 
 
 class RandomDistillation(nn.Module):

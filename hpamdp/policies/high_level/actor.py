@@ -24,43 +24,27 @@ takes 1.3 times as long for an update of 1,024 decisions on one CPU core (1.6 ti
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
+from hpamdp.policies.high_level.options import ActorOptions
 from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.policies.shared.networks import mlp
-from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised
-from hpamdp.policies.shared.selector_memory import RemembersDecisions, SelectorMemoryOptions
+from hpamdp.policies.shared.on_policy import OnPolicy, mean_scalars, normalised
+from hpamdp.policies.shared.selector_memory import RemembersDecisions
 from hpamdp.policies.shared.sequences import sequence_starts
-from hpamdp.settings import PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
 # Of the held option at its decision, float32 [*B] each.
 LOG_PROB = "option_log_prob"  # by the policy, also if the option was chosen uniformly
 WEIGHT = "option_weight"  # ratio of its probability by the policy to the probability with which it was chosen
 ALLOWED = "option_allowed"  # the options that were allowed, bool [*B, num_options], if the problem has an option mask
-
-
-class ActorOptions(SelectorMemoryOptions, OnPolicyOptions):
-    """Settings of `Actor`; the rows of an update are decisions."""
-
-    hidden_dims: Widths = (128, 128)
-    """Hidden layers of the policy and of the value network."""
-    gamma: PositiveFraction = 0.99
-    """Discount of an environment step, both within an option's return and for the value of the next decision."""
-    epochs: Annotated[int, Field(ge=1, le=1000)] = 4
-    """Passes over the collected decisions in an update."""
-    minibatch_size: PositiveInt = 64
-    """Decisions in a gradient step, and the least number of decisions that an update waits for."""
-    entropy: NonNegativeFloat = 0.1
-    """Weight of the entropy bonus. With 0.02 the policy settles on the option whose learner improves first."""
 
 
 class Actor(OnPolicy, RemembersDecisions):

@@ -13,27 +13,12 @@ Differs from the sources:
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import torch
-from pydantic import PositiveFloat
 from torch import Tensor
 
+from hpamdp.policies.high_level.options import EpsilonGreedyOptions
 from hpamdp.policies.masks import random_choice
-from hpamdp.policies.shared.bandit import Bandit, BanditOptions
-from hpamdp.settings import Fraction, OwnSteps
-
-
-class EpsilonGreedyOptions(BanditOptions):
-    """Settings of `EpsilonGreedy`."""
-
-    epsilon_scale: Annotated[PositiveFloat, OwnSteps()] = 100.0
-    """The probability of a random option is `epsilon_scale` / t, at most 1.
-
-    t counts the decisions of all environments, uniform ones included, but not those of a data set.
-    """
-    epsilon_final: Annotated[Fraction, OwnSteps()] = 0.1
-    """Lower bound of that probability; 0 suits stationary rewards."""
+from hpamdp.policies.shared.bandit import Bandit
 
 
 class EpsilonGreedy(Bandit):

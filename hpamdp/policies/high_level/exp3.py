@@ -20,18 +20,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.shared.bandit import Bandit, BanditOptions, RewardStatistics
-from hpamdp.settings import PositiveFraction
+from hpamdp.policies.high_level.options import Exp3Options
+from hpamdp.policies.shared.bandit import Bandit, RewardStatistics
 from hpamdp.specs import PAMDPSpecs
 
 PROBABILITY = "option_probability"  # of the held option at its decision, float32 [*B]
-
-
-class Exp3Options(BanditOptions):
-    """Settings of `Exp3`."""
-
-    exploration: PositiveFraction = 0.1
-    """Gamma of the source: the probability of a uniform choice, and the scale of the gains."""
 
 
 class Exp3(Bandit):

@@ -10,16 +10,10 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector
+from hpamdp.policies.high_level.options import FixedOptions
 from hpamdp.policies.masks import allowed_or_first
-from hpamdp.settings import SettingError, Settings
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
-
-
-class FixedOptions(Settings):
-    """Settings of `Fixed`."""
-
-    option: str | int = 0
-    """Name or number of the option."""
 
 
 class Fixed(Selector):

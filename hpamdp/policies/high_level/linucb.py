@@ -14,17 +14,10 @@ Differs from the sources:
 
 from __future__ import annotations
 
-from pydantic import PositiveFloat
 from torch import Tensor
 
-from hpamdp.policies.shared.linear_bandit import LinearBandit, LinearBanditOptions
-
-
-class LinUCBOptions(LinearBanditOptions):
-    """Settings of `LinUCB`."""
-
-    exploration: PositiveFloat = 2.0
-    """Width of the bounds, in standard deviations of the prediction; alpha in the source."""
+from hpamdp.policies.high_level.options import LinUCBOptions
+from hpamdp.policies.shared.linear_bandit import LinearBandit
 
 
 class LinUCB(LinearBandit):

@@ -18,10 +18,9 @@ Differs from the sources:
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -29,36 +28,15 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
+from hpamdp.policies.high_level.options import MetaCriticOptions
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
-from hpamdp.policies.shared.option_values import OptionValueOptions
 from hpamdp.policies.shared.replay import first_multiple, packed_states, unpacked_states
-from hpamdp.policies.shared.selector_memory import RemembersDecisions, SelectorReplayMemoryOptions
+from hpamdp.policies.shared.selector_memory import RemembersDecisions
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
-from hpamdp.settings import OnlyWith, OwnSteps
 from hpamdp.specs import PAMDPSpecs
-
-
-class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
-    """Settings of `MetaCritic`; an update learns from stored decisions."""
-
-    num_members: PositiveInt = 3
-    """Number of critics in the ensemble."""
-    exploration: Literal["epsilon", "ucb"] = "epsilon"
-    """`epsilon`: a random option with a decaying probability. `ucb`: the option with the highest upper bound."""
-    epsilon_decisions: Annotated[NonNegativeInt, OnlyWith("exploration", "epsilon"), OwnSteps()] = 1000
-    """Finished decisions of all environments, after the warm-up, over which the probability of a random option falls.
-
-    It falls linearly from 1 to `epsilon_final`. Decisions of a data set do not count.
-    """
-    ucb_width: Annotated[NonNegativeFloat, OnlyWith("exploration", "ucb")] = 2.0
-    """Width of the upper confidence bound, in standard deviations over the critics."""
-    updates_per_decision: Annotated[PositiveFloat, OwnSteps()] = 0.5
-    """Updates for each finished decision; with `mode=offline`, `offline.updates` counts them instead."""
-    warmup_decisions: Annotated[NonNegativeInt, OwnSteps()] = 100
-    """Decisions of all environments, with random options, before the first update; those of a data set do not count."""
 
 
 class MetaCritic(RemembersDecisions):

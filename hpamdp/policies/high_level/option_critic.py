@@ -24,10 +24,9 @@ Differs from the sources:
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -36,38 +35,13 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
+from hpamdp.policies.high_level.options import OptionCriticOptions
 from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.networks import mlp, polyak_update
-from hpamdp.policies.shared.option_values import OptionValueOptions
 from hpamdp.policies.shared.replay import first_multiple
-from hpamdp.policies.shared.selector_memory import RemembersDecisions, SelectorStackOptions
-from hpamdp.settings import LearningRate
+from hpamdp.policies.shared.selector_memory import RemembersDecisions
 from hpamdp.specs import PAMDPSpecs
-
-
-class OptionCriticOptions(SelectorStackOptions, OptionValueOptions):
-    """Settings of `OptionCritic`; an update learns from stored steps."""
-
-    batch_size: PositiveInt = 512
-    """Number of stored steps in an update."""
-    buffer_size: PositiveInt = 100_000
-    """Number of steps that are stored."""
-    deliberation_cost: NonNegativeFloat = 0.01
-    """How much better another option's return must be for the held option to end. With 0, most options end at once."""
-    initial_termination: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.3
-    """Probability that an untrained option ends at a step; it stays part of exploration."""
-    epsilon_steps: NonNegativeInt = 20_000
-    """Steps of all environments, after the warm-up, over which the probability of a random option falls.
-
-    It falls linearly from 1 to `epsilon_final`.
-    """
-    updates_per_step: PositiveFloat = 0.02
-    """Updates for each step, of any environment."""
-    warmup_steps: NonNegativeInt = 2000
-    """Steps of all environments, with random options, before the first update."""
-    termination_lr: LearningRate = 1e-3
-    """Learning rate of Adam for the terminations."""
 
 
 class OptionCritic(RemembersDecisions):

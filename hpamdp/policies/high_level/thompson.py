@@ -15,19 +15,12 @@ Differs from the source:
 from __future__ import annotations
 
 import torch
-from pydantic import PositiveFloat
 from torch import Tensor
 
+from hpamdp.policies.high_level.options import ThompsonOptions
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.bandit import above_all
-from hpamdp.policies.shared.session_bandit import SessionBandit, SessionBanditOptions, SessionRewards
-
-
-class ThompsonOptions(SessionBanditOptions):
-    """Settings of `Thompson`."""
-
-    exploration: PositiveFloat = 1.0
-    """Factor of the posteriors' standard deviation; 1 is Bayesian."""
+from hpamdp.policies.shared.session_bandit import SessionBandit, SessionRewards
 
 
 class Thompson(SessionBandit):

@@ -18,17 +18,10 @@ Differs from the sources:
 from __future__ import annotations
 
 import torch
-from pydantic import PositiveFloat
 from torch import Tensor
 
-from hpamdp.policies.shared.session_bandit import SessionBandit, SessionBanditOptions, SessionRewards
-
-
-class UCBOptions(SessionBanditOptions):
-    """Settings of `UCB`; with `memory=all` it is UCB1."""
-
-    exploration: PositiveFloat = 2.0
-    """Width of the bounds, in standard deviations of the rewards. It falls with every choice of an option."""
+from hpamdp.policies.high_level.options import UCBOptions
+from hpamdp.policies.shared.session_bandit import SessionBandit, SessionRewards
 
 
 class UCB(SessionBandit):

@@ -27,24 +27,12 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
+from hpamdp.policies.high_level.options import ValueOptions
 from hpamdp.policies.masks import allowed_or_first, masked_values, random_choice
-from hpamdp.settings import Fraction, Settings
 from hpamdp.specs import PAMDPSpecs
 
 # Which options the session has tried before a decision, bool `[*B, num_options]`.
 SESSION_TRIED = "session_tried"
-
-
-class ValueOptions(Settings):
-    """Settings of `Value`."""
-
-    epsilon: Fraction = 0.05
-    """Probability of a random option while exploring."""
-    untried_first: bool = False
-    """In sessions of trips: try each option once, in their order, before values are compared; also greedily.
-
-    What an option shows on its first trip helps most on later trips, which the value of a trip does not count.
-    """
 
 
 class Value(Selector):

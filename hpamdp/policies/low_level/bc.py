@@ -13,34 +13,19 @@ TorchRL's BCLoss does not fit: it reads a single action leaf.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp.policies.base import ActionFeature
+from hpamdp.policies.low_level.bc_options import BCOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
-from hpamdp.policies.shared.hybrid_actor import HeadOptions, HybridActor, HybridPolicy, ScaleOptions
-from hpamdp.policies.shared.replay import BufferOptions, ReplayLearner, ReplayOptions
-from hpamdp.settings import LearningRate, Widths
+from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
+from hpamdp.policies.shared.options import ReplayOptions
+from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
-
-
-class BCOptions(HeadOptions, ScaleOptions, BufferOptions):
-    """Settings of `BC`."""
-
-    hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
-    """Hidden layers of the actor."""
-    buffer_size: PositiveInt = 200_000
-    """Largest number of transitions that are kept."""
-    batch_size: PositiveInt = 512
-    """Transitions in an update."""
-    lr: LearningRate = 1e-3
-    """Learning rate of AdamW."""
-    weight_decay: NonNegativeFloat = 1e-2
-    """Weight decay of AdamW."""
 
 
 class BC(ReplayLearner):

@@ -47,29 +47,22 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
-from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.low_level.hyar_codec import CodecOptions, HybridCodec
+from hpamdp.policies.low_level.hyar_codec import HybridCodec
+from hpamdp.policies.low_level.hyar_options import HyAROptions
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
-from hpamdp.policies.shared.actor_critic import TargetRateOptions, set_learning_rates
-from hpamdp.policies.shared.actor_search import (
-    SearchingActorOptions,
-    even_normal,
-    in_pieces,
-    searching_actor_loss,
-    with_variations,
-)
+from hpamdp.policies.shared.actor_critic import set_learning_rates
+from hpamdp.policies.shared.actor_search import even_normal, in_pieces, searching_actor_loss, with_variations
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
@@ -82,75 +75,13 @@ from hpamdp.policies.shared.networks import (
 )
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.policies.shared.scales import scale_of
-from hpamdp.settings import OnlyWith, PositiveFraction, SettingError
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random
 
 # Latent actions that the critics evaluate at once, unless one state has more: bounds the memory.
 _MAX_CANDIDATES = 1 << 14
-
-
-class HyAROptions(CodecOptions, TargetRateOptions, SearchingActorOptions):
-    """Settings of `HyAR`. Noise is in units where the latent action's bounds are [-1, 1].
-
-    The published settings are those of `low=hyar_published`.
-    """
-
-    twin: bool = True
-    """Train by TD3 (HyAR-TD3). If false, train by DDPG (HyAR-DDPG): one critic, no delay, no target smoothing."""
-    discrete: Literal["greedy", "nearest"] = "greedy"
-    """Discrete action: the one with the highest value (`greedy`), or with the embedding nearest to e (`nearest`).
-
-    `nearest` is the published form. With `greedy`, updates take longer the more discrete actions there are.
-    """
-    warmup_steps: PositiveInt = 2000
-    """Random steps of a learner before its first update; the codec is trained on them."""
-    critic_window: PositiveInt | None = None
-    """Newest steps after the warm-up that the critics and the actor learn from; if null, all that are stored."""
-    inverting_gradients: bool = False
-    """Scale the gradient of a latent action by the range that is left to its bound, as published, in addition to tanh.
-
-    The range is that in the direction of the gradient (Hausknecht and Stone 2016, arXiv 1511.04143).
-    """
-    actor_max_grad_norm: PositiveFloat | None = None
-    """Largest gradient norm of an update of the actor; if null, there is no limit."""
-    noise_initial: PositiveFloat | None = None
-    """Scale of the exploring noise after the warm-up; it falls to `parameter_noise`. If null, it is constant."""
-    noise_episodes: Annotated[PositiveInt, OnlyWith("noise_initial")] = 1000
-    """The learner's own episodes, after its warm-up, within which the scale of the noise falls linearly."""
-    correction_factor: Annotated[PositiveFloat, OnlyWith("parameter_tolerance", None)] = 5.0
-    """Encode a stored z again if the error of its predicted change is this many times the codec's error."""
-    correction_error: Annotated[Literal["mean", "latest"], OnlyWith("parameter_tolerance", None)] = "mean"
-    """The codec's error: its mean over the last hundred or so updates of the codec, or the `latest`, as published.
-
-    The latest error is that of the 4,096 stored transitions from which the range of z was estimated last.
-    """
-    parameter_tolerance: NonNegativeFloat | None = None
-    """Encode a stored z again if its decoded parameters differ from the executed ones by more than this.
-
-    If null, the predicted change decides (`correction_factor`). If the next state is hard to predict, the parameters
-    are the surer sign.
-    """
-    relabelling: Literal["mean", "sample"] = "sample"
-    """Latent action in place of an outdated or random one: the encoder's mean, or a sample as published.
-
-    The means lie on a line in the latent space. Off that line, where the actor goes, only samples teach the critics.
-    """
-    lr_final_fraction: PositiveFraction = 0.1
-    """Fraction of the three learning rates that is left after `lr_steps`; 1 keeps them constant."""
-    epsilon_steps: NonNegativeInt = 15_000
-    """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
-
-    @model_validator(mode="after")
-    def _check_hyar(self) -> Self:
-        if self.critic_window is not None and self.critic_window < self.batch_size:
-            raise ValueError(f"critic_window={self.critic_window}: must be at least batch_size={self.batch_size}")
-        if self.noise_initial is not None and self.noise_initial < self.parameter_noise:
-            raise ValueError(
-                f"noise_initial={self.noise_initial}: must be at least parameter_noise={self.parameter_noise}"
-            )
-        return self
 
 
 class LatentActor(nn.Module):

@@ -5,73 +5,13 @@ Source: Li et al. 2022, arXiv 2109.05490, section 4.1; see `hyar.py`, also for t
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
-
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
+from hpamdp.policies.low_level.hyar_options import CodecOptions
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.networks import OutputLinear, as_preactivations, mlp
-from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
-
-
-class CodecOptions(Settings):
-    """Settings of `HybridCodec` and of its training."""
-
-    embedding_dim: PositiveInt = 6
-    """Dimension of a discrete action's embedding e."""
-    latent_dim: PositiveInt | None = None
-    """Dimension of the latent variable z of the VAE; if null, the largest number of parameters of a discrete action."""
-    codec_hidden_dim: PositiveInt = 128
-    """Width of the codec's layers."""
-    codec_inputs: Literal["concatenated", "multiplied"] = "concatenated"
-    """How the codec's networks join the state and e with the parameters or z: `concatenated`, or `multiplied`.
-
-    `multiplied` is the published form: each of the two goes through a layer of its own, and their outputs are
-    multiplied.
-    """
-    predicted_change: Literal["standardised", "bounded"] = "standardised"
-    """Predicted change of the state: in standard deviations over `change_unit` (`standardised`), or `bounded`.
-
-    `bounded` is the published form: the tanh of the output, in the units of the observation. It cannot represent
-    changes larger than 1.
-    """
-    change_unit: Literal["warmup", "stored"] = "warmup"
-    """Steps whose changes have a standard deviation of 1: those of the warm-up, or all that are stored.
-
-    Random steps may leave some entries of the observation nearly constant. When the agent then changes these entries,
-    their errors in units of the warm-up outweigh those of the parameters. With `stored`, the unit follows at each new
-    estimate of the range of z.
-    """
-    codec_loss: Literal["sum", "mean"] = "sum"
-    """Sum the squared errors over an action's parameters, and the KL divergence over the dimensions of z; or average.
-
-    `mean` is the published form.
-    """
-    reconstruction_weight: NonNegativeFloat = 1.0
-    """Weight of the decoded parameters' squared error in the codec's loss."""
-    kl_weight: NonNegativeFloat = 1e-4
-    """Weight of the KL divergence in the codec's loss."""
-    dynamics_weight: NonNegativeFloat = 0.1
-    """Weight of the predicted change of the state in the codec's loss."""
-    codec_lr: LearningRate = 1e-3
-    """Learning rate of the codec."""
-    codec_batch_size: PositiveInt | None = None
-    """Transitions in an update of the codec, from all that are stored; if null, it shares those of the critics."""
-    codec_pretrain_updates: PositiveInt = 2000
-    """Updates of the codec alone at the end of the warm-up."""
-    codec_every: Annotated[PositiveInt, OnlyWith("codec_episodes", None)] = 10
-    """Critic updates for each update of the codec, after the warm-up."""
-    codec_episodes: PositiveInt | None = None
-    """The learner's own episodes, after its warm-up, for each update of the codec. If null, `codec_every` decides."""
-    codec_first_episode: Annotated[NonNegativeInt, OnlyWith("codec_episodes")] = 0
-    """The learner's own episodes, after its warm-up, before `codec_episodes` begins to count."""
-    latent_coverage: PositiveFraction = 0.96
-    """Central fraction of the encoded z that the actor can reach: the latent-space constraint of the paper."""
-    latent_range_every: PositiveInt = 100
-    """Updates of the codec for each new estimate of the range of z, from 4,096 stored transitions."""
 
 
 class HybridCodec(nn.Module):

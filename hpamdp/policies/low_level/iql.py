@@ -28,51 +28,23 @@ TorchRL's IQLLoss does not fit: it reads a single action leaf.
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions, set_learning_rates
+from hpamdp.policies.low_level.iql_options import IQLOptions
+from hpamdp.policies.shared.actor_critic import set_learning_rates
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.exploration import cosine_schedule
 from hpamdp.policies.shared.gradients import expectile_loss
-from hpamdp.policies.shared.hybrid_actor import HeadOptions, HybridActor, HybridPolicy, ScaleOptions
+from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, JointCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import Expectile, LearningRate, OwnSteps, PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
-
-
-class IQLOptions(HeadOptions, ActorCriticOptions, TargetRateOptions, ScaleOptions):
-    """Settings of `IQL`."""
-
-    hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
-    """Hidden layers of the actor, the state value and the critics."""
-    actor_lr_updates: NonNegativeInt = 0
-    """Updates within which the actor's learning rate falls to 0 along a cosine; with 0 it is constant."""
-    critic_lr: LearningRate = 1e-3
-    """Learning rate of the critics and of the state value."""
-    tau: PositiveFraction = 0.005
-    """Fraction of the way to the learned critics that the target critics move in an update."""
-    warmup_steps: Annotated[NonNegativeInt, OwnSteps()] = 1000
-    """Steps before the first update; the policy explores by its own standard deviation."""
-    batch_size: PositiveInt = 256
-    """Transitions in an update."""
-    expectile: Expectile = 0.8
-    """Expectile of the actions' values that V estimates: 0.5 is their mean, 1 their maximum."""
-    temperature: PositiveFloat = 10.0
-    """An action has weight exp(temperature * advantage) in the policy's likelihood.
-
-    If advantages are much larger than 1 / `temperature`, most weights are near 0 or equal `max_weight`. Then reduce
-    `reward_scale`.
-    """
-    max_weight: PositiveFloat = 100.0
-    """Largest weight of an action."""
 
 
 class IQL(ReplayLearner):

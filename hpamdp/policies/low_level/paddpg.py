@@ -30,10 +30,9 @@ inverting gradients, for which the gradient must be changed between critic and a
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
-from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -42,47 +41,22 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.components import Components
 from hpamdp.policies.base import ActionFeature
+from hpamdp.policies.low_level.paddpg_options import PADDPGOptions
 from hpamdp.policies.masks import masked_values, zero_fixed
-from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions, TwinCriticOptions
-from hpamdp.policies.shared.exploration import EpsilonOptions, linear_schedule, with_exploring_noise
+from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     InitialLayer,
-    InitialParameters,
     InvertingGradients,
     mlp,
     polyak_update,
     with_clipped_noise,
 )
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import LearningRate, OnlyWith
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the scores of the discrete actions, which the critic sees.
 SCORES = "scores"
-
-
-class PADDPGOptions(ActorCriticOptions, TargetRateOptions, TwinCriticOptions, EpsilonOptions):
-    """Settings of `PADDPG`. Noise is in units where the bounds of scores and parameters are [-1, 1]."""
-
-    twin: bool = False
-    """Train as in TD3, which makes it PATD3: the lower of two critics counts, with smoothing and a delayed actor."""
-    target_smoothing: Annotated[NonNegativeFloat, OnlyWith("twin")] = 0.1
-    """With `twin`: standard deviation of the noise on scores and parameters in the target; 0 adds no noise."""
-    target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("twin"), OnlyWith("target_smoothing")] = 0.2
-    """With `twin`: largest size of this noise."""
-    policy_delay: Annotated[PositiveInt, OnlyWith("twin")] = 2
-    """With `twin`: critic updates for each update of the actor and the target networks."""
-    initial_parameters: InitialParameters = "domain"
-    """`domain` adds the problem's own initial parameters, if it has any, by a frozen layer; `none` adds nothing."""
-    actor_lr: LearningRate = 1e-4
-    """Learning rate of the actor."""
-    max_grad_norm: PositiveFloat | None = 10.0
-    """Largest gradient norm. If null, no limit."""
-    parameter_noise: NonNegativeFloat = 0.1
-    """Standard deviation of the exploring noise on scores and parameters."""
-    augment: Literal[False] = False
-    """Always false: the symmetries of a problem map no scores."""
 
 
 class PADDPGActor(nn.Module):

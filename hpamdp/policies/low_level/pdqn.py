@@ -43,33 +43,24 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import ActionFeature, option_ends, step_discounts
+from hpamdp.policies.low_level.pdqn_options import PDQNOptions
 from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete, zero_fixed
 from hpamdp.policies.shared.actor_critic import set_learning_rates
-from hpamdp.policies.shared.actor_search import (
-    SearchingActorOptions,
-    even_normal,
-    in_pieces,
-    searching_actor_loss,
-    with_variations,
-)
+from hpamdp.policies.shared.actor_search import even_normal, in_pieces, searching_actor_loss, with_variations
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
-from hpamdp.policies.shared.memory import ReplayMemoryOptions
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,
-    InitialParameters,
     InvertingGradients,
     as_preactivations,
     mlp,
@@ -77,9 +68,9 @@ from hpamdp.policies.shared.networks import (
     unsquashed,
     with_clipped_noise,
 )
+from hpamdp.policies.shared.options import InitialParameters
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import OnlyWith, OwnSteps, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 PROCESS = "noise_process"  # the last step's noise, if it is a process, float32 [*B, num_parameters]
@@ -87,59 +78,6 @@ _PULL = 0.15  # fraction of the process that is lost in a step
 
 # Numbers that the critics evaluate at once for the greedy policy: bounds the memory if there are many discrete actions.
 _MAX_NUMBERS = 1 << 22
-
-
-class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
-    """Settings of `PDQN`; `python run.py low=pdqn --help` shows them together with those of all replay learners."""
-
-    multipass: bool = True
-    """Show the value of a discrete action its own parameters alone, as in MP-DQN; else all parameters, as in P-DQN."""
-    double_q: bool = False
-    """Choose the next action by the learned critics; the target critics evaluate it either way."""
-    n_step: PositiveInt = 1
-    """Rewards summed before bootstrapping. A sum also ends with its batch, so long sums need long batches."""
-    bounding: Literal["tanh", "inverting_gradients"] = "tanh"
-    """How the parameters are kept within their bounds: by `tanh`, or clipped, with `inverting_gradients`."""
-    initial_parameters: InitialParameters = "domain"
-    """Initial parameters: `domain` adds the problem's own by a frozen layer, if it has any; `none` adds nothing."""
-    actor_tau: PositiveFraction = 0.01
-    """Fraction of the way to the actor that its target network moves at each actor update."""
-    critic_tau: PositiveFraction = 0.01
-    """Fraction of the way to the critics that their target networks move at each actor update."""
-    max_grad_norm: PositiveFloat | None = None
-    """Largest gradient norm of a gradient step; if null, there is no limit."""
-    random_parameters: Literal["uniform", "actor"] = "uniform"
-    """Parameters of a random action: drawn uniformly from their bounds, or those of the actor, with its noise."""
-    noise_process: Literal["gaussian", "ornstein_uhlenbeck"] = "gaussian"
-    """The noise on parameters: independent at each step, or a process that returns to 0 by 0.15 of its size a step.
-
-    With `ornstein_uhlenbeck`, `parameter_noise` is the standard deviation of what is added in a step. The process goes
-    on from episode to episode.
-    """
-    epsilon_steps: Annotated[NonNegativeInt, OnlyWith("epsilon_episodes", None), OwnSteps()] = 40_000
-    """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
-    epsilon_episodes: Annotated[PositiveInt | None, OwnSteps()] = None
-    """Episodes that end with the learner's own steps, within which the probability of a random action falls.
-
-    They are counted from the start, those of the warm-up too, and take the place of `epsilon_steps`.
-    """
-
-    @model_validator(mode="after")
-    def _check_pdqn(self) -> Self:
-        if self.preactivation_penalty > 0.0 and self.bounding != "tanh":
-            raise ValueError(
-                f"preactivation_penalty={self.preactivation_penalty}: needs bounding=tanh; bounding={self.bounding!r}"
-            )
-        if self.memory == "gru" and self.n_step > 1:
-            raise ValueError(f"n_step={self.n_step}: does not go with memory=gru; use n_step=1 or memory=stack")
-        if self.memory == "gru" and self.double_q:
-            raise ValueError("double_q=true: does not go with memory=gru, whose states differ between both critics")
-        if self.search_samples > 0 and not self.multipass:
-            raise ValueError(
-                f"search_samples={self.search_samples}: needs multipass=true, as values else depend on other actions' "
-                "parameters"
-            )
-        return self
 
 
 class ParameterActor(nn.Module):

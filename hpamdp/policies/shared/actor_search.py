@@ -10,36 +10,15 @@ et al. 2017, arXiv 1707.01495, appendix A (penalty on preactivations).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from hpamdp.policies.shared.actor_critic import ActorCriticOptions, AnnealedRateOptions, TwinCriticOptions
-from hpamdp.policies.shared.exploration import EpsilonOptions
-from hpamdp.settings import OnlyWith, SettingError
-
-
-class SearchingActorOptions(EpsilonOptions, AnnealedRateOptions, TwinCriticOptions, ActorCriticOptions):
-    """Settings of a deterministic actor that may search for better actions, and of its critics."""
-
-    layer_norm: bool = False
-    """Normalise the critics' layers, which bounds the values of actions far from all that were tried."""
-    preactivation_penalty: NonNegativeFloat = 0.0
-    """Weight of the squared preactivations of tanh in the actor's loss.
-
-    Where tanh has brought an action to its bound, gradients no longer move it; the penalty does, towards the middle.
-    """
-    search_samples: NonNegativeInt = 0
-    """Random actions for each discrete action that an update of the actor values with the critics; 0 is no search."""
-    search_weight: Annotated[NonNegativeFloat, OnlyWith("search_samples")] = 0.1
-    """Weight of the distance to the best of these actions in the actor's loss, times its gain in value."""
-    greedy_samples: NonNegativeInt = 0
-    """Variations of the actor's actions from which the greedy policy takes the one with the highest value."""
-    greedy_noise: Annotated[NonNegativeFloat, OnlyWith("greedy_samples")] = 0.3
-    """Standard deviation of these variations, in units where the bounds are [-1, 1]."""
+from hpamdp.policies.shared.options import (
+    SearchingActorOptions,
+)
+from hpamdp.settings import SettingError
 
 
 def searching_actor_loss(

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
@@ -19,25 +18,14 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values
+from hpamdp.policies.shared.bandit_options import BanditOptions
 from hpamdp.policies.stored_rows import check_choices
-from hpamdp.settings import OnlyWith, Settings
 from hpamdp.specs import PAMDPSpecs
 
 
 def above_all(noise: Tensor) -> Tensor:
     """Return values of untried options, float64: above all rewards, and in the order of `noise`, whose size is 1."""
     return (1e9 + noise) * 2.0**900
-
-
-class BanditOptions(Settings):
-    """Settings of a bandit's memory. Forgetting suits rewards that change while the low level learns."""
-
-    memory: Literal["all", "discounted", "sliding_window"] = "discounted"
-    """Which rewards count: `all` equally, recent ones more (`discounted`), or the last ones only (`sliding_window`)."""
-    discount: Annotated[float, Field(gt=0.0, lt=1.0), OnlyWith("memory", "discounted")] = 0.999
-    """With `memory=discounted`: factor on the weight of a reward for each later decision, for any option."""
-    window: Annotated[PositiveInt, OnlyWith("memory", "sliding_window")] = 2000
-    """With `memory=sliding_window`: number of decisions that count, for all options together."""
 
 
 class RewardStatistics(nn.Module):

@@ -17,11 +17,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hpamdp.policies.shared.options import SequenceSearchOptions
 from hpamdp.policies.shared.planning import (
     PlannedAction,
     Returns,
     SequenceSearch,
-    SequenceSearchOptions,
     SequenceStep,
     absolute_temperature,
     elite_weights,

@@ -13,7 +13,6 @@ state.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -21,10 +20,8 @@ from torch.nn import functional as F
 
 from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.policies.shared.networks import HybridCritics, OutputLinear, in_float32
+from hpamdp.policies.shared.options import Credit
 from hpamdp.specs import PAMDPSpecs
-
-# `joint`: every component gets the whole advantage. Otherwise the branches of a `CreditCritic` are summed or mixed.
-Credit = Literal["joint", "summed", "mixed"]
 
 _MIXING_UNITS = 32
 

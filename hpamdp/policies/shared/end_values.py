@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Annotated
 
 import torch
 from tensordict import TensorDictBase
@@ -23,25 +22,8 @@ from torch import Tensor, nn
 
 from hpamdp.policies.shared.gradients import expectile_loss
 from hpamdp.policies.shared.networks import mlp, polyak_update
+from hpamdp.policies.shared.options import EndValueOptions
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.settings import Expectile, LearningRate, OnlyWith, PositiveFraction, Settings
-
-
-class EndValueOptions(Settings):
-    """Settings of the values at the ends of plans."""
-
-    end_values: bool = False
-    """Let plans count the value of their last state, by networks that learn it from the stored steps.
-
-    Set it if options end inside episodes, and for `high=value`: a plan of one option does not see the rewards of the
-    next one. Set it also if all rewards are the same and the terminations are further away than the horizon.
-    """
-    end_value_lr: Annotated[LearningRate, OnlyWith("end_values")] = 1e-3
-    """Learning rate of these values."""
-    end_value_tau: Annotated[PositiveFraction, OnlyWith("end_values")] = 0.02
-    """Fraction of the way to the learned values that their target network moves at each update."""
-    end_value_expectile: Annotated[Expectile, OnlyWith("end_values")] = 0.9
-    """Expectile of the returns that stored actions led to, from 0.5, their mean, towards 1, the best of them."""
 
 
 class EndValues(nn.Module):

@@ -3,29 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor
-
-from hpamdp.settings import Fraction, OwnSteps, Settings
-
-
-class ParameterNoiseOptions(Settings):
-    """Exploration by noise on the parameters."""
-
-    parameter_noise: NonNegativeFloat = 0.1
-    """Standard deviation of the exploring noise on the parameters, in units where their bounds are [-1, 1]."""
-
-
-class EpsilonOptions(ParameterNoiseOptions):
-    """Exploration by noise on the parameters and by random actions."""
-
-    epsilon_final: Annotated[Fraction, OwnSteps()] = 0.05
-    """Probability of a random action after `epsilon_steps`; it falls linearly from 1 to this value."""
-    epsilon_steps: Annotated[NonNegativeInt, OwnSteps()] = 40_000
-    """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
 
 
 def with_exploring_noise(unit_actions: Tensor, deviation: float | Tensor) -> Tensor:

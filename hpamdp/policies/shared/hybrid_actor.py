@@ -8,53 +8,22 @@ from itertools import pairwise
 from typing import ClassVar
 
 import torch
-from pydantic import PositiveFloat, model_validator
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.masks import masked_logits
 from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution, ValuePlaces
-from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, OutputLinear, VectorProducts
+from hpamdp.policies.shared.networks import InitialLayer, OutputLinear, VectorProducts
+from hpamdp.policies.shared.options import InitialParameters
 from hpamdp.policies.shared.perception import Perception
-from hpamdp.settings import SettingError, Settings
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 # The raw sample of the parameters, before clipping, which a learner needs for its likelihood.
 RAW = "raw_parameters"
-
-
-class HeadOptions(Settings):
-    """How the components of an action depend on each other."""
-
-    autoregressive: bool = False
-    """Let each component of an action see the choices of the components before it.
-
-    If false, the components are independent given the state.
-    """
-
-
-class ScaleOptions(Settings):
-    """The range in which the standard deviation of the parameters is learned."""
-
-    min_scale: PositiveFloat = 0.02
-    """Smallest standard deviation of the parameters, in units where their bounds are [-1, 1]."""
-    max_scale: PositiveFloat = 1.0
-    """Largest standard deviation of the parameters."""
-
-    @model_validator(mode="after")
-    def _check_scale(self) -> Self:
-        if not self.min_scale < self.max_scale:
-            raise ValueError(f"min_scale={self.min_scale}: must be less than max_scale={self.max_scale}")
-        return self
-
-    @property
-    def scale_range(self) -> tuple[float, float]:
-        """Smallest and largest standard deviation."""
-        return self.min_scale, self.max_scale
 
 
 class HybridActor(nn.Module):

@@ -6,10 +6,9 @@ import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
@@ -17,29 +16,10 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit import BanditOptions, RewardStatistics, above_all, check_statistics
-from hpamdp.settings import Indices, OnlyWith, SettingError
+from hpamdp.policies.shared.bandit import RewardStatistics, above_all, check_statistics
+from hpamdp.policies.shared.bandit_options import LinearBanditOptions
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
-
-
-class LinearBanditOptions(BanditOptions):
-    """Settings of linear bandits; `memory`, `discount` and `window` say which decisions count."""
-
-    discount: Annotated[float, Field(gt=0.0, lt=1.0), OnlyWith("memory", "discounted")] = 0.998
-    """With `memory=discounted`: factor on the weight of a reward for each later decision, for any option.
-
-    It counts about the last 500 decisions. Earlier rewards are those of weaker learners.
-    """
-    inputs: Indices | None = None
-    """Indices of the observation entries that the features use. If null, all."""
-    features: Literal["polynomial", "random_fourier"] = "polynomial"
-    """`polynomial`: monomials of the inputs up to `degree`. `random_fourier`: `degree` cosines in random directions."""
-    degree: PositiveInt = 1
-    """Degree of the polynomial, or number of the cosines."""
-    ridge: PositiveFloat = 1.0
-    """Number added to the diagonal of each option's Gram matrix."""
-    exploration: PositiveFloat = 1.0
-    """Factor of the prediction's standard deviation in exploring choices."""
 
 
 class ContextFeatures(nn.Module):

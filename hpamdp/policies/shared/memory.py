@@ -15,57 +15,8 @@ TorchRL's GRUModule does not fit: it writes the next state under `next`. Neither
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
-
 import torch
-from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 from torch import Tensor, nn
-from typing_extensions import Self
-
-from hpamdp.settings import OnlyWith, Settings
-
-
-class StackOptions(Settings):
-    """Settings of a memory of the last observations."""
-
-    memory: Literal["none", "stack"] = "none"
-    """What the networks see beside the observation. `none`: nothing; `stack`: the observations before it."""
-    stack_steps: Annotated[int, Field(ge=2, le=1000), OnlyWith("memory", "stack")] = 4
-    """With `memory=stack`: number of observations that the networks see, the current one included.
-
-    Zeros stand for observations before the first one.
-    """
-
-    @model_validator(mode="after")
-    def _check_memory(self) -> Self:
-        for name in ("vector_products", "augment"):  # problems declare vectors and symmetries of observations alone
-            if self.memory != "none" and getattr(self, name, False) is True:
-                raise ValueError(f"{name}=true: does not go with memory={self.memory}; use {name}=false or memory=none")
-        return self
-
-
-class MemoryOptions(StackOptions):
-    """Settings of a memory."""
-
-    memory: Literal["none", "stack", "gru"] = "none"  # type: ignore[assignment]
-    """What the networks see beside the observation. `none`: nothing; `stack`: the observations before it.
-
-    `gru`: the state of a GRU that has seen all observations since the memory was reset.
-    """
-    memory_size: Annotated[PositiveInt, OnlyWith("memory", "gru")] = 64
-    """With `memory=gru`: units of the GRU."""
-    sequence_length: Annotated[PositiveInt, OnlyWith("memory", "gru")] = 16
-    """With `memory=gru`: steps, for selectors decisions, through which gradients flow back in time."""
-
-
-class ReplayMemoryOptions(MemoryOptions):
-    """Settings of a memory that learns from a replay buffer."""
-
-    burn_in: Annotated[NonNegativeInt, OnlyWith("memory", "gru")] = 8
-    """With `memory=gru`: steps, for selectors decisions, before each sequence, replayed without gradients.
-
-    From them the current GRU computes the state in which the sequence starts.
-    """
 
 
 class Stack(nn.Module):

@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from hpamdp.policies.shared.options import InitialParameters
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
-
-# Initial parameters: the problem's own convention, if it has one (`domain`), or the network's initial output (`none`).
-InitialParameters = Literal["domain", "none"]
 
 # Initial squashed parameters are clamped to the first bound, past which tanh has hardly any gradient. Targets of an
 # actor's squashed parameters are clamped to the second.

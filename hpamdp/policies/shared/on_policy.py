@@ -3,38 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from pydantic import Field, PositiveFloat, PositiveInt
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
+from hpamdp.policies.shared.options import OnPolicyOptions
 from hpamdp.policies.stored_rows import check_choices
-from hpamdp.settings import LearningRate, Settings
 from hpamdp.specs import PAMDPSpecs
 
 # PyTorch's name of an extra state in a state dict: the waiting rows. A saved learner for a new run is read without it.
 WAITING = "_extra_state"
-
-
-class OnPolicyOptions(Settings):
-    """Settings of proximal policy optimisation."""
-
-    epochs: Annotated[int, Field(ge=1, le=1000)] = 10
-    """Passes over the collected rows in an update."""
-    minibatch_size: PositiveInt = 256
-    """Rows in a gradient step, and the least number of rows that an update waits for."""
-    clip: PositiveFloat = 0.2
-    """The surrogate stops rewarding probability ratios that are further from 1 than this."""
-    lr: LearningRate = 3e-4
-    """Learning rate of Adam."""
-    max_grad_norm: PositiveFloat = 0.5
-    """Largest gradient norm of a gradient step; longer gradients are scaled down.
-
-    `high=actor` limits the norms of its policy, its critic and their common perception separately.
-    """
 
 
 class OnPolicy(nn.Module):

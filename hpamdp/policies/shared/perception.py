@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.policies.encoders.base import JoinedEncoders
 from hpamdp.policies.shared.known_directions import KnownDirections
-from hpamdp.policies.shared.memory import GRU, MemoryOptions, Stack, StackOptions
+from hpamdp.policies.shared.memory import GRU, Stack
+from hpamdp.policies.shared.options import MemoryOptions, StackOptions
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 

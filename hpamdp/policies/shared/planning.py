@@ -2,89 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 from torch import Tensor
-from typing_extensions import Self
 
 from hpamdp.policies.masks import random_choice
-from hpamdp.settings import Settings
+from hpamdp.policies.shared.options import SequenceSearchOptions
 
 # Of a sequence with a forbidden action: below all returns, and finite, so that the weights of the elites are numbers.
 _FORBIDDEN_RETURN = -1e30
-
-
-class SearchOptions(Settings):
-    """Settings of a search for good sequences of actions. Deviations are in units where the bounds are [-1, 1]."""
-
-    horizon: PositiveInt = 2
-    """Steps in a sequence: a plan sees no reward and no termination beyond them."""
-    num_samples: PositiveInt = 256
-    """Samples in an iteration."""
-    num_elites: PositiveInt = 32
-    """The best of the samples, which define the next iteration's distribution."""
-    num_iterations: PositiveInt = 5
-    """Iterations of the search."""
-    temperature: PositiveFloat = 0.1
-    """Elites are weighted by exp(return / (temperature * spread)), so the scale of rewards does not matter.
-
-    The spread is the standard deviation of the returns of the plan's first samples.
-    """
-    min_deviation: NonNegativeFloat = 0.02
-    """Smallest standard deviation of a parameter."""
-
-    def _check_search(self, samples: Sequence[str], factors: Sequence[str]) -> None:
-        """Refuse more elites than samples, and searches that try too many actions.
-
-        Args:
-            samples: names of the settings that are numbers of samples.
-            factors: names of the other settings. Times the samples, their product is the number of actions tried.
-        """
-        for name in samples:
-            if self.num_elites > getattr(self, name):
-                raise ValueError(f"num_elites={self.num_elites}: must be at most {name}={getattr(self, name)}")
-        most = max(getattr(self, name) for name in samples)
-        if most * math.prod(getattr(self, name) for name in factors) > 1_000_000_000:
-            given = ", ".join(f"{name}={getattr(self, name)}" for name in (*factors, *samples))
-            raise ValueError(f"{given}: a plan would try more than 1,000,000,000 actions")
-
-
-class SequenceSearchOptions(SearchOptions):
-    """Settings of a `SequenceSearch`."""
-
-    max_sequences: PositiveInt = 64
-    """Largest number of discrete sequences tried: all of them if there are no more, else random ones."""
-    num_kept: PositiveInt = 4
-    """Sequences refined in the second iteration; half as many in each one after it, down to 1."""
-    num_samples: PositiveInt = 12
-    """Samples of the parameters for each sequence in an iteration."""
-    greedy_samples: PositiveInt = 60
-    """`num_samples` of a greedy plan. Greedy plans need more, because no exploration corrects them."""
-    num_elites: PositiveInt = 4
-    """The best of the samples, which define the next iteration's Gaussians."""
-    first_min_deviation: NonNegativeFloat = 0.3
-    """Smallest standard deviation of a parameter in the second iteration; it falls geometrically from there.
-
-    The shortest step that reaches a target lies at a cliff of the return, which elites alone approach too slowly.
-    """
-    min_deviation: NonNegativeFloat = 0.04
-    """Smallest standard deviation of a parameter in the last iteration.
-
-    With two iterations `first_min_deviation` counts.
-    """
-
-    @model_validator(mode="after")
-    def _check_sequences(self) -> Self:
-        self._check_search(("num_samples", "greedy_samples"), ("horizon", "max_sequences", "num_iterations"))
-        if self.min_deviation > self.first_min_deviation:
-            raise ValueError(
-                f"min_deviation={self.min_deviation}: must be at most first_min_deviation={self.first_min_deviation}"
-            )
-        return self
 
 
 class Prediction(NamedTuple):

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
-
 import torch
-from pydantic import Field, PositiveInt
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -14,11 +11,7 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import check_batch
 from hpamdp.policies.masks import random_discrete
-from hpamdp.policies.shared.end_values import EndValueOptions
 from hpamdp.policies.shared.perception import Perception
-from hpamdp.policies.shared.planning import SearchOptions
-from hpamdp.policies.shared.replay import ReplayOptions
-from hpamdp.settings import LearningRate
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -29,24 +22,6 @@ def plan_ends(batch: TensorDictBase) -> Tensor:
     """
     ends: Tensor = batch["next", keys.TERMINATED] | batch.get(("next", keys.TRIP_ENDED), False)
     return ends.squeeze(-1)
-
-
-class PlanningOptions(SearchOptions, EndValueOptions, ReplayOptions):
-    """Settings of a learner that plans in a learned model."""
-
-    warmup_steps: PositiveInt = 1000
-    """Random steps of a learner before its first update. The updates that are due for them are then made at once."""
-    num_members: PositiveInt = 2
-    """Members of the ensemble of models."""
-    lr: LearningRate = 1e-3
-    """Learning rate of the model."""
-    epsilon: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.05
-    """Probability of a uniformly random action in place of an exploring plan's."""
-    planning_precision: Literal["float32", "bfloat16"] = "bfloat16"
-    """Precision of the networks' hidden layers when planning; `update_precision` is that of updates.
-
-    bfloat16 is faster on hardware with instructions for it (AVX-512 BF16, AMX, GPUs) and slower elsewhere.
-    """
 
 
 class PlanningPolicy(TensorDictModuleBase):

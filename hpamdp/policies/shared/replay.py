@@ -6,67 +6,25 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.devices import checked_device
 from hpamdp.observation_entries import packed, unpacked
 from hpamdp.policies.base import Bonus, Learner, step_discounts
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
-from hpamdp.policies.shared.memory import MemoryOptions, ReplayMemoryOptions
+from hpamdp.policies.shared.options import MemoryOptions, ReplayMemoryOptions, ReplayOptions
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
 from hpamdp.policies.shared.symmetry import RandomSymmetry
-from hpamdp.settings import OwnSteps, PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
 
 _STATES = ("state", "next_state")
-
-
-class BufferOptions(Settings):
-    """Settings of a replay buffer."""
-
-    buffer_size: PositiveInt = 200_000
-    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
-    batch_size: PositiveInt = 128
-    """Transitions in an update."""
-
-    @model_validator(mode="after")
-    def _check_buffer(self) -> Self:
-        if self.batch_size > self.buffer_size:
-            raise ValueError(f"batch_size={self.batch_size}: must be at most buffer_size={self.buffer_size}")
-        return self
-
-
-class ReplayOptions(BufferOptions):
-    """Settings of a learner with a replay buffer."""
-
-    warmup_steps: Annotated[NonNegativeInt, OwnSteps()] = 5000
-    """Random steps of a learner before its first update."""
-    updates_per_step: Annotated[PositiveFloat, OwnSteps()] = 0.25
-    """Updates for each step that the learner collects."""
-    augment: Literal["auto"] | bool = False
-    """Map each sampled transition by a random symmetry that the problem declares.
-
-    `auto` does so if there is any and the learner has no memory.
-    """
-    gamma: PositiveFraction = 0.99
-    """Discount of a step."""
-    reward_scale: PositiveFloat = 1.0
-    """Factor on the stored rewards. It scales values and predicted rewards, too."""
-
-    @model_validator(mode="after")
-    def _check_replay(self) -> Self:
-        if self.updates_per_step > 1000.0:
-            raise ValueError(f"updates_per_step={self.updates_per_step}: must be at most 1000")
-        return self
 
 
 class ReplayLearner(Learner):

@@ -6,40 +6,17 @@ decisions. What was observed within options is not part of it.
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector
-from hpamdp.policies.shared.memory import MemoryOptions, ReplayMemoryOptions, StackOptions
+from hpamdp.policies.shared.options import StackOptions
 from hpamdp.policies.shared.perception import Perception
 
 # Before the name of the state in a step, where learners have memories of their own.
 _PREFIX = "option_"
-
-
-class SelectorStackOptions(StackOptions):
-    """Settings of a selector's memory of the last decisions."""
-
-    memory: Literal["none", "stack"] = "none"
-    """What the networks see beside the observation. `none`: nothing; `stack`: observations at the last decisions."""
-
-
-class SelectorMemoryOptions(MemoryOptions):
-    """Settings of a selector's memory."""
-
-    memory: Literal["none", "stack", "gru"] = "none"
-    """What the networks see beside the observation. `none`: nothing; `stack`: observations at the last decisions.
-
-    `gru`: the state of a GRU that has seen the observations at all decisions of the episode.
-    """
-
-
-class SelectorReplayMemoryOptions(ReplayMemoryOptions, SelectorMemoryOptions):
-    """Settings of a selector's memory that learns from a replay buffer."""
 
 
 class RemembersDecisions(Selector):

@@ -8,7 +8,7 @@ explores, too.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,21 +17,12 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit import Bandit, BanditOptions
+from hpamdp.policies.shared.bandit import Bandit
+from hpamdp.policies.shared.bandit_options import SessionBanditOptions
 from hpamdp.specs import PAMDPSpecs
 
 # Counts, sums and sums of squares of the rewards of each option in the session, float64 `[*B, 3, num_options]`.
 SESSION_REWARDS = "session_rewards"
-
-
-class SessionBanditOptions(BanditOptions):
-    """Settings of a bandit that may count the rewards of a session alone."""
-
-    memory: Literal["all", "discounted", "sliding_window", "session"] = "discounted"  # type: ignore[assignment]
-    """Which rewards count: `all` equally, recent ones more (`discounted`), or the last ones only (`sliding_window`).
-
-    `session`: those of the session's earlier trips, if an episode is a session of trips. Each session begins anew.
-    """
 
 
 class SessionRewards:

@@ -56,10 +56,9 @@ predicted states only. On this project's benchmark the score after 8,000 steps w
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import torch
-from pydantic import PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
@@ -68,15 +67,15 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import ActionFeature, Bonus, known_ends
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
-from hpamdp.policies.low_level.dlpa.planner import Planner, PlannerOptions
+from hpamdp.policies.low_level.dlpa.options import DLPAOptions
+from hpamdp.policies.low_level.dlpa.planner import Planner
 from hpamdp.policies.shared.end_values import EndValues
-from hpamdp.policies.shared.memory import ReplayMemoryOptions, Stack
+from hpamdp.policies.shared.memory import Stack
 from hpamdp.policies.shared.networks import polyak_update
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.planning_policy import PlanningPolicy, plan_ends
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.policies.shared.sequences import past_of
-from hpamdp.settings import PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
 Tensors: TypeAlias = Mapping[str, Tensor] | TensorDictBase
@@ -85,36 +84,6 @@ Tensors: TypeAlias = Mapping[str, Tensor] | TensorDictBase
 _STORED = ("state", "discrete", "unit", "reward", "next_state")
 # What a memory's state is computed from: the stored state of a stack, and the steps that a GRU saw.
 _REMEMBERED = ("memory", "past", "num_past", "first_memory", "first_begins")
-
-
-class DLPAOptions(ReplayMemoryOptions, PlannerOptions):
-    """Settings of `DLPA`."""
-
-    form: Literal["parallel", "masking", "sequential"] = "masking"
-    """How the model takes an action.
-
-    `parallel`: the discrete action and its own parameters at once. `masking`: the same with the parameters of all
-    actions, those of the others set to 0. `sequential`: the discrete action first, then its parameters.
-    """
-    hidden_dims: Widths = (128, 128)
-    """Hidden layers of the transition predictor, and of each member of the ensemble for reward and termination."""
-    state_weight: PositiveFloat = 2.0
-    """Weight of the change of the state, in standard deviations, in the H-step loss."""
-    reward_weight: PositiveFloat = 0.5
-    """Weight of the reward's squared error in the H-step loss, in the units of scaled rewards.
-
-    One network predicts rewards and terminations. With rewards much larger than 1, it learns terminations worse.
-    """
-    termination_weight: PositiveFloat = 0.5
-    """Weight of the termination in the H-step loss."""
-    rho: PositiveFraction = 0.5
-    """Step h of a training window has weight rho^h."""
-    buffer_size: PositiveInt = 100_000
-    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
-    batch_size: PositiveInt = 256
-    """Windows in an update."""
-    updates_per_step: PositiveFloat = 1.0
-    """Updates for each step that the learner collects; the first ones make up for the warm-up."""
 
 
 class DLPAPolicy(PlanningPolicy):

@@ -7,37 +7,18 @@ Source: Zhang, Fu, Miao and Konidaris, 2024, arXiv 2404.03037, section 4; Willia
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from pydantic import Field, NonNegativeFloat, model_validator
 from torch import Tensor
-from typing_extensions import Self
 
 from hpamdp.policies.base import Bonus
+from hpamdp.policies.low_level.dlpa.options import PlannerOptions
 from hpamdp.policies.shared.gradients import matmul_precision
 from hpamdp.policies.shared.planning import Prediction, absolute_temperature, discounted_return, elite_weights
-from hpamdp.policies.shared.planning_policy import PlanningOptions
 from hpamdp.specs import PAMDPSpecs
 
 _CHUNK_ROWS = 4096  # states predicted at once when planning: fits the cache and bounds the memory
-
-
-class PlannerOptions(PlanningOptions):
-    """Settings of a `Planner`."""
-
-    momentum: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
-    """Weight of the old distribution in the new one."""
-    pessimism: NonNegativeFloat = 0.0
-    """Standard deviations between the members' returns that are subtracted from their mean.
-
-    With two members, 1 gives their minimum.
-    """
-
-    @model_validator(mode="after")
-    def _check_planner(self) -> Self:
-        self._check_search(("num_samples",), ("horizon", "num_iterations"))
-        return self
 
 
 class Plan(NamedTuple):

@@ -62,17 +62,17 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
-from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp.policies.base import ActionFeature, Bonus
 from hpamdp.policies.low_level.pets.model import PETSModel
-from hpamdp.policies.low_level.pets.policy import PETSPolicy, PETSPolicyOptions
+from hpamdp.policies.low_level.pets.options import PETSOptions
+from hpamdp.policies.low_level.pets.policy import PETSPolicy
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.known_directions import KnownDirections
-from hpamdp.policies.shared.memory import ReplayMemoryOptions, Stack
+from hpamdp.policies.shared.memory import Stack
 from hpamdp.policies.shared.networks import polyak_update
 from hpamdp.policies.shared.planning_policy import plan_ends
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -81,25 +81,6 @@ from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 _MAX_COPIES = 16  # of a stored step under the problem's symmetries
-
-
-class PETSOptions(PETSPolicyOptions, ReplayMemoryOptions):
-    """Settings of `PETS`."""
-
-    weight_decay: NonNegativeFloat = 1.0
-    """Weight decay of AdamW. With much less, the networks overfit a few hundred steps, with overconfident errors."""
-    weight_decay_steps: PositiveInt = 256
-    """With more stored steps than these, the decay falls as 1 / steps, so that it blurs no edges of targets."""
-    transition_weight: PositiveFloat = 2.0
-    """Weight of the change's error in the loss; those of termination and rewards are 1."""
-    warmup_steps: PositiveInt = 64
-    """Random steps of a learner before its first update; there are more until two rewards differ."""
-    updates_per_step: PositiveFloat = 10.0
-    """Updates for each step that the learner collects; the first ones make up for the warm-up."""
-    batch_size: PositiveInt = 64
-    """Steps in a member's minibatch."""
-    buffer_size: PositiveInt = 20_000
-    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
 
 
 class PETS(ReplayLearner):

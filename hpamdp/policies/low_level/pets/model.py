@@ -7,45 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal
 
 import torch
-from pydantic import PositiveInt
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from hpamdp.policies.low_level.pets.options import PETSModelOptions
 from hpamdp.policies.shared.canonical_frame import CanonicalFrame, joined
 from hpamdp.policies.shared.joint_choice import JointChoice
 from hpamdp.policies.shared.networks import EnsembleLinear, in_float32
 from hpamdp.policies.shared.planning import Prediction
-from hpamdp.policies.shared.planning_policy import PlanningOptions
 from hpamdp.policies.shared.scales import scale_of
-from hpamdp.settings import Widths
 from hpamdp.specs import PAMDPSpecs
 
 _LOG_VARIANCE_LOW, _LOG_VARIANCE_HIGH = -10.0, 1.0  # of a scaled change
 _RIDGE = 0.3  # of the linear part, whose inputs have a deviation of about 1
-
-
-class PETSModelOptions(PlanningOptions):
-    """Settings of a `PETSModel`."""
-
-    augment: Literal["auto"] | bool = "auto"
-    """Use the symmetry and the geometry that the problem declares: `auto` if there are any; true requires them."""
-    num_members: PositiveInt = 5
-    """Models, each trained on minibatches of its own."""
-    transition_dims: Widths = (64, 64)
-    """Hidden layers of the networks that predict the change of the state."""
-    outcome_dims: Widths = (64, 64)
-    """Hidden layers of the networks that predict whether a step terminates, and its reward."""
-    probabilistic: bool = False
-    """Predict a variance of the change, for problems with noise."""
-    linear_part: Literal["auto"] | bool = "auto"
-    """Predict the change by a linear model, fitted by least squares, plus what the networks add to it.
-
-    The linear model knows where steps lead after some hundred steps. `auto` uses it unless the problem declares a
-    geometry that makes its discrete actions alike.
-    """
 
 
 class MemberNet(nn.Module):

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Literal
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Bonus
-from hpamdp.policies.low_level.pets.model import PETSModel, PETSModelOptions
+from hpamdp.policies.low_level.pets.model import PETSModel
+from hpamdp.policies.low_level.pets.options import PETSPolicyOptions
 from hpamdp.policies.shared.contingent_planning import ContingentSearch
 from hpamdp.policies.shared.end_values import EndValues
-from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
+from hpamdp.policies.shared.exploration import with_exploring_noise
 from hpamdp.policies.shared.joint_choice import JointChoice
 from hpamdp.policies.shared.known_directions import KnownDirections
 from hpamdp.policies.shared.perception import Perception
@@ -25,51 +24,15 @@ from hpamdp.policies.shared.planning import (
     Prediction,
     Returns,
     SequenceSearch,
-    SequenceSearchOptions,
     SequenceStep,
     discounted_return,
 )
 from hpamdp.policies.shared.planning_policy import PlanningPolicy
-from hpamdp.settings import Fraction
 from hpamdp.specs import PAMDPSpecs
 
 MEMBER = "member"  # which member an environment follows, int64 [*B]
 
 _CHUNK_ROWS = 8192  # states predicted at once when planning: fits the cache and bounds the memory
-
-
-class PETSPolicyOptions(SequenceSearchOptions, ParameterNoiseOptions, PETSModelOptions):
-    """Settings of a `PETSPolicy`."""
-
-    posterior_sampling: Literal["auto"] | bool = "auto"
-    """Let each exploring environment follow the plans of one member until its episode or option ends.
-
-    So environments try what members disagree on. If false, plans use all members. With a bonus for new states, plans
-    always use all members.
-
-    `auto` does so if the problem declares a geometry that makes its discrete actions alike. Elsewhere a single member
-    knows too little for its plans to lead anywhere.
-    """
-    optimism: NonNegativeFloat = 1.0
-    """Without posterior sampling: standard deviations of the members' returns that exploring plans add to the mean."""
-    caution: NonNegativeFloat = 0.0
-    """Standard deviations of the members' returns that greedy plans subtract from the mean.
-
-    It avoids plans that look good only because some members err. This helps where one mistake ends the episode.
-    """
-    hypotheses: NonNegativeInt = 8
-    """Number of sampled sets of directions to plan under while some actions' directions are unknown.
-
-    Plans then value what an action reveals. If 0, or if there are more than `max_sequences` sequences of horizon + 1
-    discrete actions, plans use a single guess.
-    """
-    parameter_noise: NonNegativeFloat = 0.05
-    """Standard deviation of the exploring noise on the parameters, in units where their bounds are [-1, 1]."""
-    epsilon: Fraction = 0.0
-    """Probability of a uniformly random action in place of an exploring plan's.
-
-    If no member has seen a reward, all of them predict none, and planning alone never finds it.
-    """
 
 
 class PETSPolicy(PlanningPolicy):

@@ -1,0 +1,25 @@
+"""Settings of `bc`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, NonNegativeFloat, PositiveInt
+
+from hpamdp.policies.shared.options import BufferOptions, HeadOptions, ScaleOptions
+from hpamdp.settings import LearningRate, Widths
+
+
+class BCOptions(HeadOptions, ScaleOptions, BufferOptions):
+    """Settings of `BC`."""
+
+    hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
+    """Hidden layers of the actor."""
+    buffer_size: PositiveInt = 200_000
+    """Largest number of transitions that are kept."""
+    batch_size: PositiveInt = 512
+    """Transitions in an update."""
+    lr: LearningRate = 1e-3
+    """Learning rate of AdamW."""
+    weight_decay: NonNegativeFloat = 1e-2
+    """Weight decay of AdamW."""

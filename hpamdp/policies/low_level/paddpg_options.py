@@ -1,0 +1,39 @@
+"""Settings of `paddpg`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+
+from hpamdp.policies.shared.options import (
+    ActorCriticOptions,
+    EpsilonOptions,
+    InitialParameters,
+    TargetRateOptions,
+    TwinCriticOptions,
+)
+from hpamdp.settings import LearningRate, OnlyWith
+
+
+class PADDPGOptions(ActorCriticOptions, TargetRateOptions, TwinCriticOptions, EpsilonOptions):
+    """Settings of `PADDPG`. Noise is in units where the bounds of scores and parameters are [-1, 1]."""
+
+    twin: bool = False
+    """Train as in TD3, which makes it PATD3: the lower of two critics counts, with smoothing and a delayed actor."""
+    target_smoothing: Annotated[NonNegativeFloat, OnlyWith("twin")] = 0.1
+    """With `twin`: standard deviation of the noise on scores and parameters in the target; 0 adds no noise."""
+    target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("twin"), OnlyWith("target_smoothing")] = 0.2
+    """With `twin`: largest size of this noise."""
+    policy_delay: Annotated[PositiveInt, OnlyWith("twin")] = 2
+    """With `twin`: critic updates for each update of the actor and the target networks."""
+    initial_parameters: InitialParameters = "domain"
+    """`domain` adds the problem's own initial parameters, if it has any, by a frozen layer; `none` adds nothing."""
+    actor_lr: LearningRate = 1e-4
+    """Learning rate of the actor."""
+    max_grad_norm: PositiveFloat | None = 10.0
+    """Largest gradient norm. If null, no limit."""
+    parameter_noise: NonNegativeFloat = 0.1
+    """Standard deviation of the exploring noise on scores and parameters."""
+    augment: Literal[False] = False
+    """Always false: the symmetries of a problem map no scores."""

@@ -1,0 +1,43 @@
+"""Settings of `td3_bc`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
+
+from hpamdp.policies.shared.options import (
+    ActorCriticOptions,
+    ParameterNoiseOptions,
+    SmoothedTargetOptions,
+    TargetRateOptions,
+)
+from hpamdp.settings import LearningRate, OnlyWith, OwnSteps, PositiveFraction, Widths
+
+
+class TD3BCOptions(ActorCriticOptions, TargetRateOptions, SmoothedTargetOptions, ParameterNoiseOptions):
+    """Settings of `TD3BC`. Noise is in units where the parameters' bounds are [-1, 1]."""
+
+    hidden_dims: Widths = (128, 128)
+    """Hidden layers of the actor, the critics and the model of the data's discrete actions."""
+    actor_lr: LearningRate = 1e-3
+    """Learning rate of the actor and of the model of the data's discrete actions."""
+    behaviour_weight: NonNegativeFloat = 0.2
+    """Weight of the parameters' squared distance from the data, beside values divided by their mean size.
+
+    It is 1 / alpha of the paper, which has 0.4.
+    """
+    discrete_threshold: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.3
+    """Discrete actions are never taken if their probability in the data is below this fraction of the largest one."""
+    target_smoothing: NonNegativeFloat = 0.05
+    """Standard deviation of the noise on the parameters in the target."""
+    target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("target_smoothing")] = 0.1
+    """Largest size of this noise."""
+    policy_delay: PositiveInt = 2
+    """Critic updates for each update of the actor and the target networks."""
+    tau: PositiveFraction = 0.005
+    """Fraction of the way to the learned networks that the target networks move in an update of theirs."""
+    warmup_steps: Annotated[NonNegativeInt, OwnSteps()] = 1000
+    """Steps before the first update."""
+    batch_size: PositiveInt = 256
+    """Transitions in an update."""
