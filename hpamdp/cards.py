@@ -12,7 +12,7 @@ has its card as an attribute::
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from typing import Literal
 
@@ -49,8 +49,9 @@ class ProblemCard(Card):
     """What an environment declares.
 
     Attributes:
-        has_trips: whether an episode is a session of several trips. The options end with each trip, which the
-            environment reports as `trip_ended`.
+        has_trips: whether an episode is a session: several trips, one after another, through which something unseen
+            stays the same. An agent can learn what that is in one trip and use it in the next ones (Duan et al. 2016,
+            *RL^2*). The environment reports the ends of trips as `trip_ended`.
         choice_setting: a setting with which the agent chooses an option, for errors.
         no_choice_setting: a setting with which there is nothing to choose, for errors.
         change_setting: a setting with which an option may end before its episode, if others forbid it, for errors.
@@ -76,11 +77,14 @@ class LevelCard(Card):
             argument are refused. Append the keys to `in_keys`.
         takes_pictures: whether observations may have pictures, because they go through `policies.shared.perception` or
             nothing reads them. If not, pictures are refused: they are flattened only if the user asks for it.
+        counts_durations: whether discounts are those of `policies.base.step_discounts`. A run warns if the environment
+            writes durations and the level does not count them.
     """
 
     modes: tuple[str, ...] = ("train", "offline")
     needs: tuple[str, ...] = ()
     takes_pictures: bool = False
+    counts_durations: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,8 +125,6 @@ class LearnerCard(LevelCard):
         step_sizes: settings that give the sizes of what the policy writes into steps, beside the action.
         needs_current_policy: whether each batch must be of the policy after the last update. A collector that collects
             ahead is refused.
-        counts_durations: whether discounts are those of `policies.base.step_discounts`. A run warns if the environment
-            writes durations and the learner does not count them.
         explores_with: what an exploration beside the learner may change (`ExplorationCard.changes`). With `actions`,
             the learner may be `is_overruled`; with `rewards`, it may have a `bonus`. Other explorations are refused.
         novelty_by: where a bonus for new states counts. `reward`: the agent adds it to the rewards of the batch.
@@ -139,7 +141,6 @@ class LearnerCard(LevelCard):
     remembers_directions: bool = False
     step_sizes: tuple[str, ...] = ()
     needs_current_policy: bool = False
-    counts_durations: bool = False
     explores_with: frozenset[str] = frozenset()
     novelty_by: Literal["reward", "sample", "plan"] = "reward"
     knows_disagreement: bool = False
@@ -165,7 +166,7 @@ class ExplorationCard(Card):
             which they take (`LearnerCard.explores_with`).
     """
 
-    changes: Literal["actions", "rewards"]
+    changes: Literal["actions", "rewards", "nothing"] = "nothing"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,3 +201,9 @@ class CallbackCard(Card):
     """
 
     needs_evaluations: bool = False
+
+
+def outside_card(cls: type, card: type[Card]) -> str | None:
+    """Return what to do about a class that has a field of its card as an attribute of its own; None if it has none."""
+    names = [each.name for each in fields(card) if each.name != "options" and hasattr(cls, each.name)]
+    return f"{names[0]} belongs to its card; write card = {card.__name__}({names[0]}=...)" if names else None

@@ -28,7 +28,6 @@ from hpamdp.config.compose import conf_dir, job_overrides, read
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import explained, not_understood
 from hpamdp.config.schema import RESUME_AUTO
-from hpamdp.config.stand_ins import RealImportsNeededError, quick_imports
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError
 from hpamdp.exit_codes import FAILED, INTERRUPTED, MISTAKE
 from hpamdp.limits import limit_in
@@ -269,18 +268,14 @@ def _go_on(cfg: DictConfig, output_dir: Path) -> int:
 
 
 def _refuse_early(cfg: DictConfig) -> None:
-    """Refuse wrong settings before torch is imported. The run checks its config again, with the real classes.
+    """Refuse wrong settings before torch is imported. The run checks its config again.
 
     Raises:
         ConfigError: a value is wrong, or values do not go together.
     """
     if cfg.resume is not None or cfg.mode == "eval":  # the saved run has the config
         return
-    try:
-        with quick_imports():
-            config = read(cfg)
-    except RealImportsNeededError:
-        return
+    config = read(cfg)
     compatibility.check_saved_run(config.run)
     problem = compatibility.facts_of(config)
     if problem is not None:

@@ -9,7 +9,7 @@ REWARD = "reward"
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
 OUTCOME = "outcome"  # how the episode ended, in an environment's own codes
 
-# Written by an environment whose episodes are sessions of trips (`PAMDPEnv.has_trips`): the step ended a trip.
+# Written by an environment whose episodes are sessions of trips (`ProblemCard.has_trips`): the step ended a trip.
 TRIP_ENDED = "trip_ended"
 
 # Written by an environment that forbids some choices: the allowed choices in its current state.

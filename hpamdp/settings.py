@@ -1,6 +1,6 @@
 """Base class of every class's `Options`, which define each setting's type, bounds, default and meaning.
 
-A class lists its settings once, at the top of its file::
+A class lists its settings once. Those of this package stand in modules without torch, see `hpamdp.cards`::
 
     class UCBOptions(Settings):
         exploration: NonNegativeFloat = 2.0
@@ -114,6 +114,7 @@ class Settings(BaseModel):
         allow_inf_nan=False,
         protected_namespaces=(),
         use_attribute_docstrings=True,
+        defer_build=True,
     )
 
     @classmethod

@@ -13,7 +13,7 @@ FILES = {
     for file in sorted((ROOT / "hpamdp").rglob("*.py"))
 }
 LOW, HIGH = "hpamdp.policies.low_level", "hpamdp.policies.high_level"
-LEARNERS = [module for module in FILES if module.startswith(f"{LOW}.")]
+LEARNERS = [module for module in FILES if module.startswith(f"{LOW}.") and module != f"{LOW}.options"]
 TORCH = ("torch", "torchrl", "tensordict")
 # The rooms that know boats; everything else is generic.
 BOATS = ("hpamdp.env.boatdock", "hpamdp.env.boatdock_released", "hpamdp.env.boatdock_unseen", "hpamdp.data.human")
@@ -94,6 +94,14 @@ def test_what_a_boat_for_gymnasium_runs_through_imports_no_torch():
         assert not [name for name in loaded if any(is_in(name, library) for library in TORCH)], module
 
 
+def test_settings_and_cards_import_no_slow_library():
+    slow = (*TORCH, "numba", "scipy", "matplotlib")
+    modules = [module for module in FILES if module.endswith(("_options", ".options"))]
+    assert f"{LOW}.hppo_options" in modules and "hpamdp.env.platform.options" in modules
+    for module in modules:
+        assert not [name for name in loaded_with(module) if any(is_in(name, library) for library in slow)], module
+
+
 def test_imports_through_other_modules_are_found():
     assert "torch" in loaded_with("hpamdp.env.boatdock.environment")
     assert any(is_in(name, "numba") for name in loaded_with("hpamdp.env.boatdock.gymnasium_adapter"))
@@ -134,7 +142,19 @@ def test_a_problem_knows_no_other_but_the_other_boats_the_boats_and_those_on_gym
 
 
 def test_the_data_knows_the_environments_and_nobody_below_knows_the_data():
-    allowed = ("data", "devices", "env", "exit_codes", "files", "json_lines", "keys", "messages", "settings", "specs")
+    allowed = (
+        "cards",
+        "data",
+        "devices",
+        "env",
+        "exit_codes",
+        "files",
+        "json_lines",
+        "keys",
+        "messages",
+        "settings",
+        "specs",
+    )
     known = {name for module in FILES if is_in(module, "hpamdp.data") for name in imports(module)}
     assert not [n for n in known if is_in(n, "hpamdp") and not any(is_in(n, f"hpamdp.{room}") for room in allowed)]
     assert not importers("hpamdp.data", inside="hpamdp.env") | importers("hpamdp.data", inside="hpamdp.policies")

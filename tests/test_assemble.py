@@ -15,7 +15,7 @@ from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.option_choice import OptionChoiceEnv
-from hpamdp.env.rooms.environment import RoomsEnv
+from hpamdp.env.rooms.options import RoomsOptions
 from hpamdp.run.assemble import AssembledRun, assemble
 from hpamdp.run.trainer import Trainer
 
@@ -282,7 +282,7 @@ def test_returns_over_frozen_learners_are_discounted_by_the_step_of_the_episode(
 def test_names_of_options_that_are_no_list_of_names_are_refused_for_every_environment(names, tmp_path, monkeypatch):
     facts = ProblemFacts(title="rooms", option_names=names, has_choice=True)
     monkeypatch.setattr(Crossing, "option_names", names)
-    monkeypatch.setattr(RoomsEnv, "facts", classmethod(lambda cls, options: facts))
+    monkeypatch.setattr(RoomsOptions, "facts", lambda options, title: facts)
     for words in (["env=crossing", "low=stepper"], ["env=rooms", "low=random", "high=uniform"]):
         with pytest.raises((ProblemError, ConfigError), match=r"option_names (is .* a list|has a name twice)"):
             make(make_config([*SMALL, *words]), tmp_path)

@@ -17,12 +17,12 @@ from hpamdp.env.boatdock import task
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock_unseen import fleet, rules
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
-from hpamdp.env.boatdock_unseen.fleet import FleetRules
+from hpamdp.env.boatdock_unseen.options import FAMILIES, FleetRules
 from hpamdp.env.boatdock_unseen.registration import IDS
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.settings import SettingError
 
-every_family = pytest.mark.parametrize("family", fleet.FAMILIES)
+every_family = pytest.mark.parametrize("family", FAMILIES)
 
 
 def presses(env: UnseenBoatsEnv, td: TensorDict, seed: int, longest: float = 1.2) -> TensorDict:

@@ -16,8 +16,10 @@ from torchrl.envs.utils import check_env_specs
 
 import hpamdp
 from hpamdp import keys
-from hpamdp.env.circuit import compiler, gates, oracle, rules
+from hpamdp.env.circuit import compiler, gates, rules
 from hpamdp.env.circuit.environment import CircuitEnv
+from hpamdp.env.circuit.known_circuits import CIRCUITS
+from hpamdp.env.circuit.options import NATIVE_SETS
 from hpamdp.env.circuit.rules import MATCHED, MISSED, TASK_OF, TASKS
 from hpamdp.policies.shared.networks import VectorProducts
 from hpamdp.specs import PAMDPSpecs
@@ -119,7 +121,7 @@ def test_random_circuits_score_as_a_simulator_of_tensor_products_says(task):
     assert all(has_ended)
 
 
-@pytest.mark.parametrize("gate_set", gates.NATIVE_SETS)
+@pytest.mark.parametrize("gate_set", NATIVE_SETS)
 def test_native_circuits_have_the_simulators_fidelity_and_the_sum_of_their_gates_costs(gate_set):
     env = CircuitEnv(30, task="random_state", gate_set=gate_set, seed=5)
     env.reset()
@@ -145,7 +147,7 @@ def test_native_circuits_have_the_simulators_fidelity_and_the_sum_of_their_gates
     assert results["cost"].tolist() == pytest.approx(costs, abs=1e-5)
 
 
-@pytest.mark.parametrize("task", oracle.CIRCUITS)
+@pytest.mark.parametrize("task", CIRCUITS)
 def test_the_textbooks_circuit_scores_1(task):
     env = CircuitEnv(1, task=task, oracle=True)
     reading = env.reset()
@@ -154,8 +156,8 @@ def test_the_textbooks_circuit_scores_1(task):
         reading = act(env, known["discrete"].squeeze(-1), known["parameters"].squeeze(-1))
     assert env.results(reading)["score"].item() == pytest.approx(1.0, abs=5e-5)
     assert reading[keys.OUTCOME].item() == MATCHED
-    assert env.state.steps.item() == len(oracle.CIRCUITS[task]) + 1
-    assert len(oracle.CIRCUITS[task]) == {"hadamard": 3, "bell": 3, "ghz": 4, "toffoli": 11}[task]
+    assert env.state.steps.item() == len(CIRCUITS[task]) + 1
+    assert len(CIRCUITS[task]) == {"hadamard": 3, "bell": 3, "ghz": 4, "toffoli": 11}[task]
 
 
 @pytest.mark.parametrize(
@@ -248,11 +250,11 @@ def test_products_of_vectors_include_the_overlap_with_the_target():
     assert torch.allclose(fidelity, env.state.similarity, atol=1e-5)
 
 
-@pytest.mark.parametrize("task", oracle.CIRCUITS)
+@pytest.mark.parametrize("task", CIRCUITS)
 def test_training_may_begin_within_the_known_circuit_and_evaluation_begins_without_gates(task):
     env = CircuitEnv(200, task=task, begin="known")
     assert compare_with_rules(env, 3, 1e-5)[1] == 0
-    circuit = oracle.CIRCUITS[task]
+    circuit = CIRCUITS[task]
     begun = env.reset()[keys.OBSERVATION]
     made = Circuit(TASK_OF[task].n)
     expected = []
@@ -295,7 +297,7 @@ def test_a_circuit_of_as_many_gates_as_are_allowed_is_finished_and_has_its_score
     assert torch.allclose(total, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("task", oracle.CIRCUITS)
+@pytest.mark.parametrize("task", CIRCUITS)
 def test_the_planner_finishes_the_known_circuit_wherever_training_begins_in_it(task):
     env = CircuitEnv(50, task=task, begin="known", oracle=True)
     first = torch.tensor([0, *env.parameter_dims]).cumsum(0)
@@ -310,7 +312,7 @@ def test_the_planner_finishes_the_known_circuit_wherever_training_begins_in_it(t
         td = env.step(td.update({"action": {"discrete": gate, "parameters": parameters}}))["next"]
         steps.append(td[keys.DONE].sum())
     assert (td[keys.OUTCOME] == MATCHED).all() and env.state.similarity.min() > 0.999
-    assert steps[1] > 0 and len(steps) == len(oracle.CIRCUITS[task]) + 1  # some had but one gate to go
+    assert steps[1] > 0 and len(steps) == len(CIRCUITS[task]) + 1  # some had but one gate to go
 
 
 def test_the_closing_table_has_the_score_of_no_gates_for_the_target_at_hand():

@@ -28,6 +28,7 @@ from hpamdp.limits import limit_of
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.base import CollectionError, WorkerDiedError
+from hpamdp.run.collection.options import WorkerOptions
 from hpamdp.run.collection.ray import check_answers
 from hpamdp.run.collection.worker import (
     EnvShard,
@@ -38,7 +39,7 @@ from hpamdp.run.collection.worker import (
     WorkingDir,
     pack_state,
 )
-from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, call_worker
+from hpamdp.run.collection.workers import WorkerCollection, call_worker
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 

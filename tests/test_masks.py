@@ -212,8 +212,8 @@ def test_a_forbidden_option_is_never_chosen(high):
     torch.manual_seed(0)
     config = make_config([f"high={high}", "low=random", *SELECTORS[high]])
     selector: Selector = config.high.build(specs=specs, device=CPU)
-    learner = make_learner("pdqn", specs) if selector.asks_learners else Random(specs)
-    learners = [learner] * specs.num_options if selector.asks_learners else [learner]
+    learner = make_learner("pdqn", specs) if selector.card.asks_learners else Random(specs)
+    learners = [learner] * specs.num_options if selector.card.asks_learners else [learner]
     play_and_learn(env, HierarchicalAgent(selector, learners, specs), 8)
     assert env.base_env.violations == 0
 

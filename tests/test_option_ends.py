@@ -10,6 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_options import Crossing, Stepper, Toll, best_value, earned, steppers
 
 from hpamdp import keys
+from hpamdp.cards import SelectorCard
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.high_level.meta_critic import MetaCritic
@@ -26,7 +27,7 @@ SPECS = PAMDPSpecs.from_env(Crossing())
 class Moody(Uniform):
     """Choose options at random, and end them at random."""
 
-    ends_options = True
+    card = SelectorCard(ends_options=True)
 
     def ends(self, td: TensorDict) -> torch.Tensor:
         return torch.rand(td.batch_size) < 0.3

@@ -19,6 +19,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import needs_trust, read_saved
 from hpamdp.env.pinball import maps
 from hpamdp.env.pinball.environment import PinballEnv
+from hpamdp.env.pinball.options import SOURCE_MAPS
 from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
 from hpamdp.settings import SettingError
@@ -32,7 +33,7 @@ TABLE = {
     "polygons": [[[0.5, 0.2], [0.55, 0.2], [0.55, 0.8], [0.5, 0.8]]],
 }
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=320", "eval.layouts=4", "eval.every=0"]
-each_map = pytest.mark.parametrize("name", maps.SOURCE_MAPS)
+each_map = pytest.mark.parametrize("name", SOURCE_MAPS)
 
 
 def scripted(env: PinballEnv):

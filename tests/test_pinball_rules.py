@@ -14,10 +14,11 @@ from batched_players import random_player
 
 from hpamdp.env.pinball import maps, rules
 from hpamdp.env.pinball.environment import PinballEnv
+from hpamdp.env.pinball.options import SOURCE_MAPS
 from hpamdp.env.pinball.rules import DOWN, LEFT, NONE, REACHED, RIGHT, ROLLING, UP, PinballState
 
 FOLDER = Path(os.environ.get("HPAMDP_TRACES", "nowhere")) / "domains"
-each_map = pytest.mark.parametrize("name", maps.SOURCE_MAPS)
+each_map = pytest.mark.parametrize("name", SOURCE_MAPS)
 
 
 class ScalarTable:

@@ -17,7 +17,8 @@ from tensordict import TensorDict
 from hpamdp import keys
 from hpamdp.env.primitives import players
 from hpamdp.env.primitives.environment import PrimitivesEnv
-from hpamdp.env.primitives.manipulation import ACTIONS, OBSERVED, Manipulation, Task
+from hpamdp.env.primitives.manipulation import OBSERVED, Manipulation
+from hpamdp.env.primitives.options import ACTIONS, Task
 from hpamdp.env.primitives.primitives import OPENING_STEPS, PRIMITIVES, STEPS, phases
 from hpamdp.env.primitives.registration import IDS
 from hpamdp.env.registration import register

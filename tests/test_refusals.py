@@ -12,7 +12,7 @@ from pydantic import BaseModel, TypeAdapter
 from toy_environments import Toy
 
 import hpamdp
-from hpamdp.config.components import GROUPS, load_class, settings_model, takes_settings_model
+from hpamdp.config.components import GROUPS, card_named
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
 from hpamdp.limits import is_about_memory
@@ -424,9 +424,9 @@ def test_a_setting_that_counts_only_with_another_value_is_told(words, needs):
 @pytest.mark.parametrize(("group", "name"), [(group, name) for group in ("high", "low") for name in choices(group)])
 def test_a_setting_that_counts_own_steps_is_marked_where_a_class_declares_it_anew(group, name):
     target = yaml.safe_load((CONF / group / f"{name}.yaml").read_text()).get("_target_")
-    if target is None or "offline" not in load_class(target).modes or not takes_settings_model(load_class(target)):
+    if target is None or "offline" not in card_named(target).modes or card_named(target).options is None:
         return
-    model = settings_model(load_class(target))
+    model = card_named(target).options
 
     def marked(model: type[BaseModel]) -> set[str]:
         fields = model.model_fields.items()
@@ -514,9 +514,9 @@ def test_a_setting_without_effect_is_told_once_by_both_doors(command, capsys):
 @pytest.mark.parametrize(("group", "name"), [(group, name) for group in GROUPS for name in choices(group)])
 def test_settings_that_count_with_another_one_name_a_setting_and_its_values(group, name):
     target = yaml.safe_load((CONF / group / f"{name}.yaml").read_text()).get("_target_")
-    if target is None or not takes_settings_model(load_class(target)):
+    model = None if target is None else card_named(target).options
+    if model is None:
         return
-    model = settings_model(load_class(target))
     for field in model.model_fields.values():
         for each in field.metadata:
             if isinstance(each, OnlyWith):

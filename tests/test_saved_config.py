@@ -237,7 +237,7 @@ def test_the_page_names_every_setting_that_needs_consent():
     for n in range(MOST):
         config = make_config([f"{group}={choices(group)[n % len(choices(group))]}" for group in GROUPS])
         for group in GROUPS:
-            guarded |= {f"{group}.{name}" for name in getattr(getattr(config, group).cls, "guarded_settings", ())}
+            guarded |= {f"{group}.{name}" for name in getattr(config, group).card.guarded_settings}
     assert guarded == {word for word in table if word.partition(".")[0] in GROUPS}
 
 

@@ -24,8 +24,8 @@ from hpamdp.env.registration import register
 from hpamdp.env.traffic import network
 from hpamdp.env.traffic.environment import TrafficEnv
 from hpamdp.env.traffic.lights import TrafficLights
-from hpamdp.env.traffic.network import ARMS, GREENS, MAX_GREEN, MIN_GREEN, PHASES, network_file, run_tool
-from hpamdp.env.traffic.players import PLAYERS
+from hpamdp.env.traffic.network import ARMS, GREENS, MAX_GREEN, MIN_GREEN, network_file, run_tool
+from hpamdp.env.traffic.options import PHASES, PLAYERS
 from hpamdp.env.traffic.process import SimulationProcess
 from hpamdp.env.traffic.simulation import Simulation, Task
 from hpamdp.settings import SettingError

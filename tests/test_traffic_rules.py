@@ -14,7 +14,8 @@ from scripts import load_script
 
 from hpamdp.env.traffic import lights
 from hpamdp.env.traffic.demand import HELD_OUT, KINDS, NUM_DEMANDS, Demand, draw
-from hpamdp.env.traffic.network import FOLDER, GREENS, NETWORKS, PHASES, YELLOW, entries, lanes_of
+from hpamdp.env.traffic.network import FOLDER, GREENS, NETWORKS, YELLOW, entries, lanes_of
+from hpamdp.env.traffic.options import PHASES
 from hpamdp.env.traffic.players import Webster
 from hpamdp.env.traffic.simulation import observation_names
 from hpamdp.settings import SettingError

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
+from hpamdp.cards import CallbackCard
 from hpamdp.run.callbacks import Callback
 
 
@@ -32,7 +33,7 @@ class Recording(Callback):
 class Guarded(Callback):
     """Has a setting that a saved run must not choose alone."""
 
-    guarded_settings: ClassVar[tuple[str, ...]] = ("command",)
+    card = CallbackCard(guarded_settings=("command",))
 
     def __init__(self, command: str = "") -> None:
         self.command = command

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,6 +10,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from hpamdp import keys
+from hpamdp.cards import ProblemCard
 from hpamdp.env.base import PAMDPEnv
 
 
@@ -30,7 +30,7 @@ class Sessions(PAMDPEnv):
         session: number of the environment's session, int64 `[N]`.
     """
 
-    has_trips: ClassVar[bool] = True
+    card = ProblemCard(has_trips=True)
     parameter_dims = (1, 1)
 
     def __init__(

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from pydantic import PositiveInt
 
+from hpamdp.cards import CallbackCard
 from hpamdp.run.callbacks import Callback
 from hpamdp.run.trainer import Trainer
 from hpamdp.settings import Settings
@@ -25,7 +26,7 @@ class HalveRate(Callback):
     """Halve all learning rates after some evaluations without a higher score."""
 
     Options = HalveRateOptions
-    needs_evaluations = True
+    card = CallbackCard(needs_evaluations=True)
 
     def __init__(self, options: HalveRateOptions | None = None, **settings: Any) -> None:
         self.options: HalveRateOptions = HalveRateOptions.of(options, settings)

@@ -18,7 +18,7 @@ from hpamdp import keys
 from hpamdp.analysis.study import Rows, write_tables
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.env.boatdock_unseen.explorer import Explorer
-from hpamdp.env.boatdock_unseen.fleet import FAMILIES
+from hpamdp.env.boatdock_unseen.options import FAMILIES
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent

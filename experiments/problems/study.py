@@ -30,7 +30,7 @@ from hpamdp.analysis.study import (
     spread,
     with_enough_seeds,
 )
-from hpamdp.env.primitives.manipulation import ACTIONS, Reward, Task
+from hpamdp.env.primitives.options import ACTIONS, Reward, Task
 from hpamdp.env.primitives.players import MEASURED
 from hpamdp.figure_style import LEARNER_COLOURS, STYLE, draw_spread
 from hpamdp.messages import exit_code

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hpamdp.analysis.study import fault_of, run_folders
-from hpamdp.env.registration import NAMING_SETTINGS
+from hpamdp.env.facts import NAMING_SETTINGS
 from hpamdp.messages import one_line, reason_of, warn
 from hpamdp.metrics_file import EVALUATION, read_curve
 from hpamdp.run_files import (

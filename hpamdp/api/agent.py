@@ -27,7 +27,7 @@ from hpamdp.config.outside_jobs import composed, word
 from hpamdp.config.schema import Config, EnvConfig
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import DecisionTracker, decision_tracker
-from hpamdp.env.registration import SOURCE_SETTINGS
+from hpamdp.env.facts import SOURCE_SETTINGS
 from hpamdp.messages import as_code
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.renamed import no_member

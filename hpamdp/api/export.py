@@ -246,8 +246,8 @@ def _check_levels(agent: HierarchicalAgent) -> None:
         raise ConfigError(f"export: {_names(agent)} cannot be exported: it observes pictures")
     for level in _levels(agent):
         refusal = level.export_refusal
-        if refusal is None and level.needs:
-            refusal = f"reads {' and '.join(level.needs)} entries, which only the environment can write"
+        if refusal is None and level.card.needs:
+            refusal = f"reads {' and '.join(level.card.needs)} entries, which only the environment can write"
         if refusal is not None:
             raise ConfigError(f"export: {type(level).__name__} cannot be exported: it {refusal}")
     if agent.specs.has_parameter_bounds or agent.specs.has_pair_mask:

@@ -34,7 +34,7 @@ from hpamdp.config.outside_jobs import check_no_sweep, choosing_class, composed,
 from hpamdp.config.saved import choices_of
 from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.env.errors import closed_on_error
-from hpamdp.env.registration import NAMING_SETTINGS
+from hpamdp.env.facts import NAMING_SETTINGS
 from hpamdp.messages import as_code, reason_of, say, warn
 from hpamdp.metrics_file import read_rows, what_is_lost
 from hpamdp.run import checkpoint

@@ -1,6 +1,8 @@
 """Check and build the classes that are chosen for the groups of conf/.
 
-A class lists its settings in a model, `Options`. If it has none, its constructor's arguments define the settings.
+A class lists its settings in a model, `Options`. If it has none, its constructor's arguments define the settings. The
+settings and the card of this package's classes are read without importing the classes, which would import torch, see
+`card_named`. Classes of others are imported.
 """
 
 from __future__ import annotations
@@ -10,13 +12,26 @@ import importlib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeAlias, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, PydanticUserError, create_model
 
+from hpamdp.cards import (
+    CallbackCard,
+    Card,
+    CollectorCard,
+    DataCard,
+    EncoderCard,
+    ExplorationCard,
+    LearnerCard,
+    LoggerCard,
+    ProblemCard,
+    SelectorCard,
+    outside_card,
+)
 from hpamdp.complaints import as_json
 from hpamdp.config.errors import ConfigError, validated
-from hpamdp.config.stand_ins import check_works_with_stand_ins
 from hpamdp.limits import is_about_memory
 from hpamdp.messages import first_line
 from hpamdp.settings import SettingError, Settings
@@ -57,6 +72,17 @@ _BASE_CLASSES = {
     "collector": "hpamdp.run.collection.base.Collection",
     CALLBACK: "hpamdp.run.callbacks.Callback",
 }
+_CARDS: dict[str, type[Card]] = {
+    "env": ProblemCard,
+    "high": SelectorCard,
+    "low": LearnerCard,
+    "encoder": EncoderCard,
+    "exploration": ExplorationCard,
+    "data": DataCard,
+    "logger": LoggerCard,
+    "collector": CollectorCard,
+    CALLBACK: CallbackCard,
+}
 _CAN_BE_NONE = ("high", "exploration", "data")
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, protected_namespaces=())
 
@@ -68,14 +94,15 @@ class Component:
     Attributes:
         group: the group, such as `low`.
         name: name of the yaml file, such as `hyar`.
-        cls: the class; None for `high=none`, `exploration=none` and `data=none`.
+        target: the class, as its dotted name if it is one of this package, which is imported when it is built; None for
+            `high=none`, `exploration=none` and `data=none`.
         settings: checked values by name.
         objects: further arguments of the constructor, from Python code. No file holds them.
     """
 
     group: str
     name: str
-    cls: type | None
+    target: str | type | None
     settings: Mapping[str, Any]
     objects: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -83,20 +110,40 @@ class Component:
         return f"{self.group}={self.name}"
 
     @property
+    def cls(self) -> type | None:
+        """The class, imported if it has not been; None if there is none."""
+        return load_class(self.target) if isinstance(self.target, str) else self.target
+
+    @property
+    def class_name(self) -> str:
+        """The name of the class, without its module."""
+        return _name_of(self.target)
+
+    @property
+    def card(self) -> Any:
+        """What the class declares; if it has no card or there is no class, an empty card."""
+        card = card_named(self.target) if isinstance(self.target, str) else getattr(self.target, "card", None)
+        return card or _CARDS[self.group]()
+
+    @property
+    def model(self) -> type[BaseModel] | None:
+        """The class's `Options`; None if it has no model."""
+        if isinstance(self.target, str):
+            return self.card.options
+        return settings_model(self.target) if self.target is not None and takes_settings_model(self.target) else None
+
+    @property
     def as_model(self) -> Any:
         """The settings as an instance of the class's `Options`; None if it has no model."""
-        if self.cls is None or not takes_settings_model(self.cls):
-            return None
-        return settings_model(self.cls)(**self.settings)
+        return None if self.model is None else self.model(**self.settings)
 
     def is_guarded(self, name: str, value: object) -> bool:
         """Return whether a saved config needs the user's permission to give a setting this value.
 
-        The class lists such settings in `guarded_settings`, as `name`, or as `name=value` if only that value needs
-        permission. An environment's `unguarded_values` need none.
+        The card of the class lists such settings, see `Card.guarded_settings`.
         """
-        guarded = getattr(self.cls, "guarded_settings", ())
-        if value in getattr(self.cls, "unguarded_values", {}).get(name, ()):
+        guarded = self.card.guarded_settings
+        if value in self.card.unguarded_values.get(name, ()):
             return False
         return name in guarded or f"{name}={value}" in guarded
 
@@ -109,16 +156,17 @@ class Component:
         Raises:
             ConfigError: the constructor raises a `SettingError`, or memory does not suffice.
         """
-        if self.cls is None:
+        cls = self.cls
+        if cls is None:
             return None
-        accepted = constructor_arguments(self.cls)
+        accepted = constructor_arguments(cls)
         supplied = {name: value for name, value in {**context, **self.objects}.items() if name in accepted}
         model = self.as_model
         settings = self.settings if model is None else {"options": model}
         try:
-            return self.cls(**supplied, **settings)
+            return cls(**supplied, **settings)
         except SettingError as error:
-            what, name = first_line(error), self.cls.__name__
+            what, name = first_line(error), self.class_name
             raise ConfigError(f"{self.group}: {what}" if name in what else f"{self.group}: {what} ({name})") from error
         except Exception as error:
             if not is_about_memory(error):
@@ -164,30 +212,30 @@ def component(
         model = create_model("none", __config__=_STRICT)
         validated(model, settings, f"{group}.", "setting of none", f"none, {file}")
         return Component(group, name, None, {})
-    cls = _load_target(group, target, file)
-    model = settings_model(cls, SUPPLIED_ARGUMENTS.get(group, ()))
+    chosen = str(target) if card_named(str(target)) is not None else _load_target(group, target, file)
+    model = model_of(chosen, group)
     taken = [value for value in (TARGET, *of_run) if value in model.model_fields]
     if taken:
         raise ConfigError(
-            f"{group}={name}: {cls.__name__} has a setting {taken[0]}, but {group}.{taken[0]} is a value of the run; "
-            f"rename the setting ({file})"
+            f"{group}={name}: {_name_of(chosen)} has a setting {taken[0]}, but {group}.{taken[0]} is a value of the "
+            f"run; rename the setting ({file})"
         )
 
     def where(setting: str | None) -> str:
         place = None if setting is None or place_of is None else place_of(setting)
-        return cls.__name__ if place is None else f"{cls.__name__}, {place}"
+        return _name_of(chosen) if place is None else f"{_name_of(chosen)}, {place}"
 
-    checked = validated(model, settings, prefix or f"{group}.", f"setting of {cls.__name__}", where)
-    return Component(group, name, cls, dict(checked))
+    checked = validated(model, settings, prefix or f"{group}.", f"setting of {_name_of(chosen)}", where)
+    return Component(group, name, chosen, dict(checked))
 
 
 def check_base_class(group: str, name: str, target: object) -> None:
-    """Refuse a class that does not fit the group, or that is abstract.
+    """Refuse a class that does not fit the group, that is abstract, or that declares itself outside its card.
 
     Raises:
         ConfigError: the message names what the class lacks.
     """
-    if target is None and group in _CAN_BE_NONE:
+    if (target is None and group in _CAN_BE_NONE) or isinstance(card_named(str(target)), _CARDS[group]):
         return
     file = file_of(group, name)
     cls, base = _load_target(group, target, file), load_class(_BASE_CLASSES[group])
@@ -204,6 +252,29 @@ def check_base_class(group: str, name: str, target: object) -> None:
     if left or cls is base:
         missing = f", which have {', '.join(left)}" if left else ""
         raise ConfigError(f"{given} is abstract; choose one of its subclasses{missing} ({file})")
+    outside = outside_card(cls, _CARDS[group])
+    if outside is not None:
+        raise ConfigError(f"{given}: {outside} ({file})")
+
+
+@cache
+def card_named(dotted: str) -> Card | None:
+    """Return the card of a class of this package without importing the class; None for other classes.
+
+    The card of `package.module.Class` is `CARDS["Class"]` of the module `package.module_options` or `package.options`.
+    """
+    module, _, name = dotted.rpartition(".")
+    package = module.rpartition(".")[0]
+    if dotted.partition(".")[0] != __name__.partition(".")[0]:
+        return None
+    for place in (f"{module}_options", f"{package}.options"):
+        try:
+            cards = getattr(importlib.import_module(place), "CARDS", {})
+        except ModuleNotFoundError:
+            continue
+        if name in cards:
+            return cards[name]
+    return None
 
 
 # Classes that Python code passed, by their dotted names. Those defined in a notebook or a function cannot be imported.
@@ -217,7 +288,7 @@ def name_of_passed(cls: type) -> str:
     return dotted
 
 
-def is_passed(cls: type) -> bool:
+def is_passed(cls: object) -> bool:
     """Return whether Python code passed a class, which another process may be unable to import."""
     return cls in _passed.values()
 
@@ -227,14 +298,12 @@ def load_class(dotted: str) -> type:
 
     Raises:
         ConfigError: there is no such class.
-        RealImportsNeededError: see `check_works_with_stand_ins`.
     """
     if dotted in _passed:
         return _passed[dotted]
     module_name, _, name = dotted.rpartition(".")
     if not module_name or not all(part.isidentifier() for part in dotted.split(".")):
         raise ConfigError(f"{dotted}: must be a class, as package.module.Class")
-    check_works_with_stand_ins(dotted)
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
@@ -253,6 +322,23 @@ def _load_target(group: str, target: object, file: str) -> type:
         return load_class(str(target))
     except ConfigError as error:
         raise ConfigError(f"{group}.{TARGET}={error} ({file})") from error
+
+
+def _name_of(target: str | type | None) -> str:
+    return target.rpartition(".")[2] if isinstance(target, str) else getattr(target, "__name__", "none")
+
+
+def model_of(target: str | type, group: str) -> type[BaseModel]:
+    """Return the model of a class's settings, given the class or its dotted name.
+
+    Raises:
+        ConfigError: there is no such class, or as for `settings_model`.
+    """
+    card = card_named(target) if isinstance(target, str) else None
+    if card is not None:
+        return card.options or create_model(_name_of(target), __config__=_STRICT)
+    cls = load_class(target) if isinstance(target, str) else target
+    return settings_model(cls, SUPPLIED_ARGUMENTS.get(group, ()))
 
 
 def constructor_arguments(cls: type) -> dict[str, inspect.Parameter]:

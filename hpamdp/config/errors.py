@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias, TypeVar
 
-import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from hpamdp.complaints import complaints
@@ -63,5 +62,5 @@ def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: st
 
 def _plain(value: Any) -> Any:
     """Return NumPy's numbers and truth values as Python's, and what else JSON does not know as text."""
-    plain = value.item() if isinstance(value, np.generic) else value
+    plain = value.item() if getattr(value, "shape", None) == () else value
     return plain if isinstance(plain, bool | int | float) else str(value)

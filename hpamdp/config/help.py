@@ -18,7 +18,6 @@ from hpamdp.config.compose import listed_callbacks, plain
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed
 from hpamdp.config.schema import RunConfig
-from hpamdp.config.stand_ins import quick_imports
 from hpamdp.shell import program
 
 _WIDTH = 110  # letters of a line
@@ -95,14 +94,13 @@ def _explained_choices(line: CommandLine) -> Iterator[str]:
 
 def _explained_choice(group: str, name: str, given: Mapping[str, Any], prefix: str) -> str:
     try:
-        with quick_imports():
-            chosen = component(group, name, given)
+        chosen = component(group, name, given)
     except ConfigError:
         return ""
-    if chosen.as_model is None:
+    if chosen.model is None:
         settings = f"the settings {', '.join(chosen.settings)}" if chosen.settings else "no settings"
         return f"{group}={name} has {settings}\n\n"
-    lines = _explained(type(chosen.as_model), prefix, dict(chosen.settings))
+    lines = _explained(chosen.model, prefix, dict(chosen.settings))
     return "\n".join([f"Settings of {group}={name}", *lines, "", ""])
 
 

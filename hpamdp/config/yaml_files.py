@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from typing import Any
 
 from hydra.core.plugins import Plugins
@@ -12,15 +11,12 @@ from omegaconf import DictConfig, Node, OmegaConf
 from hpamdp.config.components import (
     CALLBACK,
     GROUPS,
-    SUPPLIED_ARGUMENTS,
     TARGET,
     defaults_of,
-    load_class,
-    settings_model,
+    model_of,
 )
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RunConfig
-from hpamdp.config.stand_ins import quick_imports, works_with_stand_ins
 
 
 def complete_yaml_files() -> None:
@@ -53,7 +49,6 @@ def _defaults(config_path: str, cfg: DictConfig) -> dict[str, Any]:
     if not isinstance(target, Node) or not isinstance(target._value(), str):
         return {}
     try:
-        with quick_imports() if works_with_stand_ins(target._value()) else nullcontext():
-            return defaults_of(settings_model(load_class(target._value()), SUPPLIED_ARGUMENTS.get(group, ())))
+        return defaults_of(model_of(target._value(), group))
     except ConfigError:  # which the check of the config raises again, with the name of the file
         return {}

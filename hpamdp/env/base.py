@@ -15,10 +15,11 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategoric
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.cards import ProblemCard
 from hpamdp.components import MAX_PAIRED, Components
 from hpamdp.devices import checked_device
 from hpamdp.env.errors import ProblemError as ProblemError  # part of what a problem may use
-from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.facts import ProblemFacts, ProblemOptions
 from hpamdp.env.gymnasium_form import GymnasiumForm, VectorForm
 from hpamdp.geometry import PlaneGeometry, Symmetries
 from hpamdp.messages import as_code
@@ -66,9 +67,9 @@ class PAMDPEnv(EnvBase):
       `[N, num_discrete, num_discrete]` beside the observation: whether the column's action may follow the row's;
     - if parameters have other bounds in each state, `parameter_low` and `parameter_high` float32 `[N, num_parameters]`
       beside the observation, within the bounds of the spec;
-    - if an episode is a session of several trips (`has_trips`), `trip_ended` bool `[N, 1]` beside the observation:
-      whether the step ended a trip. It is also true where `done`, and false after a reset. The next trip begins at
-      once: the observation of the same step is its first one;
+    - if an episode is a session of several trips (`ProblemCard.has_trips`), `trip_ended` bool `[N, 1]` beside the
+      observation: whether the step ended a trip. It is also true where `done`, and false after a reset. The next trip
+      begins at once: the observation of the same step is its first one;
     - if steps take different times, `duration` float32 `[N, 1]` beside the observation: how long the step took, in
       units of one discount. `policies.base.step_discounts` says which learners count it. It is 0 after a reset;
     - `reward`, `done`, `terminated`, `truncated` `[N, 1]`; a time limit is `truncated` only.
@@ -95,24 +96,12 @@ class PAMDPEnv(EnvBase):
     max_steps: int  # steps of the longest episode
     result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads
 
-    # Whether an episode is a session: several trips, one after another, through which something unseen stays the same.
-    # An agent can learn what that is in one trip and use it in the next ones (Duan et al. 2016, *RL^2*).
-    has_trips: ClassVar[bool] = False
-
     # Whether a reset of some environments returns the others unchanged. If so, TorchRL's merge of the two changes
     # nothing and is left out, since it takes longer than simple physics of 65,536 environments.
     reset_returns_all_rows: ClassVar[bool] = False
 
-    # Settings that can run code, read files or reach servers. A saved config sets them only if the user allows it.
-    guarded_settings: ClassVar[tuple[str, ...]] = ()
-    # Values of these settings that need no such permission.
-    unguarded_values: ClassVar[Mapping[str, tuple[object, ...]]] = {}
-
-    # Settings that let the agent choose an option, and settings that do not. Errors name them.
-    choice_setting: ClassVar[str] = ""
-    no_choice_setting: ClassVar[str] = ""
-    # A setting with which an option may end before its episode, if other settings forbid it. Errors name it.
-    change_setting: ClassVar[str] = ""
+    # What the class declares; see `ProblemCard`.
+    card: ClassVar[ProblemCard] = ProblemCard()
 
     # Rows of the closing table, and panels of the learning curves.
     table_metrics: ClassVar[tuple[Metric, ...]] = (
@@ -143,7 +132,7 @@ class PAMDPEnv(EnvBase):
     @classmethod
     def facts(cls, options: Settings) -> ProblemFacts | None:
         """Return what these settings tell of the problem; None if only a built environment knows it."""
-        return None
+        return options.facts(cls.__name__) if isinstance(options, ProblemOptions) else None
 
     @property
     def title(self) -> str:

@@ -210,7 +210,7 @@ class NumpyBatchedEnv(NumpyRows):
         """Return the infos, `[N]` each."""
         steps, outcome = self.rows.integers[STEPS_ROW], self.rows.integers[OUTCOME_ROW]
         infos = {"outcome": self._outcome_names[outcome], "steps": steps.astype(np.int64)}
-        if self._env.has_trips:
+        if self._env.card.has_trips:
             infos[keys.TRIP_ENDED] = self._env.trip_ends(self.rows)
         return infos | self._masks() | self._env.final_infos(self.rows)
 
@@ -221,7 +221,7 @@ class NumpyBatchedEnv(NumpyRows):
         """Return the infos of the first environment as Python's numbers."""
         steps, outcome, _ = self.rows.integers[STEPS_ROW:, 0].tolist()
         values: dict[str, Any] = {"outcome": self._env.outcomes[outcome], "steps": steps}
-        if self._env.has_trips:
+        if self._env.card.has_trips:
             values[keys.TRIP_ENDED] = self._env.trip_ends(self.rows).item(0)
         values |= {name: mask[0] for name, mask in self._masks().items()}
         if outcome == GOING_ON:

@@ -180,8 +180,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem."""
-        return ProblemFacts(title=cls.__name__)
+        """Return what these settings tell of the problem; by default that all its facts are the usual ones."""
+        return super().facts(options) or ProblemFacts(title=cls.__name__)
 
     @property
     def default_options(self) -> Mapping[str, Sequence[int | str]]:

@@ -48,7 +48,7 @@ class DecisionTracker(Transform):
         option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`, if options are sets of
             actions and some may be forbidden; else None.
         components: components of the action. If None, it has one.
-        ends_with_trips: whether options end with the trips inside their episodes, see `PAMDPEnv.has_trips`.
+        ends_with_trips: whether options end with the trips inside their episodes, see `ProblemCard.has_trips`.
         keeps_observation: whether to write `decision_observation`. Pictures are large, so they are kept only if there
             are options to choose.
     """
@@ -282,7 +282,7 @@ def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLen
     Raises:
         ProblemError: it has trips, but does not say where they end.
     """
-    if env.has_trips and keys.TRIP_ENDED not in env.observation_spec.keys():
+    if env.card.has_trips and keys.TRIP_ENDED not in env.observation_spec.keys():
         raise ProblemError(f"{env.title}: has_trips is true, but its observation_spec has no {keys.TRIP_ENDED}")
     option_actions = None
     observed = env.observation_spec.keys()
@@ -294,7 +294,7 @@ def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: OptionLen
         option_length,
         option_actions,
         components=env.components,
-        ends_with_trips=env.has_trips and env.has_choice,
+        ends_with_trips=env.card.has_trips and env.has_choice,
         keeps_observation=keeps_observation,
     )
 

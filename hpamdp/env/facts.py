@@ -5,6 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from hpamdp.settings import Settings
+
+# Settings of `GymnasiumEnv` that name the environment, and all that say which environment it is.
+NAMING_SETTINGS = ("id", "entry_point")
+SOURCE_SETTINGS = (*NAMING_SETTINGS, "kwargs")
+
 
 @dataclass(frozen=True)
 class ProblemFacts:
@@ -36,3 +42,11 @@ class ProblemFacts:
     has_oracle: bool = False
     has_human: bool = False
     has_pictures: bool = False
+
+
+class ProblemOptions(Settings):
+    """Base of the settings of problems whose facts follow from their settings."""
+
+    def facts(self, title: str) -> ProblemFacts:
+        """Return what these settings tell of the problem, which errors call `title`."""
+        return ProblemFacts(title=title)

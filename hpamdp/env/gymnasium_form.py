@@ -133,7 +133,7 @@ class VectorForm(GymnasiumForm):
             if name in observed.keys()
         }
         self._bounds = [name for name in (keys.PARAMETER_LOW, keys.PARAMETER_HIGH) if name in observed.keys()]
-        self._needs_trips = env.has_trips and env.has_choice  # with which options end
+        self._needs_trips = env.card.has_trips and env.has_choice  # with which options end
         self._num_parameters = sum(env.parameter_dims)
         self.num_entries = observed[keys.OBSERVATION].shape[-1]
         entries = env.observation_entries

@@ -11,10 +11,6 @@ import gymnasium
 
 import hpamdp.env
 
-# Settings of `GymnasiumEnv` that name the environment, and all that say which environment it is.
-NAMING_SETTINGS = ("id", "entry_point")
-SOURCE_SETTINGS = (*NAMING_SETTINGS, "kwargs")
-
 
 def register() -> None:
     """Register the Gymnasium ids of all problems; calling it again changes nothing.

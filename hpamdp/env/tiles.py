@@ -7,16 +7,13 @@ the middle of the next one. So it is not tile coding, whose features are 0 or 1 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from hpamdp.env.kernels import HALF, ONE, ZERO, part
-
-NumTiles = Annotated[int, Field(ge=0, le=100)]
 
 
 def tiles_of(x: Tensor, y: Tensor, tiles: int) -> Tensor:

@@ -467,7 +467,7 @@ class HierarchicalAgent(nn.Module):
             if selector_ends_options:
                 held: list[NestedKey] = [(keys.HELD, key) for key in selector.out_keys]
                 self.policy.out_keys = [*self.policy.out_keys, *held]
-            if selector.asks_learners:
+            if selector.card.asks_learners:
                 selector.take_option_values(OptionValues(learners, specs.num_options))
             self.next_options = AgentNextOptions(selector, learners, specs.num_options, is_shared, self.pairs)
             for learner in learners:
@@ -541,7 +541,7 @@ class HierarchicalAgent(nn.Module):
             batch: the transitions.
             decisions: `[*B, K]` for the selector. If None, the decisions in the batch.
         """
-        if self.selector is not None and self.pairs is None and "offline" in self.selector.modes:
+        if self.selector is not None and self.pairs is None and "offline" in self.selector.card.modes:
             self.selector.add_demonstrations(finished_decisions(batch if decisions is None else decisions))
         if self.next_options is not None and self.next_options.decides_ends:
             # A row without its option would be stored with option 0, beside the agent's own rows.

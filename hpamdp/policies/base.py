@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from enum import Enum
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -15,6 +14,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.cards import ActionFeature, LearnerCard, LevelCard, SelectorCard
 from hpamdp.messages import as_code
 from hpamdp.policies.masks import sample_index
 from hpamdp.policies.stored_rows import check_stored_rows
@@ -33,17 +33,9 @@ def check_batch(owner: object, step: TensorDictBase) -> None:
         raise ValueError(f"{name}: the step has batch size [], but must have [N]; for one environment use [1]")
 
 
-class ActionFeature(Enum):
-    """What an action may have beyond one choice with bounded parameters, and its name in refusals."""
-
-    COMPONENTS = "an action of several components"
-    PAIR_MASK = "a pair_mask, which forbids pairs of discrete actions"
-    PARAMETER_BOUNDS = "bounds of the parameters that depend on the state"
-
-
 @dataclass(frozen=True)
 class Bonus:
-    """The reward of an exploration for states that are new; see `Learner.novelty_by`.
+    """The reward of an exploration for states that are new; see `LearnerCard.novelty_by`.
 
     Attributes:
         weight: reward of a bonus of 1.
@@ -169,33 +161,25 @@ class Level:
 
     Attributes:
         specs: sizes and bounds of the problem.
-        needs: names of constructor arguments of the environment which the run sets to true. With `oracle`, the
-            environment also writes its planner's best action for each option (the `ORACLE_` keys of `hpamdp.keys`).
-            With `human`, it writes the probabilities of human choices (`HUMAN_OPTION`). Environments without such an
-            argument are refused. Append the keys to `in_keys`.
-        guarded_settings: settings that can run code, read files or reach servers.
+        card: what the class declares.
         may_be_nan: the columns of the replay buffer that may hold NaN.
         export_refusal: why its greedy policy cannot be exported to ONNX. If None, it can.
-        takes_pictures: whether observations may have pictures, because they go through `policies.shared.perception` or
-            nothing reads them. If not, pictures are refused: they are flattened only if the user asks for it.
     """
 
-    needs: ClassVar[tuple[str, ...]] = ()
-    guarded_settings: ClassVar[tuple[str, ...]] = ()
+    card: ClassVar[LevelCard]
     may_be_nan: ClassVar[frozenset[str]] = frozenset()
     export_refusal: str | None = None
-    takes_pictures: ClassVar[bool] = False
     specs: PAMDPSpecs
 
     def check_specs(self, specs: PAMDPSpecs) -> None:
-        """Refuse anything but specs, and pictures unless the level `takes_pictures`.
+        """Refuse anything but specs, and pictures unless the card says `takes_pictures`.
 
         Raises:
             SettingError: they are no specs, or an entry of the observation is a picture.
         """
         if not isinstance(specs, PAMDPSpecs):
             raise SettingError(f"{type(self).__name__}: specs={as_code(specs)}: must be PAMDPSpecs.from_env(env)")
-        if specs.has_pictures and not self.takes_pictures:
+        if specs.has_pictures and not self.card.takes_pictures:
             raise SettingError(f"{type(self).__name__}: has no encoder for pictures; encoder=mlp flattens them")
 
     def stateful(self) -> dict[str, Any]:
@@ -298,38 +282,24 @@ class Selector(Level, TensorDictModuleBase):
     optimizers and replay buffers.
 
     Attributes:
-        asks_learners: whether the selector needs `option_values`.
+        card: what the class declares.
         option_values: the learners' values of each option, `[N, num_options]`, as a function. Its arguments are
             observations `[N, observation_dim]`, the states' action masks or None, and what the learners remember of the
-            steps before or None. The agent gives it if `asks_learners`.
+            steps before or None. The agent gives it if the card says `asks_learners`.
         gamma: discount of an environment step, whatever the length of the options. It discounts `option_return` and
             the value of the next decision, see `next_discount`.
-        ends_options: whether the selector can decide where options end, by `ends`.
-        decides_ends: whether it does so in this run (`agent.termination=learned`). The agent sets it.
-        lengths_refusal: why the selector cannot choose pairs of an option and its length (`agent.termination=chosen`).
-            If None, it can: its `specs` then list the pairs as options. A selector with `needs`, or that
-            `asks_learners`, is refused in any case.
-        is_bandit: True if the selector uses an option's return as its full value, that is, does not bootstrap. Its
-            options must last as long as their episodes or trips; others are refused.
-        modes: what the selector can learn from: its own choices (`train`), or a data set of other choices (`offline`).
-            A data set lacks keys that a selector adds to `out_keys`, so such a selector usually has `train` alone.
+        decides_ends: whether the selector decides where options end, by `ends`, in this run
+            (`agent.termination=learned`). The agent sets it.
         memory_key: key of the selector's memory of earlier decisions in a step; None if it has no memory.
-        sees_state: whether the selector tells by the state which option is best. If true, `agent.practice=auto` can
-            mean `curves`.
         practice: probability that an exploring decision is overruled in favour of each option, `[num_options]`, a
             buffer that the agent sets. With the remaining probability the selector chooses.
         pending: how many decisions for each option have not yet reached `learn`, int64 `[num_options]`. The agent sets
             this buffer after every batch. A selector that needs the number within a batch adds its own choices.
     """
 
-    asks_learners: ClassVar[bool] = False
-    sees_state: ClassVar[bool] = False
+    card: ClassVar[SelectorCard] = SelectorCard()
     added_later: ClassVar[tuple[str, ...]] = ("practice",)  # checkpoints of 0.3 have `is_uniform` in its place
-    is_bandit: ClassVar[bool] = False
-    ends_options: ClassVar[bool] = False
-    lengths_refusal: ClassVar[str | None] = None
     decides_ends: bool = False
-    modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     gamma: float = 1.0
     memory_key: str | None = None
     practice: Tensor
@@ -370,7 +340,7 @@ class Selector(Level, TensorDictModuleBase):
         return [] if self.memory_key is None else [self.memory_key]
 
     def take_option_values(self, option_values: nn.Module) -> None:
-        """Compare the learners' values of the options from now on, if the selector `asks_learners`."""
+        """Compare the learners' values of the options from now on, if the card says `asks_learners`."""
         self.option_values = option_values
 
     def option_probabilities(self, td: TensorDictBase) -> Tensor | None:
@@ -417,7 +387,8 @@ class Selector(Level, TensorDictModuleBase):
     def ends(self, td: TensorDictBase) -> Tensor:
         """Return whether the held `option` of `td` ends in each environment, bool `[*B]`.
 
-        Called at every step but the first of an episode, if `decides_ends`. Override it if `ends_options`.
+        Called at every step but the first of an episode, if `decides_ends`. Override it if the card says
+        `ends_options`.
         """
         raise NotImplementedError(f"{type(self).__name__} does not decide where options end")
 
@@ -549,9 +520,10 @@ class Learner(Level, nn.Module):
     one-hot option is the end of its observation. A subclass provides:
 
     - `policy`, which acts;
+    - `card`, what it takes, needs and gives (`LearnerCard`);
     - `learn`, to learn from the agent's own transitions;
-    - `add_demonstrations` and `update`, to learn from a data set, and `"offline"` in `modes`;
-    - `value`, if it bootstraps, so that the learners of other options can bootstrap from it;
+    - `add_demonstrations` and `update`, to learn from a data set, and `"offline"` in the `modes` of its card;
+    - `value`, and `has_value` in its card, if it bootstraps, so that other options' learners can bootstrap from it;
     - `stateful`, if it has optimizers or a replay buffer.
 
     If an option ends inside its episode, the value of the next state is its value under the next option. The batch then
@@ -586,29 +558,10 @@ class Learner(Level, nn.Module):
 
     Attributes:
         policy: the module that acts.
-        modes: what the learner can learn from: transitions that the agent collects (`train`), or a data set
-            (`offline`, for `mode=offline` and for `data=...` with `mode=train`).
-        takes: the features of actions that the learner can handle. Problems with other features are refused. With
-            `COMPONENTS`, see `hpamdp.components`. With `PARAMETER_BOUNDS`, pass the step to `specs.from_unit` and
-            `specs.to_unit`.
-        value_setting: setting that must be true for `value` to work. If None, `value` always works.
+        card: what the class declares.
         memory_key: key of the memory's state in a step, if the policy and `value` have a memory; else None.
         memory_lasts_an_episode: whether that memory remembers the whole episode, and not the option alone.
-        remembers_directions: whether the learner remembers the directions of actions that a problem reveals, unless it
-            has another memory or `augment=false`.
-        step_sizes: settings that give the sizes of what the policy writes into steps, beside the action.
-        needs_current_policy: whether each batch must be of the policy after the last update. A collector that collects
-            ahead is refused.
-        counts_durations: whether discounts are those of `step_discounts`. A run warns if the environment writes
-            durations and the learner does not count them.
         exploring_keys: those of the policy's states that only exploration reads. They do not keep it from an export.
-        explores_with: what an exploration beside the learner may change (`Exploration.changes`). With `actions`, the
-            learner may be `is_overruled`; with `rewards`, it may have a `bonus`. Other explorations are refused.
-        novelty_by: where a bonus for new states counts. `reward`: the agent adds it to the rewards of the batch.
-            `sample`: the learner adds it to the rewards that it samples. `plan`: the learner adds it to the rewards of
-            the states in its exploring plans.
-        knows_disagreement: whether the learner has an ensemble that predicts states, whose disagreement can be the
-            bonus of plans.
         is_overruled: whether an exploration sometimes takes another action than the policy's. Then `is_held` marks the
             steps in the batch, bool `[*B, T]`, and what the policy writes beside the action is not of that action. An
             exploration sets it.
@@ -619,19 +572,10 @@ class Learner(Level, nn.Module):
         while_compiling: makes a context for updates that are compiled first, which takes seconds. The run sets it.
     """
 
-    modes: ClassVar[tuple[str, ...]] = ("train",)
-    takes: ClassVar[frozenset[ActionFeature]] = frozenset()
-    value_setting: ClassVar[str | None] = None
+    card: ClassVar[LearnerCard] = LearnerCard()
     memory_key: str | None = None
     memory_lasts_an_episode: bool = False
-    remembers_directions: ClassVar[bool] = False
-    step_sizes: ClassVar[tuple[str, ...]] = ()
-    needs_current_policy: ClassVar[bool] = False
-    counts_durations: ClassVar[bool] = False
     exploring_keys: ClassVar[frozenset[str]] = frozenset()
-    explores_with: ClassVar[frozenset[str]] = frozenset()
-    novelty_by: ClassVar[Literal["reward", "sample", "plan"]] = "reward"
-    knows_disagreement: ClassVar[bool] = False
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
     is_overruled: bool = False
     bonus: Bonus | None = None
@@ -650,7 +594,7 @@ class Learner(Level, nn.Module):
             ActionFeature.PARAMETER_BOUNDS: specs.has_parameter_bounds,
         }
         for feature, is_present in present.items():
-            if is_present and feature not in self.takes:
+            if is_present and feature not in self.card.takes:
                 raise SettingError(
                     f"{type(self).__name__} cannot learn {feature.value}; hppo, for example, can (docs/spaces.md)"
                 )

@@ -118,8 +118,8 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
     if first_env > 0 and "first_env" not in constructor_arguments(config.env.cls):
         seed = int(np.random.SeedSequence((seed, first_env)).generate_state(1)[0])
     levels = (config.high, *config.learners)
-    needs = {need: True for level in levels for need in getattr(level.cls, "needs", ())}
-    flattens = bool(getattr(config.encoder.cls, "flattens", False))
+    needs = {need: True for level in levels for need in level.card.needs}
+    flattens = config.encoder.card.flattens
     env: PAMDPEnv = config.env.build(
         num_envs=num_envs, device=device, seed=seed, first_env=first_env, flatten_pictures=flattens, **needs
     )
@@ -237,7 +237,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     learners = [low.build(specs=each, device=device) for low, each in chosen]
     explorations = (
         []
-        if config.exploration.cls is None
+        if config.exploration.target is None
         else [config.exploration.build(learner=learner, device=device) for learner in learners]
     )
     agent = HierarchicalAgent(
@@ -262,7 +262,7 @@ def _practice(config: Config, selector: Selector | None) -> Practice | None:
     run = config.run
     practice = run.agent.practice
     if practice == "auto":
-        practises = selector is not None and selector.sees_state and not run.low.freeze
+        practises = selector is not None and selector.card.sees_state and not run.low.freeze
         lasts = run.agent.termination == "episode" and not compatibility.has_trips(config)
         practice = "curves" if practises and lasts and run.agent.sharing == "per_option" else 0
     if selector is None:

@@ -11,14 +11,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
+from hpamdp.cards import CallbackCard
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import replacing
 from hpamdp.messages import as_code, first_line, warn
+from hpamdp.run.callbacks_options import CARDS, PatienceOptions, TimeLimitOptions
 from hpamdp.run_files import BEST_NAME
-from hpamdp.settings import SettingError, Settings
+from hpamdp.settings import SettingError
 
 if TYPE_CHECKING:
     from hpamdp.run.trainer import Trainer
@@ -40,10 +41,10 @@ class Callback:
     `trainer.recorder.metrics.rows()`.
 
     Attributes:
-        needs_evaluations: whether the callback does nothing in a run without evaluations during training.
+        card: what the class declares.
     """
 
-    needs_evaluations: ClassVar[bool] = False
+    card: ClassVar[CallbackCard] = CallbackCard()
 
     def on_start(self, trainer: Trainer) -> None:
         """Act before the first batch, of a resumed run too. `trainer.resumed_from` is the resumed run's folder."""
@@ -82,6 +83,8 @@ class BestAgent(Callback):
     Attributes:
         best_score: score of the kept agent; None before the first evaluation.
     """
+
+    card = CARDS["BestAgent"]
 
     def __init__(self) -> None:
         self.best_score: float | None = None
@@ -145,20 +148,11 @@ class BestAgent(Callback):
         self.best_score = None if state["best_score"] == -math.inf else state["best_score"]
 
 
-class PatienceOptions(Settings):
-    """Settings of `Patience`."""
-
-    evaluations: PositiveInt = 10
-    """Evaluations without an improvement after which training ends."""
-    min_improvement: NonNegativeFloat = 0.0
-    """Least difference to the best score so far that counts as an improvement. An equal score never does."""
-
-
 class Patience(Callback):
     """End training after some evaluations without an improvement of the score."""
 
     Options = PatienceOptions
-    needs_evaluations = True
+    card = CARDS["Patience"]
 
     def __init__(self, options: PatienceOptions | None = None, **settings: Any) -> None:
         self.options: PatienceOptions = PatienceOptions.of(options, settings)
@@ -193,17 +187,11 @@ class Patience(Callback):
         self._best, self._evaluations = state["best"], state["evaluations"]
 
 
-class TimeLimitOptions(Settings):
-    """Settings of `TimeLimit`."""
-
-    minutes: PositiveFloat = 60.0
-    """Minutes of training after which it ends, evaluations and the parts before a resumption included."""
-
-
 class TimeLimit(Callback):
     """End training after some minutes of wall time."""
 
     Options = TimeLimitOptions
+    card = CARDS["TimeLimit"]
 
     def __init__(self, options: TimeLimitOptions | None = None, **settings: Any) -> None:
         self.options: TimeLimitOptions = TimeLimitOptions.of(options, settings)

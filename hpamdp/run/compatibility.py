@@ -1,7 +1,7 @@
 """Check that the parts of a run go together, by two lists of rules, before anything is built.
 
 A rule returns one line with the settings to change, or None if the run satisfies it. Rules read only settings and
-attributes of classes, so they can be checked without torch.
+cards of classes, so they can be checked without torch.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
+from hpamdp.cards import CallbackCard
 from hpamdp.complaints import as_json
 from hpamdp.config.components import (
     GROUPS,
@@ -19,13 +20,11 @@ from hpamdp.config.components import (
     Component,
     constructor_arguments,
     is_passed,
-    settings_model,
-    takes_settings_model,
 )
 from hpamdp.config.compose import RECIPE, setting_of, settings_in
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config, RunConfig
-from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.facts import ProblemFacts, ProblemOptions
 from hpamdp.pickling import why_unsendable
 from hpamdp.settings import OnlyWith, OwnSteps
 
@@ -195,9 +194,9 @@ def _conditions(config: Config, name: str) -> list[str]:
     With `mode=offline`, a setting marked `OwnSteps` needs another mode, and nothing else is named.
     """
     component, setting = _component_and_setting(config, name)
-    if component is None or component.cls is None or not takes_settings_model(component.cls):
+    if component is None or component.model is None:
         return []
-    field = settings_model(component.cls).model_fields.get(setting)
+    field = component.model.model_fields.get(setting)
     marks = [] if field is None else field.metadata
     if config.run.mode == "offline" and any(isinstance(mark, OwnSteps) for mark in marks):
         return ["with mode=train"]
@@ -229,8 +228,10 @@ def with_acting_learners(config: Config, facts: ProblemFacts) -> Config:
 
 def facts_of(config: Config) -> ProblemFacts | None:
     """Return the facts about the problem that follow from its settings; None if only a built environment has them."""
-    facts = getattr(config.env.cls, "facts", None)
     options = config.env.as_model
+    if isinstance(config.env.target, str):
+        return options.facts(config.env.class_name) if isinstance(options, ProblemOptions) else None
+    facts = getattr(config.env.target, "facts", None)
     return None if facts is None or options is None else facts(options)
 
 
@@ -279,17 +280,17 @@ def _memory(component: Component) -> str | None:
 
 def _remembers_directions(low: Component) -> bool:
     """Return whether a learner remembers revealed directions."""
-    can = getattr(low.cls, "remembers_directions", False)
+    can = low.card.remembers_directions
     return can and low.settings.get("memory") == "none" and low.settings.get("augment") is not False
 
 
 def has_trips(config: Config) -> bool:
     """Return whether an episode of the problem is a session of several trips."""
-    return bool(getattr(config.env.cls, "has_trips", False))
+    return config.env.card.has_trips
 
 
 def _needs(component: Component) -> tuple[str, ...]:
-    return getattr(component.cls, "needs", ())
+    return component.card.needs
 
 
 # Rules about the values of the run.
@@ -313,7 +314,7 @@ def option_lengths_go_with_chosen(config: Config) -> str | None:
             return None
         given = f"agent.option_lengths={as_json(lengths)}"
         return f"{given}: goes with agent.termination=chosen only, not with {termination}"
-    if config.run.mode != "eval" and config.data.cls is not None:
+    if config.run.mode != "eval" and config.data.target is not None:
         return (
             f"agent.termination=chosen: the decisions of {config.data} have no lengths to learn from; use data=none or "
             "another agent.termination"
@@ -332,21 +333,21 @@ def stop_score_needs_evaluations(config: Config) -> str | None:
 
 def callbacks_have_evaluations(config: Config) -> str | None:
     """Require evaluations during training if a callback counts them."""
-    return need_of_evaluations(config, [(f"{each}:", each.cls) for each in config.callbacks])
+    return need_of_evaluations(config, [(f"{each}:", each.card) for each in config.callbacks])
 
 
-def need_of_evaluations(config: Config, callbacks: Iterable[tuple[str, object]]) -> str | None:
+def need_of_evaluations(config: Config, callbacks: Iterable[tuple[str, CallbackCard]]) -> str | None:
     """Return which of these callbacks counts evaluations that the run does not make, or None.
 
     Args:
         config: config of the run.
-        callbacks: each with its name.
+        callbacks: the name and the card of each.
     """
     run = config.run
     if run.mode == "eval" or run.eval_every > 0:
         return None
     every = "offline.eval_every" if run.mode == "offline" else "eval.every"
-    counting = [name for name, each in callbacks if getattr(each, "needs_evaluations", False)]
+    counting = [name for name, card in callbacks if card.needs_evaluations]
     return f"{counting[0]} needs evaluations during training; set {every} above 0" if counting else None
 
 
@@ -390,7 +391,7 @@ def data_and_frozen_learners_have_single_trips(config: Config) -> str | None:
     """Refuse what takes an episode for a single trip: data sets, and learners that play whole episodes."""
     if not has_trips(config) or config.run.mode == "eval":
         return None
-    if config.data.cls is not None:
+    if config.data.target is not None:
         return f"{config.data}: {config.env} has sessions of trips, which data sets do not hold; use data=none"
     if config.run.low.freeze:
         return f"low.freeze=true: plays whole episodes, but {config.env} has sessions of trips; use low.freeze=false"
@@ -399,7 +400,7 @@ def data_and_frozen_learners_have_single_trips(config: Config) -> str | None:
 
 def uncounted_durations(config: Config) -> str | None:
     """Return a warning if a level discounts all steps alike, for a problem whose steps take different times."""
-    blind = [level for level in _discounting(config) if not getattr(level.cls, "counts_durations", False)]
+    blind = [level for level in _discounting(config) if not level.card.counts_durations]
     if config.run.mode == "eval" or not blind:
         return None
     return f"{blind[0]}: discounts all steps alike, but those of {config.env} take different times; gamma=1 avoids that"
@@ -407,7 +408,7 @@ def uncounted_durations(config: Config) -> str | None:
 
 def counting_durations(config: Config) -> list[Component]:
     """Return the levels whose discounts count how long steps take."""
-    return [level for level in _discounting(config) if getattr(level.cls, "counts_durations", False)]
+    return [level for level in _discounting(config) if level.card.counts_durations]
 
 
 def _discounting(config: Config) -> list[Component]:
@@ -461,7 +462,7 @@ def check_directions(config: Config) -> None:
 def explorations_have_steps(config: Config) -> str | None:
     """Refuse exploration in a run whose learners take no steps of their own to learn from."""
     exploration, run = config.exploration, config.run
-    if exploration.cls is None or run.mode == "eval":
+    if exploration.target is None or run.mode == "eval":
         return None
     if run.mode == "offline":
         return f"{exploration}: mode=offline takes no steps; use exploration=none"
@@ -473,11 +474,11 @@ def explorations_have_steps(config: Config) -> str | None:
 def learners_take_the_exploration(config: Config) -> str | None:
     """Require learners that can learn from other actions than their own, or with a bonus for new states."""
     exploration = config.exploration
-    if exploration.cls is None:
+    if exploration.target is None:
         return None
-    changes = getattr(exploration.cls, "changes", "")
+    changes = exploration.card.changes
     for low in config.learners:
-        if changes not in getattr(low.cls, "explores_with", ()):
+        if changes not in low.card.explores_with:
             return f"{exploration}: changes {changes}, which {low} does not take; use exploration=none or another low"
     return None
 
@@ -487,23 +488,23 @@ def learners_take_the_exploration(config: Config) -> str | None:
 
 def offline_runs_have_data(config: Config) -> str | None:
     """Require a data set with `mode=offline`."""
-    if config.run.mode == "offline" and config.data.cls is None:
+    if config.run.mode == "offline" and config.data.target is None:
         return "mode=offline: data=none leaves nothing to learn from; choose a data set"
     return None
 
 
 def levels_support_the_mode(config: Config) -> str | None:
     """Require learners and a selector that can learn from the run's own steps or data set."""
-    mode, has_data = config.run.mode, config.data.cls is not None
+    mode, has_data = config.run.mode, config.data.target is not None
     sources = {"train": "its own steps", "offline": "data sets"}
     for low in config.learners:
-        modes: tuple[str, ...] = getattr(low.cls, "modes", ())
+        modes: tuple[str, ...] = low.card.modes
         learns = f"{low} learns from {' and '.join(sources[known] for known in modes)}"
         if mode == "train" and "train" not in modes:
             return f"mode=train: {learns} only; use mode=offline and a data set, or another low"
         if mode != "eval" and has_data and "offline" not in modes:
             return f"{config.data}: {learns} only; use data=none, or another low"
-    if mode == "offline" and "offline" not in getattr(config.high.cls, "modes", ("offline",)):
+    if mode == "offline" and "offline" not in config.high.card.modes:
         return f"{config.high}: learns from its own choices only; use mode=train, or another high"
     if mode == "offline" and config.run.low.freeze:
         return "low.freeze=true: mode=offline trains the learners; use low.freeze=false"
@@ -523,13 +524,13 @@ def n_step_fits_a_batch(config: Config) -> str | None:
 
 def compared_learners_have_values(config: Config) -> str | None:
     """Require learners with values if the selector compares them."""
-    if not getattr(config.high.cls, "asks_learners", False):
+    if not config.high.card.asks_learners:
         return None
     for low in config.learners:
-        setting = getattr(low.cls, "value_setting", None)
+        setting = low.card.value_setting
         if setting is not None and not low.settings[setting]:
             return f"{config.high}: {low} has no value to compare without low.{setting}=true"
-        if not _overrides(low.cls, "value", base="hpamdp.policies.base"):
+        if not low.card.has_value:
             return f"{config.high}: {low} has no value to compare; use another low or another high"
     return None
 
@@ -537,7 +538,7 @@ def compared_learners_have_values(config: Config) -> str | None:
 def learners_ask_each_other(config: Config) -> str | None:
     """Refuse learners that bootstrap from one without a value, or compare values on different scales."""
     why_ends = _why_options_end(config)
-    is_compared = getattr(config.high.cls, "asks_learners", False)
+    is_compared = config.high.card.asks_learners
     if config.run.mode == "eval" or (why_ends is None and not is_compared):
         return None
     without = [low for low in config.learners if not _has_next_value(low)]
@@ -574,13 +575,13 @@ def _values_end_with_trips(config: Config) -> bool:
 
 def _value_setting(low: Component) -> str | None:
     """Return the setting that lets other learners bootstrap from this one; None if they always can, or never."""
-    return getattr(low.cls, "value_setting", None) or ("end_values" if "end_values" in low.settings else None)
+    return low.card.value_setting or ("end_values" if "end_values" in low.settings else None)
 
 
 def _has_next_value(low: Component) -> bool:
     """Return whether other learners can bootstrap from this one."""
     setting = _value_setting(low)
-    return _overrides(low.cls, "value", base="hpamdp.policies.base") and (setting is None or low.settings[setting])
+    return low.card.has_value and (setting is None or low.settings[setting])
 
 
 # Rules about what the levels remember.
@@ -588,7 +589,7 @@ def _has_next_value(low: Component) -> bool:
 
 def memories_have_own_steps(config: Config) -> str | None:
     """Refuse data sets for a level with a memory, whose states only a policy that acts can store."""
-    if config.run.mode == "eval" or config.data.cls is None:
+    if config.run.mode == "eval" or config.data.target is None:
         return None
     for level in _levels(config):
         if _memory(level) is not None:
@@ -623,7 +624,7 @@ def learners_have_the_same_memory(config: Config) -> str | None:
 
 def learners_write_the_same_sizes(config: Config) -> str | None:
     """Refuse learners whose policies would write the same entry of a step in different sizes."""
-    for name in dict.fromkeys(name for low in config.learners for name in getattr(low.cls, "step_sizes", ())):
+    for name in dict.fromkeys(name for low in config.learners for name in low.card.step_sizes):
         values = list(dict.fromkeys(low.settings[name] for low in config.learners if name in low.settings))
         if len(values) > 1:
             given = " and ".join("null" if value is None else str(value) for value in values)
@@ -639,9 +640,9 @@ def collector_fits_the_run(config: Config) -> str | None:
     collector, run = config.collector, config.run
     if run.mode == "eval":  # which collects nothing
         return None
-    if run.mode == "offline" and getattr(collector.cls, "has_workers", False):
+    if run.mode == "offline" and collector.card.has_workers:
         return f"{collector}: mode=offline takes no steps; use collector=single"
-    package: str | None = getattr(collector.cls, "package", None)
+    package: str | None = collector.card.package
     if package is not None and importlib.util.find_spec(package) is None:
         return f"{collector}: {package} is not installed; pip install hpamdp[{package}]"
     num_workers = collector.settings.get("num_workers", 1)
@@ -652,7 +653,7 @@ def collector_fits_the_run(config: Config) -> str | None:
         )
     if collector.settings.get("ahead", False):
         for low in config.learners:
-            if getattr(low.cls, "needs_current_policy", False):
+            if low.card.needs_current_policy:
                 return (
                     f"collector.ahead=true: {low} learns from steps of its current policy alone, and batches ahead are "
                     "of the one before; use collector.ahead=false"
@@ -662,10 +663,10 @@ def collector_fits_the_run(config: Config) -> str | None:
 
 def workers_get_what_python_passed(config: Config) -> str | None:
     """Require that objects and classes from Python code can be sent to a collector's workers."""
-    if config.run.mode == "eval" or not getattr(config.collector.cls, "has_workers", False):
+    if config.run.mode == "eval" or not config.collector.card.has_workers:
         return None
     parts = (config.env, config.high, *config.learners)
-    passed: dict[str, object] = {str(part): part.cls for part in parts if part.cls is not None and is_passed(part.cls)}
+    passed: dict[str, object] = {str(part): part.cls for part in parts if is_passed(part.target)}
     if config.env.objects:
         passed["env"] = config.env.objects
     for what, value in passed.items():
@@ -681,7 +682,7 @@ def workers_get_what_python_passed(config: Config) -> str | None:
 def workers_fit_the_problem(config: Config, problem: ProblemFacts) -> str | None:
     """Refuse workers for environments that start processes, and batches ahead if a scale is learned between them."""
     settings = config.collector.settings
-    if config.run.mode == "eval" or not getattr(config.collector.cls, "has_workers", False):
+    if config.run.mode == "eval" or not config.collector.card.has_workers:
         return None
     if not problem.is_shardable:
         return f"{config.collector}: {config.env} starts processes itself; use collector=single"
@@ -708,10 +709,13 @@ def problem_provides_needs(config: Config) -> str | None:
 
 def lack_of(need: str, config: Config) -> str | None:
     """Return why the problem does not provide what a level needs, such as `oracle`; None if it does."""
-    assert config.env.cls is not None
-    facts = facts_of(config)
-    is_known = facts is None or getattr(facts, f"has_{need}", True)
-    if is_known and need in constructor_arguments(config.env.cls):
+    facts, fact = facts_of(config), f"has_{need}"
+    if hasattr(facts, fact):
+        is_provided = getattr(facts, fact)
+    else:
+        assert config.env.cls is not None
+        is_provided = need in constructor_arguments(config.env.cls)
+    if is_provided:
         return None
     lacks = {"oracle": "has no planner to ask", "human": "has no human data"}
     return f"{config.env} {lacks.get(need, f'takes no argument {need}')}"
@@ -731,10 +735,10 @@ def grouping_fits_levels(config: Config, problem: ProblemFacts) -> str | None:
 
 def levels_take_pictures(config: Config, problem: ProblemFacts) -> str | None:
     """Refuse pictures with a level that cannot encode them: they are flattened only if the user asks for it."""
-    if getattr(config.encoder.cls, "flattens", False) or not problem.has_pictures:
+    if config.encoder.card.flattens or not problem.has_pictures:
         return None
     for level in _levels(config):
-        if level.cls is not None and not getattr(level.cls, "takes_pictures", False):
+        if level.target is not None and not level.card.takes_pictures:
             return (
                 f"{level}: {config.env} observes pictures, which it has no encoder for; use another {level.group}, or "
                 "encoder=mlp to flatten them"
@@ -744,7 +748,7 @@ def levels_take_pictures(config: Config, problem: ProblemFacts) -> str | None:
 
 def data_sets_have_no_pictures(config: Config, problem: ProblemFacts) -> str | None:
     """Refuse data sets with pictures: their observations are vectors."""
-    if config.data.cls is None or not problem.has_pictures or getattr(config.encoder.cls, "flattens", False):
+    if config.data.target is None or not problem.has_pictures or config.encoder.card.flattens:
         return None
     return f"{config.data}: {config.env} observes pictures, which data sets do not hold; use data=none"
 
@@ -752,7 +756,7 @@ def data_sets_have_no_pictures(config: Config, problem: ProblemFacts) -> str | N
 def encoder_has_pictures(config: Config, problem: ProblemFacts) -> str | None:
     """Refuse an encoder of pictures, or its settings, if the problem has none."""
     encoder = config.encoder
-    if problem.has_pictures or getattr(encoder.cls, "flattens", False):
+    if problem.has_pictures or encoder.card.flattens:
         return None
     if encoder.name != AUTO_ENCODER:
         return f"{encoder}: {config.env} observes no pictures; use encoder={AUTO_ENCODER}"
@@ -765,14 +769,14 @@ def encoder_has_pictures(config: Config, problem: ProblemFacts) -> str | None:
 
 def selector_fits_the_choice(config: Config, problem: ProblemFacts) -> str | None:
     """Require a selector if the agent chooses options, and refuse one otherwise."""
-    has_selector, has_choice = config.high.cls is not None, _has_choice(config, problem)
+    has_selector, has_choice = config.high.target is not None, _has_choice(config, problem)
     if has_selector and not has_choice:
         if not problem.option_names:
             return f"{config.high}: {config.env} has no options to choose; use high=none"
-        choice = getattr(config.env.cls, "choice_setting", "")
+        choice = config.env.card.choice_setting
         return f"{config.high}: {config.env} leaves nothing to choose; use high=none or {choice}"
     if not has_selector and has_choice:
-        without = getattr(config.env.cls, "no_choice_setting", "")
+        without = config.env.card.no_choice_setting
         without = f" or {without}" if without else ""
         return f"high=none: {config.env} needs a selector; use another high{without}"
     if config.run.low.freeze and not has_choice:
@@ -801,17 +805,17 @@ def options_end_where_they_may(config: Config, problem: ProblemFacts) -> str | N
     given, has_choice = f"agent.termination={termination}", _has_choice(config, problem)
     if not (has_choice and problem.can_change_option):
         why = "keeps an option for an episode" if has_choice else "has no options"
-        change = getattr(config.env.cls, "change_setting", "")
+        change = config.env.card.change_setting
         change = f" or {change}" if has_choice and change else ""
         return f"{given}: {config.env} {why}; use agent.termination=episode{change}"
     if config.run.low.freeze:
         return f"{given}: low.freeze=true plays whole episodes; use agent.termination=episode"
-    if getattr(high.cls, "is_bandit", False):
+    if high.card.is_bandit:
         return (
             f"{given}: {high} is a bandit, which counts what an option returns and nothing of what follows it; use "
             "agent.termination=episode, high=meta_critic or high=actor"
         )
-    if termination == "learned" and not getattr(high.cls, "ends_options", False):
+    if termination == "learned" and not high.card.ends_options:
         return (
             f"{given}: {high} does not decide where options end; use high=option_critic, high=meta_critic or "
             "agent.termination=steps"
@@ -823,8 +827,8 @@ def selector_chooses_lengths(config: Config, problem: ProblemFacts) -> str | Non
     """Require a selector that can choose lengths with `agent.termination=chosen`."""
     if config.run.agent.termination != "chosen":
         return None
-    why: str | None = getattr(config.high.cls, "lengths_refusal", None)
-    if getattr(config.high.cls, "asks_learners", False):
+    why: str | None = config.high.card.lengths_refusal
+    if config.high.card.asks_learners:
         why = "compares the learners' values, which do not depend on an option's length"
     elif _needs(config.high):
         why = "chooses as the environment's entries say, which have no lengths"
@@ -842,12 +846,6 @@ def per_option_names_options(config: Config, problem: ProblemFacts) -> str | Non
     if config.low_of and config.run.agent.sharing == "shared":
         return "low.per_option: agent.sharing=shared has one learner for all; use agent.sharing=per_option"
     return None
-
-
-def _overrides(cls: type | None, method: str, base: str) -> bool:
-    """Return whether a class overrides a method of the module `base`."""
-    owner = next((each for each in getattr(cls, "__mro__", ()) if method in vars(each)), None)
-    return owner is not None and owner.__module__ != base
 
 
 def _has_choice(config: Config, problem: ProblemFacts) -> bool:

@@ -12,15 +12,16 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from hpamdp.messages import first_line, warn
 from hpamdp.metrics_file import FRAMES, WALL_SECONDS
+from hpamdp.run.loggers_options import CARDS, WandbOptions
 from hpamdp.run_files import TENSORBOARD_NAME, WANDB_NAME
-from hpamdp.settings import SettingError, Settings
+from hpamdp.settings import SettingError
 
 
 class EarlierRun(NamedTuple):
@@ -32,8 +33,6 @@ class EarlierRun(NamedTuple):
 
 # Seconds that an online wandb run may keep the training waiting, at its start and at its end.
 _WANDB_START, _WANDB_FINISH = 20.0, 60.0
-
-Name = Annotated[str, Field(min_length=1)]
 WandbMode = Literal["offline", "online", "disabled"]
 # Values of WANDB_MODE, with two older names of wandb.
 _WANDB_MODES: dict[str, WandbMode] = {
@@ -131,6 +130,8 @@ class CSVLogger:
         output_dir: the run's folder, which has these files.
     """
 
+    card = CARDS["CSVLogger"]
+
     def __init__(self, output_dir: Path) -> None:
         self.output_dir = output_dir
 
@@ -162,6 +163,8 @@ class TensorboardLogger:
         output_dir: the run's folder; the events go to `tensorboard` in it.
         earlier: the run that is continued, if any.
     """
+
+    card = CARDS["TensorboardLogger"]
 
     def __init__(self, output_dir: Path, earlier: EarlierRun | None = None) -> None:
         from tensorboard.compat.proto.event_pb2 import Event
@@ -233,21 +236,6 @@ class TensorboardLogger:
             RecordWriter(file).write(event.SerializeToString())
 
 
-class WandbOptions(Settings):
-    """Settings of `WandbLogger`. `project`, `entity`, `group` and `name` go to `wandb.init`."""
-
-    project: Name | None = "hpamdp"
-    """Project of the run. If null, wandb chooses."""
-    entity: Name | None = None
-    """User or team of the run. If null, wandb chooses."""
-    group: Name | None = None
-    """Group of runs to show together."""
-    name: Name | None = None
-    """Name of the run. If null, wandb chooses."""
-    mode: Literal["auto", "offline", "online", "disabled"] = "auto"
-    """If `auto`, `WANDB_MODE` decides. If that is not set, the mode is online with an API key and offline without."""
-
-
 class WandbLogger:
     """Log to Weights & Biases, without asking for input or keeping a run from starting.
 
@@ -261,7 +249,7 @@ class WandbLogger:
     """
 
     Options = WandbOptions
-    guarded_settings: ClassVar[tuple[str, ...]] = ("entity", "mode=online")
+    card = CARDS["WandbLogger"]
 
     def __init__(
         self,

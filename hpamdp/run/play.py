@@ -170,7 +170,7 @@ def described(folder: Path, player: Player) -> dict[str, Any] | None:
     if form is None:
         return None
     config = player.config
-    title = config.low.name if config.high.cls is None else f"{config.high.name} + {config.low.name}"
+    title = config.low.name if config.high.target is None else f"{config.high.name} + {config.low.name}"
     score: Any = saved_summary(folder).get("score")
     options = json.loads(json.dumps(dict(config.env.settings)))
     return {

@@ -226,10 +226,15 @@ class Recorder:
     def _one_option(self) -> list[str]:
         """Return a line if the selector cannot tell states apart, in which another option may be better."""
         selector = self.parts.agent.selector
-        if selector is None or not selector.is_bandit or selector.sees_state or selector.memory_key is not None:
+        if (
+            selector is None
+            or not selector.card.is_bandit
+            or selector.card.sees_state
+            or selector.memory_key is not None
+        ):
             return []
         learners = [each for each in self.parts.agent.learners if isinstance(each, Learner)]
-        have_value = all(type(each).value is not Learner.value and each.value_setting is None for each in learners)
+        have_value = all(each.card.has_value and each.card.value_setting is None for each in learners)
         better = "high=value" if have_value else "high=meta_critic"
         return [f"{self.config.high} holds the option that is best on average; {better} chooses one for each episode"]
 

@@ -19,7 +19,7 @@ from hpamdp.config.outside_jobs import searched, searching
 from hpamdp.config.saved import choices_of, read_saved, upgraded
 from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.env.registration import SOURCE_SETTINGS
+from hpamdp.env.facts import SOURCE_SETTINGS
 from hpamdp.messages import warn
 from hpamdp.run import checkpoint, compatibility
 from hpamdp.run.assemble import choose_selector

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
+from hpamdp.cards import CallbackCard, outside_card
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import needs_trust
 from hpamdp.config.schema import Config, RunConfig
@@ -142,7 +143,7 @@ def _all_callbacks(config: Config, given: Sequence[Callback]) -> list[Callback]:
         ConfigError: a given object is no callback, or needs evaluations that the run does not make.
     """
     check_callbacks(given)
-    complaint = need_of_evaluations(config, [(type(each).__name__, each) for each in given])
+    complaint = need_of_evaluations(config, [(type(each).__name__, each.card) for each in given])
     if complaint is not None:
         raise ConfigError(f"callbacks: {complaint}")
     callbacks = [*(chosen.build() for chosen in config.callbacks), *given]
@@ -161,6 +162,9 @@ def check_callbacks(given: Sequence[object]) -> None:
         if not isinstance(each, Callback):
             what = f"{each.__name__}, a class" if isinstance(each, type) else type(each).__name__
             raise ConfigError(f"callbacks: must be objects of subclasses of Callback, not {what}")
+        outside = outside_card(type(each), CallbackCard)
+        if outside is not None:
+            raise ConfigError(f"callbacks: {type(each).__name__}: {outside}")
 
 
 def _is_in(source: Path | None, folder: Path | None) -> bool:

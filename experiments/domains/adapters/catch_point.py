@@ -9,6 +9,7 @@ from torch import Tensor
 
 from adapters import DirectAdapter, chosen, limited
 from hpamdp.env.catch_point import rules
+from hpamdp.env.catch_point.options import PUBLISHED_CATCHES
 
 DOMAINS = ("catch_point",)
 
@@ -28,9 +29,7 @@ class DomainAdapter(DirectAdapter):
         self, state: rules.CatchPointState, steps: Sequence[dict[str, Any]]
     ) -> tuple[rules.CatchPointState, dict[str, Tensor]]:
         discrete, parameters = chosen(steps, state.x)
-        after, reward = rules.act(
-            state, discrete, parameters.squeeze(-1), catches=rules.PUBLISHED_CATCHES, late_end=True
-        )
+        after, reward = rules.act(state, discrete, parameters.squeeze(-1), catches=PUBLISHED_CATCHES, late_end=True)
         return limited(after, 25, rules.TIME_LIMIT), {"reward": reward}
 
     def observe(self, state: rules.CatchPointState) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from adapters import DirectAdapter, chosen
 from hpamdp.env.gym_hybrid import rules
+from hpamdp.env.gym_hybrid.options import PUBLISHED_STEPS
 
 DOMAINS = ("moving", "sliding")
 
@@ -38,8 +39,8 @@ class DomainAdapter(DirectAdapter):
         parameter = parameters.squeeze(-1)
         low, high = (torch.tensor([*side, 0.0]).to(parameter) for side in (rules.PARAMETER_LOW, rules.PARAMETER_HIGH))
         parameter = parameter.clamp(low[discrete], high[discrete])
-        after, reward = rules.act(state, discrete, parameter, slides=self.slides, max_steps=rules.PUBLISHED_STEPS)
+        after, reward = rules.act(state, discrete, parameter, slides=self.slides, max_steps=PUBLISHED_STEPS)
         return after, {"reward": reward}
 
     def observe(self, state: rules.VehicleState) -> Tensor:
-        return rules.observe(state, rules.PUBLISHED_STEPS)
+        return rules.observe(state, PUBLISHED_STEPS)

@@ -17,12 +17,12 @@ from hpamdp.data.errors import DataError
 from hpamdp.data.human import minari, played_file, statistics, validation
 from hpamdp.data.human.download import download
 from hpamdp.data.human.episodes import scores_by_person, select
+from hpamdp.data.human.options import SHA256
 from hpamdp.data.human.released_file import (
     EPISODES_PER_BLOCK,
     FILE_NAME,
     PATH_VARIABLE,
     QUIRKS,
-    SHA256,
     HumanData,
     default_path,
     read,

@@ -18,7 +18,8 @@ from hpamdp.data import memmap
 from hpamdp.data.errors import DataError
 from hpamdp.data.export import write_memmap
 from hpamdp.data.human.episodes import check_conditions, select
-from hpamdp.data.human.released_file import SHA256, check_sum, default_path, load_bytes, read
+from hpamdp.data.human.options import SHA256
+from hpamdp.data.human.released_file import check_sum, default_path, load_bytes, read
 from hpamdp.data.human.transitions import transitions
 from hpamdp.data.row_checks import TRAJECTORY, check_actions, check_transitions
 from hpamdp.env.boatdock.environment import BoatDockEnv

@@ -6,50 +6,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import PositiveInt
 from tensordict import TensorDict
 
 from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.errors import DataError
 from hpamdp.data.human import played_file
 from hpamdp.data.human.episodes import select
-from hpamdp.data.human.released_file import SHA256, HumanData, read
+from hpamdp.data.human.options import CARDS, HumanOptions, PeoplesOptions, PlayedOptions
+from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.data.human.rest_to_rest import to_rest_to_rest
 from hpamdp.data.human.transitions import decisions, transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.settings import SettingError, Settings
-
-
-class PeoplesOptions(Settings):
-    """Settings that select people's episodes and the form of their presses."""
-
-    successes: bool = False
-    """Take only episodes that ended in the dock."""
-    best_people: PositiveInt | None = None
-    """Take only episodes of this many people with the highest mean scores. If null, of all people."""
-    rest_to_rest: bool = True
-    """Convert interrupted presses to rest-to-rest presses, the only presses that the environment has."""
-
-
-class HumanOptions(PeoplesOptions):
-    """Settings of `HumanDemonstrations`."""
-
-    path: str | None = None
-    """The released file. If null, the path in $HPAMDP_HUMAN_DATA, or else the downloaded file."""
-    checksum: str | None = SHA256
-    """The SHA-256 that the file must have, by default the released file's. If null, any file is accepted."""
-    complete: bool = False
-    """Take only episodes with a complete log of presses."""
-
-
-class PlayedOptions(PeoplesOptions):
-    """Settings of `PlayedDemonstrations`."""
-
-    path: str = "played.jsonl"
-    """The file of episodes. Lines without a valid episode are left out, with a warning."""
-    practice: bool = False
-    """Also take practice episodes."""
+from hpamdp.settings import SettingError
 
 
 class HumanDemonstrations(Demonstrations):
@@ -70,6 +39,7 @@ class HumanDemonstrations(Demonstrations):
     """
 
     Options = HumanOptions
+    card = CARDS["HumanDemonstrations"]
 
     def __init__(self, env: object, options: HumanOptions | None = None, **settings: Any) -> None:
         self.options: HumanOptions = HumanOptions.of(options, settings)
@@ -92,6 +62,7 @@ class PlayedDemonstrations(Demonstrations):
     """
 
     Options = PlayedOptions
+    card = CARDS["PlayedDemonstrations"]
 
     def __init__(self, env: object, options: PlayedOptions | None = None, **settings: Any) -> None:
         self.options: PlayedOptions = PlayedOptions.of(options, settings)

@@ -19,12 +19,12 @@ from tensordict import TensorDict
 
 from hpamdp.data.errors import DataError
 from hpamdp.data.human import schema
+from hpamdp.data.human.options import SHA256
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.files import read_regular
 from hpamdp.messages import reason_of
 
 FILE_NAME = "BDtrajectory40.mat"
-SHA256 = "9de16874b43de9e377c2c10749cb2bd435a6db3ca7cead445b826d64ec399d20"
 PATH_VARIABLE = "HPAMDP_HUMAN_DATA"  # environment variable with the file's path
 
 TICKS_PER_SECOND = 60

@@ -26,13 +26,12 @@ from hpamdp.env.boatdock import harbour, kernel, planner, task
 from hpamdp.env.boatdock.form import BoatForm
 from hpamdp.env.boatdock.human_choices import choice_probabilities, human_spec
 from hpamdp.env.boatdock.layouts import layout_columns
-from hpamdp.env.boatdock.options import BoatDockOptions
+from hpamdp.env.boatdock.options import CARDS, BoatDockOptions
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.boatdock.task import BoatState
 from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.play_page import EpisodeError
 from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
@@ -79,8 +78,8 @@ class BoatDockEnv(BatchedEnv[BoatState]):
     """
 
     Options = BoatDockOptions
+    card = CARDS["BoatDockEnv"]
     options: BoatDockOptions
-    guarded_settings = ("recording",)
     parameter_dims = (1,) * task.NUM_KEYS
     parameter_low = (0.0,) * task.NUM_KEYS
     parameter_high = (task.MAX_DURATION,) * task.NUM_KEYS
@@ -91,9 +90,6 @@ class BoatDockEnv(BatchedEnv[BoatState]):
     start_keys = frozenset({"start", "goal", "controller", "keymap"})
     action_names = ("key", "durations")
     row_kernel = staticmethod(kernel.advance)
-    choice_setting: ClassVar[str] = "env.controller=choose"
-    change_setting: ClassVar[str] = "env.switch_cost=0.2"
-    no_choice_setting: ClassVar[str] = "env.controller=congruent (or incongruent, random)"
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score"),
         Metric("human_normalised", "human-normalised score"),
@@ -127,11 +123,6 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         super().__init__(
             num_envs, options=options, device=device, seed=seed, first_env=first_env, oracle=oracle, **settings
         )
-
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings."""
-        return options.facts(cls.__name__)
 
     def _prepare(self) -> None:
         options = self.options

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
+from hpamdp.cards import ProblemCard
 from hpamdp.env.boatdock.task import (
     CONTROLLER_DEGREES,
     CONTROLLERS,
@@ -18,15 +19,15 @@ from hpamdp.env.boatdock.task import (
     RewardForm,
     Rules,
 )
-from hpamdp.env.facts import ProblemFacts
-from hpamdp.settings import Fraction, FromList, Settings
+from hpamdp.env.facts import ProblemFacts, ProblemOptions
+from hpamdp.settings import Fraction, FromList
 
 Degrees = Annotated[tuple[float, ...], FromList]
 _MOST_MOTOR_NOISE = 10.0
 _RESERVED = ("choose", "random")  # other values of `controller`
 
 
-class BoatDockOptions(Settings):
+class BoatDockOptions(ProblemOptions):
     """Settings of `BoatDockEnv`."""
 
     controller: str = "choose"
@@ -162,3 +163,14 @@ class BoatDockOptions(Settings):
             if not 0.0 <= noise <= _MOST_MOTOR_NOISE:
                 raise ValueError(f"motor_noise={noise}: must lie between 0 and {_MOST_MOTOR_NOISE:g}")
         return self
+
+
+CARDS = {
+    "BoatDockEnv": ProblemCard(
+        options=BoatDockOptions,
+        guarded_settings=("recording",),
+        choice_setting="env.controller=choose",
+        change_setting="env.switch_cost=0.2",
+        no_choice_setting="env.controller=congruent (or incongruent, random)",
+    )
+}

@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from pydantic import PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -25,36 +24,11 @@ from hpamdp.env import counter_rng
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.boatdock_released import rules as released
+from hpamdp.env.boatdock_released.options import CARDS, ReleasedBoatDockOptions
 from hpamdp.env.boatdock_released.rules import ReleasedState
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.state_columns import check_range, where
-from hpamdp.settings import SettingError, Settings
-
-
-class ReleasedBoatDockOptions(Settings):
-    """Settings of `ReleasedBoatDockEnv`."""
-
-    controller: Literal["congruent", "incongruent"] = "congruent"
-    """The controller. The agent cannot choose it, so use high=none."""
-    keymap: Literal[0, 1] = 0
-    """Key map of the incongruent controller. If 0, it is sampled from {0, 1} at every reset until it is 1.
-
-    Key map 0 has the keys of key map 2 in env=boatdock. The congruent controller observes -1.
-    """
-    test_mode: Literal[0, 1, None] = None
-    """If 1, only layouts with a bearing within 30 degrees of the incongruent controller's directions.
-
-    If 0, only the other layouts. If null, all layouts.
-    """
-    frozen_layouts: bool = True
-    """Keep the layout of the first reset for all episodes, as released. If false, every episode has a new layout."""
-    observation: Literal["pixels", "scaled"] = "pixels"
-    """`pixels` `[N, 15]` as released, or `scaled` `[N, 17]` to about [-1, 1] with goal - boat appended.
-
-    If scaled, fuel is log(1 + fuel / 5).
-    """
-    max_steps: PositiveInt = 999
-    """Number of steps after which an episode is truncated. The released code uses 999."""
+from hpamdp.settings import SettingError
 
 
 class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
@@ -94,6 +68,7 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
     """
 
     Options = ReleasedBoatDockOptions
+    card = CARDS["ReleasedBoatDockEnv"]
     options: ReleasedBoatDockOptions
     outcomes = released.OUTCOMES
     parameter_dims = (1, 1, 1)

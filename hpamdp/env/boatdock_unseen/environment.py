@@ -8,7 +8,7 @@ a session a trial.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -22,11 +22,9 @@ from hpamdp.env.base import Metric
 from hpamdp.env.batched_env import Action, BatchedEnv, StateArrays
 from hpamdp.env.boatdock import harbour, task
 from hpamdp.env.boatdock_unseen import fleet, kernel, planner, rules
-from hpamdp.env.boatdock_unseen.fleet import FAMILIES
-from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
+from hpamdp.env.boatdock_unseen.options import CARDS, FAMILIES, UnseenBoatsOptions
 from hpamdp.env.boatdock_unseen.rules import SessionRules, SessionState
 from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.rng_streams import EVALUATION, TRAINING, folded
 from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry, RevealedDirections
@@ -61,8 +59,8 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
     """
 
     Options = UnseenBoatsOptions
+    card = CARDS["UnseenBoatsEnv"]
     options: UnseenBoatsOptions
-    has_trips = True
     parameter_dims = (1,) * task.NUM_KEYS
     outcomes = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
@@ -70,8 +68,6 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
     result_keys = (keys.OUTCOME, SESSION_SCORE, SESSION_SUCCESS)
     action_names = ("key", "durations")
     row_kernel = staticmethod(kernel.advance)
-    choice_setting: ClassVar[str] = "env.boats=2"
-    no_choice_setting: ClassVar[str] = "env.boats=1"
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score of a trip"),
         Metric("score_trip_1", "score of the first trip"),
@@ -87,11 +83,6 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         Metric("score_later", "Score of the later trips"),
         Metric("success", "Trips that dock", "share"),
     )
-
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings."""
-        return options.facts(cls.__name__)
 
     def _prepare(self) -> None:
         options = self.options

@@ -31,7 +31,8 @@ from hpamdp.env.boatdock.task import (
     TANK,
     speed,
 )
-from hpamdp.env.boatdock_unseen.fleet import Boats, FleetRules
+from hpamdp.env.boatdock_unseen.fleet import Boats
+from hpamdp.env.boatdock_unseen.options import FleetRules
 from hpamdp.env.boatdock_unseen.planner import best_plan
 from hpamdp.env.boatdock_unseen.rules import OBSERVATION_NAMES
 

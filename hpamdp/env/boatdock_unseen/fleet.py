@@ -7,30 +7,20 @@ those of test boats are odd, so no training meets a test boat.
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock.task import NUM_KEYS
+from hpamdp.env.boatdock_unseen.options import FleetRules
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.rng_streams import STEPS, TRAINING
-
-Family = Literal["turned", "any", "strength"]
-FAMILIES: tuple[Family, ...] = ("turned", "any", "strength")
 
 # Indices of a boat's random numbers.
 TURN, ORDER, FIRST_GAP, SECOND_GAP, STRENGTH, GLIDE = range(6)
 NUM_ORDERS = 6  # in which three keys can have three directions
-
-
-class FleetRules(NamedTuple):
-    """The boats that sessions draw from. The settings of UnseenBoatsEnv explain the fields."""
-
-    family: Family = "turned"
-    separation: float = math.radians(60.0)  # radians
-    spread: float = 0.3
 
 
 class Boats(NamedTuple):

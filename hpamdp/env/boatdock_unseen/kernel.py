@@ -15,6 +15,7 @@ from hpamdp.env import kernels
 from hpamdp.env.boatdock import kernel as boats
 from hpamdp.env.boatdock import task
 from hpamdp.env.boatdock_unseen import fleet, rules
+from hpamdp.env.boatdock_unseen.options import FAMILIES
 from hpamdp.env.kernels import (
     EPISODE_ROW,
     EPISODE_STREAM,
@@ -75,7 +76,7 @@ FIRST_BOAT, SECOND_BOAT, BOAT, LAST_BOAT, LAST_KEY, TRIP, PRESSES, DOCKED, TRIP_
 ) = range(OWN, OWN + 11)
 
 _F = np.float32
-_ANY, _STRENGTH = fleet.FAMILIES.index("any"), fleet.FAMILIES.index("strength")
+_ANY, _STRENGTH = FAMILIES.index("any"), FAMILIES.index("strength")
 _THIRD = _F(2.0 * math.pi / task.NUM_KEYS)
 _KEYS, _ORDERS = int32(task.NUM_KEYS), _F(fleet.NUM_ORDERS)
 _UNIT, _SPEED = _F(1.0 / task.HARBOUR_RADIUS), _F(1.0 / task.SPEED_SCALE)

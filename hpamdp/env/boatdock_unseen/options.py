@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
+from hpamdp.cards import ProblemCard
 from hpamdp.env.boatdock.task import DOCKING_SPEED, RewardForm, speed
-from hpamdp.env.boatdock_unseen.fleet import Family, FleetRules
-from hpamdp.env.facts import ProblemFacts
-from hpamdp.settings import OnlyWith, Settings
+from hpamdp.env.facts import ProblemFacts, ProblemOptions
+from hpamdp.settings import OnlyWith
 
+Family = Literal["turned", "any", "strength"]
+FAMILIES: tuple[Family, ...] = ("turned", "any", "strength")
 MOST_TRIPS = 24
 BOAT_NAMES = ("boat_1", "boat_2")
 
 
-class UnseenBoatsOptions(Settings):
+class FleetRules(NamedTuple):
+    """The boats that sessions draw from. The settings of UnseenBoatsEnv explain the fields."""
+
+    family: Family = "turned"
+    separation: float = math.radians(60.0)  # radians
+    spread: float = 0.3
+
+
+class UnseenBoatsOptions(ProblemOptions):
     """Settings of `UnseenBoatsEnv`."""
 
     trips: Annotated[int, Field(ge=1, le=MOST_TRIPS)] = 8
@@ -94,3 +104,13 @@ class UnseenBoatsOptions(Settings):
             has_choice=has_choice,
             can_change_option=False,
         )
+
+
+CARDS = {
+    "UnseenBoatsEnv": ProblemCard(
+        options=UnseenBoatsOptions,
+        has_trips=True,
+        choice_setting="env.boats=2",
+        no_choice_setting="env.boats=1",
+    )
+}

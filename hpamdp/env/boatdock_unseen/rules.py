@@ -31,7 +31,7 @@ from hpamdp.env.boatdock.task import (
     RewardForm,
 )
 from hpamdp.env.boatdock_unseen import fleet
-from hpamdp.env.boatdock_unseen.fleet import FleetRules
+from hpamdp.env.boatdock_unseen.options import FleetRules
 from hpamdp.env.counter_rng import RngKey
 
 OUTCOMES = ("sailing", "finished", "time_limit")  # of sessions; no session reaches the limit of its presses

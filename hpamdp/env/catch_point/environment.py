@@ -8,45 +8,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import PositiveInt
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 
 from hpamdp.env import point_agent
 from hpamdp.env.batched_env import Action
 from hpamdp.env.catch_point import kernel, picture, rules
+from hpamdp.env.catch_point.options import CARDS, PUBLISHED_CATCHES, CatchPointOptions
 from hpamdp.env.catch_point.rules import CatchPointState
 from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
 from hpamdp.observation_entries import ObservationEntry
-from hpamdp.settings import Settings
 
 _TURNS = 8  # turns of the plane that are declared as symmetries
 _CEILING = {25: 0.964, 30: 0.997}  # highest success by `max_steps`: from some starts the target is out of reach
-
-
-class CatchPointOptions(Settings):
-    """Settings of `CatchPointEnv`. The defaults are HyAR's version."""
-
-    max_steps: PositiveInt = 25
-    """Steps after which an episode is truncated."""
-    catches: PositiveInt = rules.PUBLISHED_CATCHES
-    """Catches that an episode allows. The published code allows 11, its papers say 10."""
-    late_end: bool = True
-    """Whether an episode without catches ends one step late, with reward 0, as in the published code."""
-    progress: bool = False
-    """Whether the agent observes its misses and the time, `[N, 6]` instead of `[N, 4]`, as in DLPA's code."""
-    observation: Literal["vector", "picture"] = "vector"
-    """Whether the agent observes a vector, or the same drawn as a picture, uint8 `[N, 12288]` (`[3, 64, 64]`)."""
-    compile_rules: bool = False
-    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
 
 class CatchPointEnv(PointEnv[CatchPointState]):
@@ -64,6 +44,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     """
 
     Options = CatchPointOptions
+    card = CARDS["CatchPointEnv"]
     options: CatchPointOptions
     discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
@@ -90,11 +71,6 @@ class CatchPointEnv(PointEnv[CatchPointState]):
             num_envs, options=options, device=device, seed=seed, first_env=first_env, oracle=oracle, **settings
         )
 
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings."""
-        return replace(super().facts(options), has_pictures=options.observation == "picture")
-
     def _prepare(self) -> None:
         self.observation_names = point_agent.OBSERVATION_NAMES + (rules.PROGRESS_NAMES if self.options.progress else ())
         self._shows_picture = self.options.observation == "picture"
@@ -114,7 +90,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         if not self._shows_picture:
             return vectors
         pixels = np.empty((len(vectors), *picture.SHAPE), np.uint8)
-        longest_time, most_misses = self.max_steps / 12.0 - 1.0, rules.PUBLISHED_CATCHES / 6.0 - 1.0
+        longest_time, most_misses = self.max_steps / 12.0 - 1.0, PUBLISHED_CATCHES / 6.0 - 1.0
         picture.draw(vectors.detach().numpy(force=True), longest_time, most_misses, pixels)
         pictures = torch.from_numpy(pixels).flatten(1).to(vectors.device)
         return pictures.float() / 255.0 if self._flattens else pictures
@@ -184,7 +160,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         ceiling = {"ceiling": {"success": _CEILING[self.max_steps]}} if self.max_steps in _CEILING else {}
         is_published = (self.max_steps, self.options.catches, self.options.late_end) == (
             25,
-            rules.PUBLISHED_CATCHES,
+            PUBLISHED_CATCHES,
             True,
         )
         return ({"scripted": {"score": 8.73, "success": 0.964}} if is_published else {}) | ceiling

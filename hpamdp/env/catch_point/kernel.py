@@ -12,6 +12,7 @@ import numpy as np
 
 from hpamdp.env import kernels, point_kernel
 from hpamdp.env.catch_point import rules
+from hpamdp.env.catch_point.options import PUBLISHED_CATCHES
 from hpamdp.env.kernels import ONE, OUTCOME_ROW, STEPS_ROW, ZERO, kernel, part, sin_cos
 
 CATCHES, LATE_END, PROGRESS = range(kernels.OWN, kernels.OWN + 3)  # the problem's own settings
@@ -76,7 +77,7 @@ def advance(
                 point_kernel.start(floats, row, bits, step)
             point_kernel.observe(floats, row, observations[reading, row])
             if settings[PROGRESS] != 0.0:
-                misses = min(integers[_MISSES, row], rules.PUBLISHED_CATCHES)
+                misses = min(integers[_MISSES, row], PUBLISHED_CATCHES)
                 observations[reading, row, 4] = _F(misses) / _SIX - ONE
                 observations[reading, row, 5] = _F(integers[STEPS_ROW, row]) / _TWELVE - ONE
             kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])

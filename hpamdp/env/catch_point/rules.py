@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import point_agent
+from hpamdp.env.catch_point.options import PUBLISHED_CATCHES
 from hpamdp.env.counter_rng import RngKey
 
 MOVE, CATCH = range(2)
@@ -21,7 +22,6 @@ ACTIONS = ("move", "catch")
 OUTCOMES = ("going on", "caught", "no catches left", "time limit")
 GOING_ON, CAUGHT, NO_CATCHES_LEFT, TIME_LIMIT = range(4)
 PROGRESS_NAMES = ("misses", "time")
-PUBLISHED_CATCHES = 11
 _FORCE = 2.0
 
 

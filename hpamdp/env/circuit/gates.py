@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 # What gates do. STOP ends the circuit.
 STOP, PHASE, MIX, TURN, FLIP = range(5)
-
-NATIVE_SETS = ("superconducting", "ion")
-GateSet = Literal["published", "choose", "superconducting", "ion"]
 
 
 class Gate(NamedTuple):

@@ -13,26 +13,8 @@ from torchrl.data import Bounded, Categorical, Composite
 
 from hpamdp.env.circuit import compiler, rules
 from hpamdp.env.circuit.gates import PHASE, matrices, published
+from hpamdp.env.circuit.known_circuits import CIRCUITS
 from hpamdp.env.circuit.rules import TASK_OF, CircuitState, Design
-
-_RIGHT = 0.5 * math.pi
-_HADAMARD_2 = (("p 2", _RIGHT), ("rx 2", _RIGHT), ("p 2", _RIGHT))
-# Circuits with the published gates that make the fixed targets, with the angle of each gate.
-CIRCUITS: Mapping[str, tuple[tuple[str, float], ...]] = {
-    "hadamard": (("p 0", _RIGHT), ("rx 0", _RIGHT), ("p 0", _RIGHT)),
-    "bell": (("rx 0", _RIGHT), ("p 0", _RIGHT), ("cx 0 1", 0.0)),
-    "ghz": (("rx 0", _RIGHT), ("p 0", _RIGHT), ("cx 0 1", 0.0), ("cx 1 2", 0.0)),
-    # Nielsen and Chuang, *Quantum Computation and Quantum Information*, section 4.3, with V the square root of X.
-    "toffoli": (
-        *_HADAMARD_2,
-        ("cp 1 2", _RIGHT),
-        ("cx 0 1", 0.0),
-        ("cp 1 2", -_RIGHT),
-        ("cx 0 1", 0.0),
-        ("cp 0 2", _RIGHT),
-        *_HADAMARD_2,
-    ),
-}
 
 
 def beginnings(task: str) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ from collections import namedtuple
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Literal, NamedTuple, Protocol, get_args
+from typing import NamedTuple, Protocol, get_args
 
 import torch
 from torch import Tensor
@@ -28,14 +28,12 @@ from hpamdp.env import counter_rng
 from hpamdp.env.batched_env import EpisodeColumns
 from hpamdp.env.circuit import gates
 from hpamdp.env.circuit.gates import Gate
+from hpamdp.env.circuit.options import RewardName, TaskName
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.state_columns import replaced
 
-TaskName = Literal["hadamard", "random_state", "bell", "ghz", "random_unitary", "toffoli"]
 TASKS: tuple[TaskName, ...] = get_args(TaskName)
-RewardName = Literal["final", "progress", "gain"]
 REWARDS: tuple[RewardName, ...] = get_args(RewardName)
-RANDOM_TASKS = ("random_state", "random_unitary")
 OUTCOMES = ("building", "matched", "missed", "time limit")
 BUILDING, MATCHED, MISSED, TIME_LIMIT = range(4)
 MATCH = 0.99  # similarity from which on a finished circuit matches its target

@@ -7,11 +7,10 @@ arXiv:2109.05490; see `hpamdp.env.goal.rules`, also for the differences.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import ClassVar, get_args
 
 import numpy as np
 import torch
-from pydantic import Field, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -19,50 +18,11 @@ from hpamdp import keys
 from hpamdp.env.base import Metric
 from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.goal import kernel, rendering, rules
+from hpamdp.env.goal.options import ACTIONS, CARDS, HARD_GOAL_ACTIONS, GoalOptions, HardGoalOptions, HardSlip, Slip
 from hpamdp.env.goal.rules import Aim, GoalState
 from hpamdp.geometry import Symmetries, make_symmetries
-from hpamdp.settings import FromList, Settings
-
-Slip = Literal["kick_to", "goal_distance", "keeper_projection"]
-HardSlip = Literal["kick_to", "goal_distance", "keeper_projection", "middle_shots"]
-
-
-class GoalOptions(Settings):
-    """Settings of `GoalEnv`."""
-
-    max_steps: PositiveInt = 100
-    """Steps after which an episode ends. The last one is not played, as in the published code."""
-    limit: Literal["truncated", "terminated"] = "truncated"
-    """If `terminated`, values stop at the time limit, as in the published code; if `truncated`, they bootstrap past it.
-
-    The observation does not show the time, and the limit costs the ball's distance from the goal.
-    """
-    observation: Literal["scaled", "raw"] = "scaled"
-    """`scaled` to [-1, 1], which orientations and the ball can leave, or `raw` positions, velocities and angles."""
-    noise: Annotated[float, Field(ge=0.0, le=5.0)] = 1.0
-    """Factor on the published noise of all motions; 0 means no noise. From about 10 on, an action might never end."""
-    repaired: Annotated[tuple[Slip, ...], FromList] = ()
-    """Slips of the published code to take out. With any of them, scores do not compare with published ones.
-
-    `kick_to`: a kick to (x, y) goes to (x, x), so that y is never read. `goal_distance`: below the goal and behind its
-    line, the distance is 14.02 too large. `keeper_projection`: this entry of the observation is clipped to
-    [-7.01, 14.02] instead of [-7.01, 7.01].
-    """
-    compile_rules: bool = False
-    """Compile the ticks instead of using the kernel, for a GPU; the first action takes about a minute."""
-
-
-class HardGoalOptions(GoalOptions):
-    """Settings of `HardGoalEnv`."""
-
-    repaired: Annotated[tuple[HardSlip, ...], FromList] = ()  # type: ignore[assignment]
-    """Slips of the published code to take out, those of Goal and `middle_shots`.
-
-    `middle_shots`: the middle stretch is a single point, y = 1.402, and not [-1.402, 1.402], so that no shot goes to
-    the middle of the goal.
-    """
+from hpamdp.settings import Settings
 
 
 class GoalEnv(BatchedEnv[GoalState]):
@@ -86,8 +46,9 @@ class GoalEnv(BatchedEnv[GoalState]):
     """
 
     Options: ClassVar[type[Settings]] = GoalOptions
+    card = CARDS["GoalEnv"]
     options: GoalOptions
-    discrete_names: tuple[str, ...] = rules.ACTIONS
+    discrete_names: tuple[str, ...] = ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims: tuple[int, ...] = rules.PARAMETER_DIMS
@@ -107,12 +68,6 @@ class GoalEnv(BatchedEnv[GoalState]):
         Metric("success", "Episodes with a goal", "share"),
         Metric("return", "Return"),
     )
-
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings; the default options are `carry` and `shoot`."""
-        groups = {"carry": cls.discrete_names[:1], "shoot": cls.discrete_names[1:]}
-        return ProblemFacts(title=cls.__name__, default_options=groups)
 
     def _prepare(self) -> None:
         self.limit_terminates = self.options.limit == "terminated"
@@ -258,8 +213,9 @@ class HardGoalEnv(GoalEnv):
     """
 
     Options = HardGoalOptions
-    discrete_names = rules.HARD_GOAL_ACTIONS
-    parameter_dims = (2,) + (1,) * (len(rules.HARD_GOAL_ACTIONS) - 1)
+    card = CARDS["HardGoalEnv"]
+    discrete_names = HARD_GOAL_ACTIONS
+    parameter_dims = (2,) + (1,) * (len(HARD_GOAL_ACTIONS) - 1)
     parameter_low = (-1.0,) * 12
     parameter_high = (1.0,) * 12
     slips = get_args(HardSlip)

@@ -20,7 +20,6 @@ from hpamdp.env import counter_rng
 from hpamdp.env.counter_rng import RngKey
 
 KICK_TO, SHOOT_LEFT, SHOOT_RIGHT = range(3)
-ACTIONS = ("kick to", "shoot left", "shoot right")
 PARAMETER_DIMS = (2, 1, 1)
 OUTCOMES = ("playing", "goal", "caught", "out", "time limit")
 PLAYING, GOAL, CAUGHT, OUT, TIME_LIMIT = range(5)
@@ -91,7 +90,6 @@ OBSERVATION_HIGH = (*_BODY_HIGH, *_BODY_HIGH, LENGTH, HALF_WIDTH, 3.0, 3.0, 1.0,
 
 # The shots of Hard Goal: intervals of the goal line, scaled to [-1, 1]. Each interval exists once for either foot.
 STRETCHES = ((-1.0, -0.6), (-0.6, -0.2), (0.2, 0.2), (0.2, 0.6), (0.6, 1.0))
-HARD_GOAL_ACTIONS = ("kick to", *(f"shoot {side} {stretch}" for side in ("left", "right") for stretch in range(1, 6)))
 _MIDDLE = 2
 REPAIRED_MIDDLE = (-0.2, 0.2)
 

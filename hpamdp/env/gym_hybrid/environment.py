@@ -7,33 +7,18 @@ Source: Xiong et al. 2018, arXiv:1810.06394, and Fan et al. 2019, arXiv:1903.013
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
-from pydantic import PositiveInt
 from torch import Tensor
 
 from hpamdp.env.batched_env import Action
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.gym_hybrid import kernel, rules
+from hpamdp.env.gym_hybrid.options import CARDS, PUBLISHED_STEPS, VehicleOptions
 from hpamdp.env.gym_hybrid.rules import VehicleState
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
-from hpamdp.settings import Settings
-
-
-class VehicleOptions(Settings):
-    """Settings of `MovingEnv` and `SlidingEnv`."""
-
-    max_steps: PositiveInt = rules.PUBLISHED_STEPS
-    """Steps after which an episode ends."""
-    limit: Literal["truncated", "terminated"] = "truncated"
-    """If `terminated`, values stop at the time limit, as in the published code; if `truncated`, they bootstrap past it.
-
-    The time is observed, and the reward at the limit is -1.
-    """
-    compile_rules: bool = False
-    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
 
 class _VehicleEnv(PointEnv[VehicleState]):
@@ -105,7 +90,7 @@ class _VehicleEnv(PointEnv[VehicleState]):
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return the figures of the hand-written player, which nearly always succeeds."""
-        if self.max_steps != rules.PUBLISHED_STEPS:
+        if self.max_steps != PUBLISHED_STEPS:
             return {}
         return {"scripted": self.scripted_figures, "ceiling": {"success": 1.0}}
 
@@ -132,6 +117,7 @@ class MovingEnv(_VehicleEnv):
     Only the start is random. For the constructor's arguments and errors see `BatchedEnv`.
     """
 
+    card = CARDS["MovingEnv"]
     slides = False
     scripted_figures: ClassVar[dict[str, float]] = {"score": 1.874, "success": 0.9987, "steps": 96.0}
 
@@ -142,5 +128,6 @@ class SlidingEnv(_VehicleEnv):
     The course is not observed. For actions, arguments and errors see `MovingEnv`.
     """
 
+    card = CARDS["SlidingEnv"]
     slides = True
     scripted_figures: ClassVar[dict[str, float]] = {"score": 1.874, "success": 0.9988, "steps": 95.0}

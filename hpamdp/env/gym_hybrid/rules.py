@@ -34,7 +34,6 @@ OBSERVATION_NAMES = (
     "time_share",
 )
 VECTORS = ((0, 1), (3, 4), (5, 6))  # places of (x, y) pairs in the observation
-PUBLISHED_STEPS = 201
 TARGET_RADIUS = 0.1
 LARGEST_PUSH = 0.5  # the most that an acceleration adds to the speed
 STEP = 0.005  # distance covered in a step at speed 1

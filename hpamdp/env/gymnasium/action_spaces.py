@@ -45,18 +45,17 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from gymnasium import spaces
 
 from hpamdp.env.gymnasium.action_parts import Bounds, Choice, Part, choice_form, read_part
+from hpamdp.env.gymnasium.options import ActionForm
 from hpamdp.env.gymnasium.parameter_trees import NotAcceptedError
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers
 from hpamdp.env.gymnasium_form import ParameterMap
 from hpamdp.settings import SettingError
-
-ActionForm = Literal["auto", "components"]
 
 _ACCEPTED = (
     "accepted are trees of Discrete, MultiDiscrete, MultiBinary, Box with finite bounds, Tuple, Dict and OneOf, "

@@ -11,11 +11,11 @@ import gymnasium
 import numpy as np
 
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError, closed_on_error, fault_of
-from hpamdp.env.gymnasium.action_spaces import ActionForm, ActionSpace, OptionSpace, written
+from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
 from hpamdp.env.gymnasium.contract import ContractCheck, checked_step, refuse_step
-from hpamdp.env.gymnasium.leaves import OutOfBounds
-from hpamdp.env.gymnasium.masks import Masks, MaskSource
+from hpamdp.env.gymnasium.masks import Masks
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
+from hpamdp.env.gymnasium.options import ActionForm, MaskSource, OutOfBounds
 from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds
 from hpamdp.env.gymnasium.time_limit import limit_of
 from hpamdp.env.gymnasium.values import flag

@@ -12,7 +12,6 @@ import gymnasium
 import numpy as np
 import torch
 from PIL import Image, ImageOps
-from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
@@ -21,21 +20,21 @@ from hpamdp import keys
 from hpamdp.env.actions import check_action_values, invalid_action
 from hpamdp.env.base import PAMDPEnv, ProblemError, checked_option_names
 from hpamdp.env.errors import closed_on_error
-from hpamdp.env.gymnasium.action_spaces import ActionForm
+from hpamdp.env.facts import NAMING_SETTINGS
 from hpamdp.env.gymnasium.copies import Copies, Reading
 from hpamdp.env.gymnasium.form import NativeForm, joined
-from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.making import Maker
-from hpamdp.env.gymnasium.masks import MaskSource, as_leaf
+from hpamdp.env.gymnasium.masks import as_leaf
+from hpamdp.env.gymnasium.options import CARDS, GymnasiumOptions
 from hpamdp.env.gymnasium.parameter_bounds import agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
-from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics, Scaling
-from hpamdp.env.registration import NAMING_SETTINGS, SOURCE_SETTINGS, register
+from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics
+from hpamdp.env.registration import register
 from hpamdp.env.rng_streams import folded
 from hpamdp.messages import as_code, warn
 from hpamdp.observation_entries import observation_dtype
 from hpamdp.pickling import why_unsendable
-from hpamdp.settings import PositiveFraction, SettingError, Settings
+from hpamdp.settings import SettingError, Settings
 
 _CPU = torch.device("cpu")
 _SUCCESS = "success"
@@ -44,63 +43,6 @@ _PICTURE = "picture"
 _LARGEST_PICTURE = 320  # px from edge to edge of a picture that is kept for a film
 # Separate streams of seeds for training and for the fixed episodes of evaluation.
 _TRAINING, _FIXED = 0, 1
-
-
-class GymnasiumOptions(Settings):
-    """Settings of `GymnasiumEnv`."""
-
-    id: str | None = None
-    """The registered name, as `gymnasium.make` takes it; `module:Name-v0` imports the module, which registers it."""
-    entry_point: str | None = None
-    """Instead of `id`, a class or function `package.module:name` that returns the environment."""
-    kwargs: dict[str, Any] | None = None
-    """Arguments of the environment's constructor, as in `env.kwargs={size:5}`."""
-    max_steps: PositiveInt | None = None
-    """Steps after which an episode is truncated. If null, the limit of the `TimeLimit` wrapper or of the spec."""
-    action_form: ActionForm = "auto"
-    """How the action space is read. `auto`: a `Discrete` and boxes beside it can be one choice with its parameters.
-
-    `components`: all parts are independent, so that a `Box` beside a `Discrete` counts whatever is chosen. Only a
-    `OneOf` is then a choice with parameters of its own.
-    """
-    parameter_dims: list[int] | None = None
-    """How many parameters each discrete action takes of one box for all, as in [1, 1, 0]. If null, the whole box."""
-    option_key: int | str | None = None
-    """The option's name in a `Dict` of actions or its number in a `Tuple`. If null, the entry `option`, if any."""
-    action_mask: MaskSource | None = None
-    """Where the environment says which actions it forbids. `info`: `action_mask` and `option_mask` in each info.
-
-    `ignore`: masks are ignored. If null, the entries `action_mask` and `option_mask` of a `Dict` of observations, if it
-    has them. A mask in an info, or a method `action_masks()`, is then refused.
-    """
-    pair_mask: MaskSource | None = None
-    """Where the environment says which discrete actions of different components go together, `pair_mask`.
-
-    `info`: in each info; `ignore`: it is ignored. If null, the entry of a `Dict` of observations, if it has one.
-    """
-    parameter_bounds: MaskSource | None = None
-    """Where the environment gives bounds of the current state, `parameter_low` and `parameter_high`.
-
-    `info`: in each info; `ignore`: they are ignored. If null, entries of a `Dict` of observations, if it has them.
-    """
-    observation_keys: list[int | str] | None = None
-    """Entries of a `Tuple` or `Dict` to observe, as in [0] or [position, speed]. If null, all but masks and bounds."""
-    observation_scaling: Scaling = "bounds"
-    """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not.
-
-    Pictures stay as they are; an encoder divides them by 255.
-    """
-    raw_observations: list[int | str] | None = None
-    """Entries that stay unscaled: names in a `Dict`, numbers in a `Tuple` or of the vector. If null, all are scaled."""
-    reward_scaling: PositiveFraction | None = None
-    """Divide rewards in training by the running standard deviation of the return with this discount.
-
-    If null, rewards are not scaled.
-    """
-    out_of_bounds: OutOfBounds = "refuse"
-    """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""
-    num_workers: NonNegativeInt = 0
-    """Processes that step the copies at the same time, for slow environments. If 0, this process steps them."""
 
 
 class GymnasiumEnv(PAMDPEnv):
@@ -135,8 +77,8 @@ class GymnasiumEnv(PAMDPEnv):
     """
 
     Options: ClassVar[type[Settings]] = GymnasiumOptions
+    card = CARDS["GymnasiumEnv"]
     result_keys = (_SUCCESS,)
-    guarded_settings: ClassVar[tuple[str, ...]] = SOURCE_SETTINGS
 
     def __init__(
         self,

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim, flatten
 
 from hpamdp.env.errors import ProblemError
+from hpamdp.env.gymnasium.options import OutOfBounds
 from hpamdp.env.gymnasium.values import as_numbers, shown
 from hpamdp.settings import SettingError
-
-OutOfBounds = Literal["refuse", "clip", "allow"]
 
 # Units in the last place beyond a bound that count as rounding.
 _ROUNDING = 4.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -14,10 +14,9 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
+from hpamdp.env.gymnasium.options import MaskSource
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers, shown
 from hpamdp.settings import SettingError
-
-MaskSource = Literal["info", "ignore"]
 
 # The setting that says where a mask is.
 _SETTINGS = {

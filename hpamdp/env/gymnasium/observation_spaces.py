@@ -19,7 +19,8 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim, flatten_space
 
 from hpamdp.env.gymnasium.action_spaces import written
-from hpamdp.env.gymnasium.leaves import Leaf, OutOfBounds, children, leaves
+from hpamdp.env.gymnasium.leaves import Leaf, children, leaves
+from hpamdp.env.gymnasium.options import OutOfBounds
 from hpamdp.observation_entries import ObservationEntry, channels_axis, is_picture_shape
 from hpamdp.settings import SettingError
 

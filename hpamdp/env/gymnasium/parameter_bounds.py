@@ -12,7 +12,7 @@ from gymnasium import spaces
 from hpamdp import keys
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
-from hpamdp.env.gymnasium.masks import MaskSource
+from hpamdp.env.gymnasium.options import MaskSource
 from hpamdp.env.gymnasium.values import MisfitError
 from hpamdp.settings import SettingError
 

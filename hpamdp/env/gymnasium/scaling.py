@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -12,9 +12,8 @@ from torch import Tensor
 
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
+from hpamdp.env.gymnasium.options import Scaling
 from hpamdp.settings import SettingError
-
-Scaling = Literal["bounds", "running", "none"]
 
 # Bounds further apart than this count as none: some environments write 1e10 or the largest float.
 _WIDEST = 1e6

@@ -6,21 +6,19 @@ Source: Li et al. 2022 (HyAR), arXiv:2109.05490; see `hpamdp.env.hard_move.rules
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from typing import ClassVar
 
 import torch
-from pydantic import PositiveInt
 from torch import Tensor
 
 from hpamdp.env import point_agent
 from hpamdp.env.batched_env import Action
 from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.hard_move import kernel, rules
+from hpamdp.env.hard_move.options import CARDS, HardMoveOptions
 from hpamdp.env.hard_move.rules import HardMoveState
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
-from hpamdp.settings import Settings
 
 # Highest success by `max_steps` and the number of actuators: from some starts the target is out of reach.
 _CEILING = {
@@ -28,19 +26,6 @@ _CEILING = {
     25: {4: 0.852, 6: 0.928, 8: 0.948, 10: 0.956},
 }
 _SCRIPTED = {4: 0.963, 6: 0.990, 8: 0.993, 10: 0.995}  # success of the hand-written player within 30 steps
-
-
-class HardMoveOptions(Settings):
-    """Settings of `HardMoveEnv`. The defaults are HyAR's version."""
-
-    n: Literal[4, 6, 8, 10] = 4
-    """Number of actuators."""
-    max_steps: PositiveInt = 30
-    """Steps after which an episode is truncated. HyAR has 30, DLPA's code 25."""
-    rounded_directions: bool = True
-    """Whether the actuators' directions are rounded to three decimals, as in the published code."""
-    compile_rules: bool = False
-    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
 
 class HardMoveEnv(PointEnv[HardMoveState]):
@@ -56,21 +41,12 @@ class HardMoveEnv(PointEnv[HardMoveState]):
     """
 
     Options = HardMoveOptions
+    card = CARDS["HardMoveEnv"]
     options: HardMoveOptions
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = point_agent.OBSERVATION_NAMES
     target_radius = point_agent.HIT_RADIUS
     row_kernel = staticmethod(kernel.advance)
-
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings.
-
-        The default options are the quadrants into which sets push with a positive parameter. Sets that push nowhere
-        belong to the first quadrant.
-        """
-        quadrants = rules.quadrants(options.n, rounded=options.rounded_directions)
-        return ProblemFacts(title=cls.__name__, default_options=quadrants, has_oracle=True)
 
     def _prepare(self) -> None:
         n = self.options.n

@@ -7,7 +7,6 @@ HyAR's code.
 from __future__ import annotations
 
 import itertools
-import math
 from typing import NamedTuple
 
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from hpamdp.env import point_agent
 from hpamdp.env.counter_rng import RngKey
+from hpamdp.env.hard_move.options import directions
 
 OUTCOMES = ("going on", "reached", "time limit")
 GOING_ON, REACHED, TIME_LIMIT = range(3)
@@ -48,28 +48,9 @@ def motions(n: int, *, rounded: bool) -> Tensor:
         n: number of actuators.
         rounded: whether the directions are rounded to three decimals, as published.
     """
-    directions = _directions(n, rounded)
     sets = torch.tensor(list(itertools.product((0.0, 1.0), repeat=n)), dtype=torch.float64)
-    sums = sets @ torch.tensor(directions, dtype=torch.float64)
+    sums = sets @ torch.tensor(directions(n, rounded), dtype=torch.float64)
     return sums / sums.norm(dim=-1).max()
-
-
-def quadrants(n: int, *, rounded: bool) -> dict[str, list[int]]:
-    """Return the sets of actuators that push into each quadrant. Sets whose pushes cancel are in `north_east`."""
-    directions = _directions(n, rounded)
-    numbers: dict[str, list[int]] = {name: [] for name in ("north_east", "north_west", "south_west", "south_east")}
-    for number, members in enumerate(itertools.product((False, True), repeat=n)):
-        pushes = list(itertools.compress(directions, members))
-        east, north = (sum(push[axis] for push in pushes) >= 0.0 for axis in (0, 1))
-        numbers[f"{'north' if north else 'south'}_{'east' if east else 'west'}"].append(number)
-    return numbers
-
-
-def _directions(n: int, rounded: bool) -> list[tuple[float, float]]:
-    """Return the actuators' directions."""
-    angles = [2.0 * math.pi * i / n for i in range(n)]
-    directions = [(math.cos(angle), math.sin(angle)) for angle in angles]
-    return [(round(x, 3), round(y, 3)) for x, y in directions] if rounded else directions
 
 
 def start(episode: Tensor, rng: RngKey) -> HardMoveState:

@@ -7,34 +7,17 @@ from functools import partial, update_wrapper
 from typing import Any, ClassVar
 
 import torch
-from pydantic import NonNegativeInt, PositiveInt
 
-from hpamdp.env.facts import ProblemFacts
-from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
-from hpamdp.env.lunar_lander.lander import SOLVED, HybridLunarLander, LanderRules
-from hpamdp.env.lunar_lander.registration import MAX_STEPS
-from hpamdp.settings import PositiveFraction, Settings
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.env.gymnasium.options import GymnasiumOptions
+from hpamdp.env.lunar_lander.lander import SOLVED, HybridLunarLander
+from hpamdp.env.lunar_lander.options import CARDS, LanderRules, LunarLanderOptions
+from hpamdp.settings import Settings
 
 # Mean return, fraction of solved episodes and length of Gymnasium's own hand-written player, over 500 episodes with the
 # default settings; experiments/hybrid_control/study.py measures it.
 HEURISTIC = {"score": 282.8, "success": 0.998, "steps": 200.7}
 _RULES = ("max_steps", "gravity", "enable_wind")  # settings on which these figures depend
-
-
-class LunarLanderOptions(LanderRules):
-    """Settings of `LunarLanderEnv`."""
-
-    max_steps: PositiveInt = MAX_STEPS
-    """Steps after which an episode is truncated."""
-    render: bool = False
-    """Draw the lander, for films; steps then take longer."""
-    reward_scaling: PositiveFraction | None = None
-    """Divide rewards in training by the running standard deviation of the return with this discount.
-
-    If null, rewards are not scaled.
-    """
-    num_workers: NonNegativeInt = 0
-    """Processes that step the environments in parallel. If 0, this process steps them."""
 
 
 class LunarLanderEnv(GymnasiumEnv):
@@ -50,7 +33,7 @@ class LunarLanderEnv(GymnasiumEnv):
     """
 
     Options: ClassVar[type[Settings]] = LunarLanderOptions
-    guarded_settings: ClassVar[tuple[str, ...]] = ()
+    card = CARDS["LunarLanderEnv"]
     observation_names = ("x", "y", "x_speed", "y_speed", "angle", "angular_speed", "left_leg", "right_leg")
     discrete_names = ("main off", "main on", "side off", "left", "right")
 
@@ -84,15 +67,6 @@ class LunarLanderEnv(GymnasiumEnv):
             device=device,
             seed=seed,
             first_env=first_env,
-        )
-
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings."""
-        return ProblemFacts(
-            title=cls.__name__,
-            is_shardable=options.num_workers == 0,
-            has_statistics=options.reward_scaling is not None,
         )
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:

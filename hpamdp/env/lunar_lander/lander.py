@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from pydantic import Field, NonNegativeFloat
 
 from hpamdp.env.gymnasium_checks import check_render_mode, describe, reset_options, single_action
-from hpamdp.settings import OnlyWith, SettingError, Settings
+from hpamdp.env.lunar_lander.options import LanderRules
+from hpamdp.settings import SettingError
 
 SOLVED = 200.0
 """Return from which Gymnasium counts an episode as solved."""
@@ -23,19 +23,6 @@ _LEAST_MAIN = np.float32(1e-6)
 _LEAST_SIDE = np.nextafter(np.float32(0.5), np.float32(1.0))
 _DIMS = {"main": (0, 1), "side": (0, 1, 1)}  # parameters of each discrete action
 _SIDES = (0.0, -1.0, 1.0)  # signs of off, left and right in LunarLander's action
-
-
-class LanderRules(Settings):
-    """Settings of `HybridLunarLander`."""
-
-    gravity: Annotated[float, Field(gt=-12.0, lt=0.0)] = -10.0
-    """Gravity in Box2D's units, negative downwards."""
-    enable_wind: bool = False
-    """Whether wind pushes and turns the lander, with a strength that changes from step to step."""
-    wind_power: Annotated[NonNegativeFloat, OnlyWith("enable_wind")] = 15.0
-    """With `enable_wind`: largest force of the wind."""
-    turbulence_power: Annotated[NonNegativeFloat, OnlyWith("enable_wind")] = 1.5
-    """With `enable_wind`: largest torque of the wind."""
 
 
 class HybridLunarLander(gymnasium.Wrapper):

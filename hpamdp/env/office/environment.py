@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import PositiveInt
 from torch import Tensor
 from torchrl.data import Binary, TensorSpec
 
@@ -19,36 +18,14 @@ from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.office import kernel, player, rendering, rules
+from hpamdp.env.office.options import CARDS, GOALS, OfficeOptions
 from hpamdp.env.office.rules import OfficeState
 from hpamdp.env.state_columns import check_range
-from hpamdp.env.tiles import NumTiles, bounds_with_tiles, tile_names
-from hpamdp.settings import Fraction, Settings
+from hpamdp.env.tiles import bounds_with_tiles, tile_names
 
 # Expected return and success of the player that knows the map, with the default settings.
 _PLAYER = {"score": 956.4, "success": 1.0}
-
-
-class OfficeOptions(Settings):
-    """Settings of `OfficeEnv`. The defaults are the source's rules."""
-
-    max_steps: PositiveInt = 400
-    """Steps after which an episode is truncated."""
-    slip: Fraction = 0.1
-    """Probability that a move slips to the other axis."""
-    tiles: NumTiles = 0
-    """Number of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
-
-    A tile is 1 in its middle and falls to 0 at the middle of its neighbours. With them a network may tell places apart
-    more easily.
-    """
-    chooses_goal: bool = False
-    """Whether the agent chooses what it goes for next, as an option: coffee, mail or target. It takes nothing else.
-
-    A goal is open while the agent lacks it; the target is open once it has both. `option_mask` says which ones are.
-    An agent that has reached its goal and still holds the option goes for the first open one.
-    """
 
 
 class OfficeEnv(BatchedEnv[OfficeState]):
@@ -67,6 +44,7 @@ class OfficeEnv(BatchedEnv[OfficeState]):
     """
 
     Options = OfficeOptions
+    card = CARDS["OfficeEnv"]
     options: OfficeOptions
     discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
@@ -74,16 +52,6 @@ class OfficeEnv(BatchedEnv[OfficeState]):
     parameter_low = rules.PARAMETER_LOW
     parameter_high = rules.PARAMETER_HIGH
     row_kernel = staticmethod(kernel.advance)
-    choice_setting: ClassVar[str] = "env.chooses_goal=true"
-    no_choice_setting: ClassVar[str] = "env.chooses_goal=false"
-
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings; the default options are the axes."""
-        if options.chooses_goal:
-            return ProblemFacts(title=cls.__name__, option_names=rules.GOALS, has_choice=True, has_oracle=True)
-        axes = {"upright": ["up", "down"], "level": ["left", "right"]}
-        return ProblemFacts(title=cls.__name__, default_options=axes, has_oracle=True)
 
     def _prepare(self) -> None:
         self.observation_names = rules.OBSERVATION_NAMES + tile_names(self.options.tiles)
@@ -137,7 +105,7 @@ class OfficeEnv(BatchedEnv[OfficeState]):
         """Return the specs of the player's actions and of the open goals."""
         specs = super()._knowledge_specs()
         if self.options.chooses_goal:
-            num = len(rules.GOALS)
+            num = len(GOALS)
             specs[keys.OPTION_MASK] = Binary(num, shape=(self.num_envs, num), dtype=torch.bool, device=self.device)
         return specs
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env.office import rules
+from hpamdp.env.office.options import GOALS
 from hpamdp.env.office.rules import OfficeState
 
 _SIZE = 100  # grid points along an axis
@@ -51,7 +52,7 @@ def best_values(slip: float, chooses_goal: bool) -> Tensor:
     The option is held until its goal is reached; then the best one follows. Without options, the first dimension is 1.
     The place in the second one is 1 with the coffee, plus 2 with the mail. There is no time limit.
     """
-    num_options = len(rules.GOALS) if chooses_goal else 1
+    num_options = len(GOALS) if chooses_goal else 1
     held, row, column = (
         part.flatten() for part in torch.meshgrid(torch.arange(4), *[torch.arange(_SIZE)] * 2, indexing="ij")
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, Canvas, Point
 from hpamdp.env.office import rules
+from hpamdp.env.office.options import GOALS
 from hpamdp.env.office.rules import OfficeState
 
 _FLOOR, _WALL = "#fffdf8", "#8f8a7c"
@@ -46,7 +47,7 @@ def draw(track: Sequence[OfficeState], size: int = 480) -> np.ndarray:
     finished = canvas.smoothed()
     steps, outcome = int(last.steps), int(last.outcome)
     finished.write((18.0, 22.0), f"{steps} {'step' if steps == 1 else 'steps'}", FAINT)
-    for (x, y), name in zip(rules.PLACES, rules.GOALS, strict=True):
+    for (x, y), name in zip(rules.PLACES, GOALS, strict=True):
         finished.write(_on_paper(x, y), name, INK, 12.0, anchor="mm")
     if outcome != rules.ON_THE_WAY:
         colour = GOOD_EDGE if outcome == rules.DELIVERED else BAD_EDGE

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hpamdp.env.office.options import GOALS
 from hpamdp.env.tiles import tiles_of
 
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -28,8 +29,6 @@ OUTCOMES = ("on the way", "delivered", "time limit")
 ON_THE_WAY, DELIVERED, TIME_LIMIT = range(3)
 OBSERVATION_NAMES = ("y", "x", "has_coffee", "has_mail")
 COFFEE, MAIL, TARGET = range(3)
-GOALS = ("coffee", "mail", "target")
-
 START = (0.05, 0.05)  # x, y
 PLACES = ((0.8, 0.1), (0.55, 0.54), (0.95, 0.95))  # x, y of the coffee, the mail and the target
 REACH = 0.06  # how near, on both axes, the agent must come to a place

@@ -7,47 +7,24 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 import torch
-from pydantic import Field, PositiveInt
 from torch import Tensor
 
 from hpamdp.env import counter_rng
 from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.pinball import kernel, maps, rendering, rules
+from hpamdp.env.pinball.options import CARDS, SOURCE_MAPS, PinballOptions
 from hpamdp.env.pinball.planner import Planner
 from hpamdp.env.pinball.rules import PinballState
-from hpamdp.env.tiles import NumTiles, bounds_with_tiles, tile_names
-from hpamdp.settings import SettingError, Settings
+from hpamdp.env.tiles import bounds_with_tiles, tile_names
+from hpamdp.settings import SettingError
 
 _GRID = 100  # places in a row from which a ball may start anywhere
 _SCRIPTED = {"simple": 9_837.0, "hard": 9_404.0}  # returns of the hand-written player from the start of the map
-
-
-class PinballOptions(Settings):
-    """Settings of `PinballEnv`."""
-
-    map: Annotated[str, Field(min_length=1)] = "simple"
-    """A map of the source, `simple` or `hard`, or the path of a JSON file with a map of your own."""
-    start: Literal["map", "anywhere"] = "map"
-    """Where episodes begin: at the start of the `map`, or `anywhere` between the walls. The ball is at rest."""
-    training_start: Literal["map", "anywhere", "both"] | None = None
-    """Where the episodes of training begin; with `both`, half of them at the start of the map and half `anywhere`.
-
-    If null, they begin where those of evaluation do, see `start`.
-    """
-    max_steps: PositiveInt = 600
-    """Steps after which an episode is truncated."""
-    tiles: NumTiles = 0
-    """Number of tiles along each axis that the agent observes beside its position, `[N, 4 + 2 tiles]`.
-
-    A tile is 1 in its middle and falls to 0 at the middle of its neighbours. With them a network may tell the
-    two sides of a thin wall apart more easily.
-    """
 
 
 class PinballEnv(BatchedEnv[PinballState]):
@@ -66,9 +43,8 @@ class PinballEnv(BatchedEnv[PinballState]):
     """
 
     Options = PinballOptions
+    card = CARDS["PinballEnv"]
     options: PinballOptions
-    guarded_settings: ClassVar[tuple[str, ...]] = ("map",)
-    unguarded_values: ClassVar[Mapping[str, tuple[object, ...]]] = {"map": maps.SOURCE_MAPS}
     discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     parameter_dims = rules.PARAMETER_DIMS
@@ -76,12 +52,6 @@ class PinballEnv(BatchedEnv[PinballState]):
     parameter_high = rules.PARAMETER_HIGH
     row_kernel = staticmethod(kernel.advance)
     seconds_per_step: ClassVar[float] = 0.04
-
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings; the default options are the two axes and none."""
-        groups = {"horizontal": ["right", "left"], "vertical": ["up", "down"], "none": ["none"]}
-        return ProblemFacts(title=cls.__name__, default_options=groups, has_oracle=True)
 
     def _prepare(self) -> None:
         try:
@@ -115,7 +85,7 @@ class PinballEnv(BatchedEnv[PinballState]):
 
     def file_checksums(self) -> dict[str, Tensor]:
         """Return the checksum of a map that is not the source's, int64 `[1]`; nothing for the source's maps."""
-        if self.options.map in maps.SOURCE_MAPS:
+        if self.options.map in SOURCE_MAPS:
             return {}
         checksum = zlib.crc32(self.map.model_dump_json().encode())
         return {"map_checksum": torch.tensor([checksum], dtype=torch.int64, device=self.device)}

@@ -26,11 +26,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json  # refuses deep nesting, at which `json` meets Python's recursion limit
 
+from hpamdp.env.pinball.options import SOURCE_MAPS
 from hpamdp.files import read_regular
 from hpamdp.json_lines import key_given_twice
 from hpamdp.messages import one_line, reason_of
 
-SOURCE_MAPS = ("simple", "hard")
 _FOLDER = Path(__file__).resolve().parent / "maps"
 _MAX_BYTES = 2**20
 _SHORTEST_EDGE = 1e-6  # of a wall, in units of the square's side; shorter ones are lost to rounding in float32

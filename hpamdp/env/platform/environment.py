@@ -7,29 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
-from pydantic import Field, PositiveInt
 from torch import Tensor
 
 from hpamdp.env import counter_rng
 from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.platform import kernel, rendering, rules
+from hpamdp.env.platform.options import CARDS, PlatformOptions
 from hpamdp.env.platform.rules import PlatformState
-from hpamdp.settings import Settings
-
-
-class PlatformOptions(Settings):
-    """Settings of `PlatformEnv`."""
-
-    max_steps: PositiveInt = 200
-    """Steps after which an episode is truncated."""
-    noise: Annotated[float, Field(ge=0.0, le=100.0)] = 1.0
-    """Factor on the published noise of jumps, of the agent's speed and of the enemies' speed; 0 means no noise."""
 
 
 class PlatformEnv(BatchedEnv[PlatformState]):
@@ -47,6 +36,7 @@ class PlatformEnv(BatchedEnv[PlatformState]):
     """
 
     Options = PlatformOptions
+    card = CARDS["PlatformEnv"]
     options: PlatformOptions
     discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
@@ -55,11 +45,6 @@ class PlatformEnv(BatchedEnv[PlatformState]):
     parameter_low = (0.0, 0.0, 0.0)
     parameter_high = rules.PARAMETER_HIGH
     row_kernel = staticmethod(kernel.advance)
-
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings; the default options are run and jump."""
-        return ProblemFacts(title=cls.__name__, default_options={"run": ["run"], "jump": ["hop", "leap"]})
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the factor on the noise."""

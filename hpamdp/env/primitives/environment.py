@@ -4,64 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial, update_wrapper
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.env.facts import ProblemFacts
-from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
-from hpamdp.env.primitives.manipulation import (
-    ACTIONS,
-    HIGHEST,
-    LOWEST,
-    OBSERVED,
-    Actions,
-    Manipulation,
-    Reward,
-    Task,
-)
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.env.gymnasium.options import GymnasiumOptions
+from hpamdp.env.primitives.manipulation import HIGHEST, LOWEST, OBSERVED, Manipulation
+from hpamdp.env.primitives.options import ACTIONS, CARDS, PrimitivesOptions
 from hpamdp.env.primitives.players import MEASURED, RING_FROM_HANDLE_M
 from hpamdp.env.primitives.primitives import AXES, PRIMITIVES
-from hpamdp.settings import OnlyWith, PositiveFraction, Settings
+from hpamdp.settings import Settings
 
-_GROUPED_PRIMITIVES = {
-    "move": ["move", "open"],
-    "grasp": ["grasp", "close"],
-    "pull": ["lift", "drop", "left", "right", "forward", "backward"],
-}
 # In assembly the hand holds a handle, and the ring beside it has to go over a peg. Lifts and drops end so far past it.
 _CLEARANCE_M = 0.05
 # Places of these vectors in the observation.
 _OBJECT, _GOAL = (slice(first, first + 3) for first in map(OBSERVED.index, ("object_x", "goal_x")))
-
-
-class PrimitivesOptions(Settings):
-    """Settings of `PrimitivesEnv`."""
-
-    task: Task = "drawer_close"
-    """Meta-World's task."""
-    reward: Reward = "sparse"
-    """`sparse`: 1 for each primitive with a success in it; `dense`: the mean of Meta-World's rewards in it, 0 to 10."""
-    decisions: PositiveInt = 5
-    """Primitives in an episode; 60 small or 6 large position steps take as long as one."""
-    actions: Actions = "primitives"
-    """What the agent chooses from: `primitives`, `small_steps` (up to 1 cm), `large_steps` (up to 10 cm), or `all`."""
-    reach: Annotated[float, Field(gt=0.0, le=1.0), OnlyWith("actions", "primitives", "all")] = 1.0
-    """Largest absolute value of a primitive's argument, in metres."""
-    negative_distances: Annotated[bool, OnlyWith("actions", "primitives", "all")] = True
-    """Whether primitives along one axis also take distances below 0, which count as 0, as in the source."""
-    render: bool = False
-    """Draw the arm, for films; without a display MuJoCo needs MUJOCO_GL=egl or osmesa."""
-    reward_scaling: PositiveFraction | None = None
-    """Divide rewards in training by the running standard deviation of the return with this discount.
-
-    If null, rewards are not scaled.
-    """
-    num_workers: NonNegativeInt = 0
-    """Processes that step the environments in parallel. If 0, this process steps them."""
 
 
 class PrimitivesEnv(GymnasiumEnv):
@@ -80,7 +40,7 @@ class PrimitivesEnv(GymnasiumEnv):
     """
 
     Options: ClassVar[type[Settings]] = PrimitivesOptions
-    guarded_settings: ClassVar[tuple[str, ...]] = ()
+    card = CARDS["PrimitivesEnv"]
     observation_names = OBSERVED
 
     def __init__(
@@ -113,20 +73,10 @@ class PrimitivesEnv(GymnasiumEnv):
         self._given = given
         self.discrete_names = tuple(action.name for action in ACTIONS[given.actions])
 
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings."""
-        return ProblemFacts(
-            title=cls.__name__,
-            is_shardable=options.num_workers == 0,
-            has_statistics=options.reward_scaling is not None,
-            default_options=_default_options(options.actions),
-        )
-
     @property
     def default_options(self) -> Mapping[str, Sequence[int | str]]:
         """The kinds of primitives, or with `actions=all` the ways of steering."""
-        return _default_options(self._given.actions)
+        return self._given.default_options
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
         """Return the linear map from observations to initial arguments: to the object, and as far as the goal.
@@ -162,12 +112,3 @@ class PrimitivesEnv(GymnasiumEnv):
             return {}
         reached = MEASURED[self._given.task]
         return {"player of primitives": {"score": reached[self._given.reward], "success": reached["success"]}}
-
-
-def _default_options(actions: Actions) -> dict[str, list[int | str]]:
-    groups = _GROUPED_PRIMITIVES if actions == "primitives" else {}
-    if actions == "all":
-        groups = {
-            name: [action.name for action in ACTIONS[name]] for name in ("small_steps", "large_steps", "primitives")
-        }
-    return {name: [*members] for name, members in groups.items()}

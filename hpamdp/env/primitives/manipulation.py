@@ -3,34 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
 from hpamdp.env.gymnasium_checks import check_render_mode, reset_options, single_action
+from hpamdp.env.primitives.options import ACTIONS, Actions, Reward, Task
 from hpamdp.env.primitives.primitives import (
-    LARGE_POSITION_STEPS,
-    PRIMITIVES,
-    SMALL_POSITION_STEPS,
     STEPS,
-    Action,
     phases,
 )
 from hpamdp.messages import one_line
 from hpamdp.settings import SettingError
-
-Task = Literal["drawer_close", "soccer", "peg_unplug_side", "sweep_into", "assembly", "disassemble"]
-Actions = Literal["primitives", "small_steps", "large_steps", "all"]
-Reward = Literal["dense", "sparse"]
-
-ACTIONS: dict[str, tuple[Action, ...]] = {
-    "primitives": PRIMITIVES,
-    "small_steps": SMALL_POSITION_STEPS,
-    "large_steps": LARGE_POSITION_STEPS,
-    "all": PRIMITIVES + SMALL_POSITION_STEPS + LARGE_POSITION_STEPS,
-}
 
 _XYZ = ("x", "y", "z")
 OBSERVED = (

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from hpamdp.env.primitives.manipulation import Manipulation, Reward, Task
+from hpamdp.env.primitives.manipulation import Manipulation
+from hpamdp.env.primitives.options import Reward, Task
 
 Choice = tuple[str, tuple[float, ...]]
 """A primitive's name and its arguments, in metres."""

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
-from pydantic import PositiveInt
 from torch import Tensor
 
 from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.rooms import rendering, rules
+from hpamdp.env.rooms.options import CARDS, RoomsOptions
 from hpamdp.env.rooms.rules import RoomsState
-from hpamdp.settings import Settings
-
-
-class RoomsOptions(Settings):
-    """Settings of `RoomsEnv`."""
-
-    max_steps: PositiveInt = 50
-    """Steps after which an episode is truncated."""
 
 
 class RoomsEnv(BatchedEnv[RoomsState]):
@@ -38,6 +29,7 @@ class RoomsEnv(BatchedEnv[RoomsState]):
     """
 
     Options = RoomsOptions
+    card = CARDS["RoomsEnv"]
     options: RoomsOptions
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = (
@@ -50,11 +42,6 @@ class RoomsEnv(BatchedEnv[RoomsState]):
     parameter_dims = (1, 1, 1, 1)
     parameter_low = (0.0,) * 4
     parameter_high = (1.0,) * 4
-
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings: the agent chooses between skates and boots."""
-        return ProblemFacts(title=cls.__name__, option_names=("skates", "boots"), has_choice=True)
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:

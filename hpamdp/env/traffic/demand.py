@@ -8,19 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
 from hpamdp.env.traffic.network import NETWORKS, Signal, entries, run_tool
+from hpamdp.env.traffic.options import Kind
 
-Kind = Literal["light", "rush", "shifting"]
 KINDS: tuple[str, ...] = get_args(Kind)
 HELD_OUT = 2**30
 """First number of a demand that training never draws."""
 NUM_DEMANDS = 2**31
-MOST_TRAFFIC = 3.0
-"""Largest factor of all flows."""
 _SLICE_S = 300  # length of the slices of constant flow
 
 

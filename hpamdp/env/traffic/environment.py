@@ -4,65 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial, update_wrapper
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import Field, NonNegativeInt, PositiveInt
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Unbounded
 
 from hpamdp import keys
 from hpamdp.env.base import Metric
-from hpamdp.env.facts import ProblemFacts
-from hpamdp.env.gymnasium.environment import GymnasiumEnv, GymnasiumOptions
-from hpamdp.env.traffic.demand import HELD_OUT, MOST_TRAFFIC, Kind
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.env.gymnasium.options import GymnasiumOptions
+from hpamdp.env.traffic.demand import HELD_OUT
 from hpamdp.env.traffic.lights import TrafficLights
-from hpamdp.env.traffic.network import ARMS, MAX_GREEN, MIN_GREEN, NETWORKS, PHASES, lanes_of
-from hpamdp.env.traffic.players import PLAYERS, START_S, VEHICLE_S
-from hpamdp.env.traffic.simulation import VEHICLES, Reward, observation_names
+from hpamdp.env.traffic.network import ARMS, MAX_GREEN, MIN_GREEN, NETWORKS, lanes_of
+from hpamdp.env.traffic.options import CARDS, PHASES, PLAYERS, TrafficOptions
+from hpamdp.env.traffic.players import START_S, VEHICLE_S
+from hpamdp.env.traffic.simulation import VEHICLES, observation_names
 from hpamdp.geometry import Symmetries, make_symmetries
-from hpamdp.settings import PositiveFraction, Settings
+from hpamdp.settings import Settings
 
 _RESULTS = ("delay", "queue", "stops", "throughput")
-_LEARNED = "learned"
 _DURATION_S = 10.0  # for which a discount stands
 _INITIAL_GREEN_S = 15.0  # in the corridor
-
-
-class TrafficOptions(Settings):
-    """Settings of `TrafficEnv`."""
-
-    network: Literal["crossing", "corridor"] = "crossing"
-    """`crossing`: a single one; `corridor`: three in a row, whose signals the agent sets in turn."""
-    demand: Kind = "rush"
-    """`light`: constant; `rush`: a peak, highest on one axis; `shifting`: one axis is busy first, then the other."""
-    minutes: PositiveInt = 60
-    """Length of an episode in minutes."""
-    traffic: Annotated[float, Field(gt=0.0, le=MOST_TRAFFIC)] = 1.0
-    """Factor on the flows of all arms."""
-    reward: Reward = "queue"
-    """`queue`: minus the vehicle hours waited since the last decision. `waiting`: minus the change of the waiting time.
-
-    The waiting time of `waiting` is that of the vehicles that stand now, in vehicle hours.
-    """
-    whole_seconds: bool = False
-    """Whether greens are whole numbers. Otherwise they are continuous, and rounded to the simulator's step of 1 s."""
-    strategies: bool = False
-    """Whether the choices of the hand-written players are discrete actions, too."""
-    render: bool = False
-    """Draw the network, for films; steps then take longer."""
-    reward_scaling: PositiveFraction | None = None
-    """Divide rewards in training by the running standard deviation of the return with this discount.
-
-    If null, rewards are not scaled.
-    """
-    num_workers: NonNegativeInt = 0
-    """Worker processes that call the simulations. If 0, this process calls one after another.
-
-    Each simulation has a process of its own in any case.
-    """
 
 
 class TrafficEnv(GymnasiumEnv):
@@ -79,7 +44,7 @@ class TrafficEnv(GymnasiumEnv):
     """
 
     Options: ClassVar[type[Settings]] = TrafficOptions
-    guarded_settings: ClassVar[tuple[str, ...]] = ()
+    card = CARDS["TrafficEnv"]
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score"),
         Metric("delay", "delay, s a vehicle"),
@@ -105,7 +70,7 @@ class TrafficEnv(GymnasiumEnv):
     ) -> None:
         given = TrafficOptions.of(options, settings)
         names = ("network", "demand", "minutes", "traffic", "reward", "whole_seconds", "strategies")
-        self._has_strategies = given.strategies
+        self._given = given
         self._is_single = len(NETWORKS[given.network]) == 1
         # Names before the base class reads them.
         self.discrete_names = (*PHASES, *(PLAYERS if given.strategies else ()))
@@ -120,16 +85,6 @@ class TrafficEnv(GymnasiumEnv):
         update_wrapper(make, TrafficLights)  # so that errors name TrafficLights
         super().__init__(num_envs, make=make, options=reading, device=device, seed=seed, first_env=first_env)
 
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings."""
-        return ProblemFacts(
-            title=cls.__name__,
-            is_shardable=options.num_workers == 0,
-            has_statistics=options.reward_scaling is not None,
-            default_options=_options(options.strategies),
-        )
-
     def _make_specs(self) -> None:
         super()._make_specs()
         shape = (self.num_envs, 1)
@@ -143,7 +98,7 @@ class TrafficEnv(GymnasiumEnv):
     @property
     def default_options(self) -> Mapping[str, Sequence[int | str]]:
         """With `strategies`, each of them, and all phases for the learner."""
-        return _options(self._has_strategies)
+        return self._given.default_options
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
         """Return the greens of the player `longest_queue`; in the corridor 15 s.
@@ -204,10 +159,6 @@ class TrafficEnv(GymnasiumEnv):
             means = {name: float(np.mean([of_copy[name] for of_copy in results])) for name in _RESULTS}
             figures[player] = {"score": -means["delay"], **means}
         return figures
-
-
-def _options(has_strategies: bool) -> dict[str, Sequence[int | str]]:
-    return {**{player: [player] for player in PLAYERS}, _LEARNED: [*PHASES]} if has_strategies else {}
 
 
 def _turned(name: str, turn: int) -> str:

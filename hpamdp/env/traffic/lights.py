@@ -9,11 +9,11 @@ import numpy as np
 from gymnasium import spaces
 
 from hpamdp.env.gymnasium_checks import check_render_mode, reset_options, single_action
-from hpamdp.env.traffic.demand import HELD_OUT, KINDS, MOST_TRAFFIC, NUM_DEMANDS
-from hpamdp.env.traffic.network import MAX_GREEN, MIN_GREEN, NETWORKS, PHASES, network_file
-from hpamdp.env.traffic.players import PLAYERS
+from hpamdp.env.traffic.demand import HELD_OUT, KINDS, NUM_DEMANDS
+from hpamdp.env.traffic.network import MAX_GREEN, MIN_GREEN, NETWORKS, network_file
+from hpamdp.env.traffic.options import MOST_TRAFFIC, PHASES, PLAYERS, Reward
 from hpamdp.env.traffic.process import SimulationProcess
-from hpamdp.env.traffic.simulation import Reward, Seen, Task, observation_names
+from hpamdp.env.traffic.simulation import Seen, Task, observation_names
 from hpamdp.settings import SettingError
 
 _NONE = spaces.Box(0.0, 1.0, (0,), np.float32)

@@ -20,7 +20,6 @@ from hpamdp.settings import SettingError
 
 FOLDER = Path(__file__).resolve().parent / "networks"
 ARMS = ("north", "east", "south", "west")
-PHASES = ("north-south", "north-south left", "east-west", "east-west left")
 MIN_GREEN, MAX_GREEN = 5, 60
 """Shortest and longest green (s) of a decision; the actuated programs in `networks` have the same."""
 YELLOW = 3

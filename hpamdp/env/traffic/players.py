@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hpamdp.env.traffic.demand import Demand
-from hpamdp.env.traffic.network import ARMS, MAX_GREEN, MIN_GREEN, NETWORKS, PHASES, YELLOW, Signal, lanes_of
+from hpamdp.env.traffic.network import ARMS, MAX_GREEN, MIN_GREEN, NETWORKS, YELLOW, Signal, lanes_of
+from hpamdp.env.traffic.options import PHASES
 
 if TYPE_CHECKING:
     from hpamdp.env.traffic.simulation import Simulation
 
-ACTUATED = "actuated"
-PLAYERS = ("webster", ACTUATED, "max_pressure", "longest_queue")
+
 START_S = 3.0
 """Green (s) of `LongestQueue` for the start of the first vehicle."""
 VEHICLE_S = (0.7, 1.2, 0.7, 1.2)

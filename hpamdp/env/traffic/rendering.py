@@ -8,7 +8,8 @@ from typing import TypeAlias
 import numpy as np
 
 from hpamdp.env.canvas import BAD_EDGE, FAINT, GOOD_EDGE, INK, PAPER, Canvas, Point
-from hpamdp.env.traffic.network import ARMS, NETWORKS, NUM_LANES, PHASES
+from hpamdp.env.traffic.network import ARMS, NETWORKS, NUM_LANES
+from hpamdp.env.traffic.options import PHASES
 from hpamdp.env.traffic.simulation import Scene
 
 OnPaper: TypeAlias = Callable[[float, float], Point]

@@ -11,17 +11,17 @@ import sys
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from hpamdp.env.traffic.demand import Demand, draw, write_vehicles
-from hpamdp.env.traffic.network import ARMS, GREENS, MAX_GREEN, MIN_GREEN, NETWORKS, NUM_LANES, PHASES, YELLOW
-from hpamdp.env.traffic.players import ACTUATED, LongestQueue, MaxPressure, Webster
+from hpamdp.env.traffic.network import ARMS, GREENS, MAX_GREEN, MIN_GREEN, NETWORKS, NUM_LANES, YELLOW
+from hpamdp.env.traffic.options import ACTUATED, PHASES
+from hpamdp.env.traffic.players import LongestQueue, MaxPressure, Webster
 from hpamdp.messages import one_line
 
-Reward = Literal["queue", "waiting"]
 VEHICLES = 20.0
 """Queues and approaching vehicles are observed in units of this many vehicles."""
 HOUR_S = 3600.0

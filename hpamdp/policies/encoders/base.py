@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from hpamdp.cards import EncoderCard
 from hpamdp.observation_entries import ObservationEntry
 from hpamdp.specs import PAMDPSpecs
 
@@ -35,12 +36,10 @@ class Encoder(nn.Module):
     Attributes:
         entry: name, place and shape of the picture in the observation.
         num_features: number of features. A subclass sets it.
-        flattens: if true, the environment makes pictures part of the vector, and no encoder is made.
-        guarded_settings: settings that can run code, read files or reach servers.
+        card: what the class declares.
     """
 
-    flattens: ClassVar[bool] = False
-    guarded_settings: ClassVar[tuple[str, ...]] = ()
+    card: ClassVar[EncoderCard] = EncoderCard()
 
     num_features: int
 

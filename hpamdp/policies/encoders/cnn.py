@@ -21,7 +21,7 @@ from torchrl.modules import ConvNet
 
 from hpamdp.observation_entries import ObservationEntry
 from hpamdp.policies.encoders.base import Encoder
-from hpamdp.policies.encoders.options import CNNOptions
+from hpamdp.policies.encoders.options import CARDS, CNNOptions
 from hpamdp.settings import SettingError
 
 _NATURE_KERNELS = [8, 4, 3]
@@ -38,6 +38,7 @@ class CNN(Encoder):
     """A convolutional network and a linear layer with ReLU."""
 
     Options = CNNOptions
+    card = CARDS["CNN"]
 
     def __init__(self, entry: ObservationEntry, *, options: CNNOptions | None = None, **settings: Any) -> None:
         super().__init__(entry)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from hpamdp.policies.encoders.base import Encoder
+from hpamdp.policies.encoders.options import CARDS
 
 
 class MLP(Encoder):
@@ -13,4 +12,4 @@ class MLP(Encoder):
     It has no weights. Replay buffers hold the pixels as float32.
     """
 
-    flattens: ClassVar[bool] = True
+    card = CARDS["MLP"]

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, PositiveInt
 
+from hpamdp.cards import EncoderCard
 from hpamdp.settings import FromList, Settings
 
 Channels = Annotated[tuple[PositiveInt, PositiveInt, PositiveInt], FromList]
@@ -26,3 +27,6 @@ class CNNOptions(Settings):
     """
     num_features: Annotated[int, Field(ge=1, le=65536)] | None = None
     """Number of features of a picture. If null, those of the papers: 512 for `nature`, 256 for `impala`."""
+
+
+CARDS = {"CNN": EncoderCard(options=CNNOptions), "MLP": EncoderCard(flattens=True)}

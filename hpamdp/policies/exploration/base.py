@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from hpamdp.cards import ExplorationCard
 from hpamdp.policies.base import Learner
 
 
@@ -30,14 +31,11 @@ class Exploration(nn.Module):
     arguments. Their names and types are the schema of the exploration's yaml in `conf/exploration`.
 
     Attributes:
-        changes: what it changes: the `actions` that are taken, or the `rewards` that are learned from. Learners say
-            which they take (`Learner.explores_with`).
-        guarded_settings: settings that can run code, read files or reach servers.
+        card: what the class declares: whether it changes the `actions` that are taken or the `rewards`.
         exploring_keys: the policy's states that it adds. They do not keep an agent from an export.
     """
 
-    changes: ClassVar[Literal["actions", "rewards"]]
-    guarded_settings: ClassVar[tuple[str, ...]] = ()
+    card: ClassVar[ExplorationCard] = ExplorationCard()
     exploring_keys: ClassVar[frozenset[NestedKey]] = frozenset()
 
     def __init__(self, learner: Learner) -> None:

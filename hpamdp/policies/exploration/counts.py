@@ -28,7 +28,7 @@ from hpamdp.devices import checked_device
 from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.exploration.base import Explored
 from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
-from hpamdp.policies.exploration.options import CountsOptions
+from hpamdp.policies.exploration.options import CARDS, CountsOptions
 from hpamdp.settings import SettingError
 
 _HASH_SEED = 0  # of the factors of the hash, which are the same in every run
@@ -88,6 +88,7 @@ class Counts(RewardsNewStates):
     """A bonus for states that were seldom visited, from a table of counts."""
 
     Options = CountsOptions
+    card = CARDS["Counts"]
 
     def __init__(
         self,

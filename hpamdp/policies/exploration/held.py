@@ -28,7 +28,7 @@ from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
 from hpamdp.policies.base import Learner
 from hpamdp.policies.exploration.base import Exploration, Explored
-from hpamdp.policies.exploration.options import HeldOptions
+from hpamdp.policies.exploration.options import CARDS, HeldOptions
 from hpamdp.policies.masks import random_discrete
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -141,7 +141,7 @@ class Held(Exploration):
     """Temporally extended epsilon-greedy exploration: random actions, held for a heavy-tailed number of steps."""
 
     Options = HeldOptions
-    changes = "actions"
+    card = CARDS["Held"]
     exploring_keys: ClassVar[frozenset[NestedKey]] = frozenset({keys.HOLD_STEPS, keys.HOLD_DISCRETE, keys.HOLD_UNIT})
 
     frames: Tensor

@@ -6,6 +6,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from hpamdp.cards import ExplorationCard
 from hpamdp.policies.base import Learner
 from hpamdp.policies.exploration.base import Exploration, Explored
 from hpamdp.settings import SettingError
@@ -40,15 +41,15 @@ class RewardsNewStates(Exploration):
         SettingError: the learner maps sampled states to others, which were never visited.
     """
 
-    changes = "rewards"
+    card = ExplorationCard(changes="rewards")
 
     def __init__(self, learner: Learner, weight: float) -> None:
         super().__init__(learner)
-        if learner.novelty_by == "sample" and getattr(learner, "symmetry", None) is not None:
+        if learner.card.novelty_by == "sample" and getattr(learner, "symmetry", None) is not None:
             raise SettingError("low.augment=true: maps states to others that were never visited; use low.augment=false")
         self.weight = weight
-        self.adds_to_reward = learner.novelty_by == "reward"
-        self.adds_to_plans = learner.novelty_by == "plan"
+        self.adds_to_reward = learner.card.novelty_by == "reward"
+        self.adds_to_plans = learner.card.novelty_by == "plan"
 
     def explored(self, bonus: Tensor, mask: Tensor, scalars: dict[str, float]) -> Explored:
         """Return what `learn` returns.

@@ -5,7 +5,7 @@ section 2: a network learns to predict a random one at the visited states, and i
 Sekar, Rybkin, Daniilidis, Abbeel, Hafner and Pathak, *Planning to Explore via Self-Supervised World Models*, 2020,
 arXiv 2005.05960, section 3.2: the bonus of a planned step is how much an ensemble's predictions of it differ.
 
-Where the bonus counts is the learner's choice (`Learner.novelty_by`):
+Where the bonus counts is the learner's choice (`LearnerCard.novelty_by`):
 - `reward`: it is added to the rewards of the steps just collected;
 - `sample`: a learner with a replay buffer adds it to the rewards that it samples. It is computed then, not when a step
   is stored: a stored bonus would go on to draw the learner to places that are no longer new;
@@ -47,7 +47,7 @@ from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.encoders.base import JoinedEncoders
 from hpamdp.policies.exploration.base import Explored
 from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
-from hpamdp.policies.exploration.options import NoveltyOptions, _OfNetworks
+from hpamdp.policies.exploration.options import CARDS, NoveltyOptions, _OfNetworks
 from hpamdp.policies.shared.hybrid_actor import hidden_layers
 from hpamdp.policies.shared.networks import OutputLinear
 from hpamdp.settings import SettingError
@@ -113,6 +113,7 @@ class Novelty(RewardsNewStates):
     """A bonus for states that are new, by random network distillation or an ensemble's disagreement."""
 
     Options = NoveltyOptions
+    card = CARDS["Novelty"]
 
     def __init__(
         self,
@@ -139,9 +140,9 @@ class Novelty(RewardsNewStates):
         Raises:
             SettingError: it should be, but the learner has no such ensemble.
         """
-        if self.options.in_plans == "disagreement" and not learner.knows_disagreement:
+        if self.options.in_plans == "disagreement" and not learner.card.knows_disagreement:
             raise SettingError(f"in_plans=disagreement: {type(learner).__name__} has no ensemble that predicts states")
-        asks_ensemble = learner.knows_disagreement and self.options.in_plans != "distillation"
+        asks_ensemble = learner.card.knows_disagreement and self.options.in_plans != "distillation"
         if asks_ensemble:  # no error, since the learner of another option may have the networks
             for name, setting in NoveltyOptions.model_fields.items():
                 value = getattr(self.options, name)

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 from typing_extensions import Self
 
+from hpamdp.cards import ExplorationCard
 from hpamdp.settings import Fraction, FromList, LearningRate, OnlyWith, Settings, Widths
 
 _COARSEST, _FINEST = 1e-12, 1e6  # resolutions in float32; finer cells of observations above 1e6 overflow int64
@@ -94,3 +95,10 @@ class NoveltyOptions(Settings):
     `auto` takes the disagreement if there is such an ensemble. The disagreement gives no bonus in new places whose
     simple dynamics the ensemble predicts already.
     """
+
+
+CARDS = {
+    "Counts": ExplorationCard(options=CountsOptions, changes="rewards"),
+    "Held": ExplorationCard(options=HeldOptions, changes="actions"),
+    "Novelty": ExplorationCard(options=NoveltyOptions, changes="rewards"),
+}

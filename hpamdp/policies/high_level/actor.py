@@ -24,7 +24,7 @@ takes 1.3 times as long for an update of 1,024 decisions on one CPU core (1.6 ti
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -33,7 +33,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
-from hpamdp.policies.high_level.options import ActorOptions
+from hpamdp.policies.high_level.options import CARDS, ActorOptions
 from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.policies.shared.networks import mlp
 from hpamdp.policies.shared.on_policy import OnPolicy, mean_scalars, normalised
@@ -51,9 +51,7 @@ class Actor(OnPolicy, RemembersDecisions):
     """Sample the option from a softmax over the outputs of a network."""
 
     Options = ActorOptions
-    takes_pictures = True
-    sees_state = True
-    modes: ClassVar[tuple[str, ...]] = ("train",)
+    card = CARDS["Actor"]
 
     def __init__(
         self,

@@ -16,7 +16,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hpamdp.policies.high_level.options import EpsilonGreedyOptions
+from hpamdp.policies.high_level.options import CARDS, EpsilonGreedyOptions
 from hpamdp.policies.masks import random_choice
 from hpamdp.policies.shared.bandit import Bandit
 
@@ -28,6 +28,7 @@ class EpsilonGreedy(Bandit):
     """
 
     Options = EpsilonGreedyOptions
+    card = CARDS["EpsilonGreedy"]
     options: EpsilonGreedyOptions
 
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:

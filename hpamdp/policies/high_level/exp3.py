@@ -13,14 +13,14 @@ Differs from the source:
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.high_level.options import Exp3Options
+from hpamdp.policies.high_level.options import CARDS, Exp3Options
 from hpamdp.policies.shared.bandit import Bandit, RewardStatistics
 from hpamdp.specs import PAMDPSpecs
 
@@ -31,8 +31,8 @@ class Exp3(Bandit):
     """Choose with probability (1 - exploration) softmax(exploration / K x gains) + exploration / K, for K options."""
 
     Options = Exp3Options
+    card = CARDS["Exp3"]
     options: Exp3Options
-    modes: ClassVar[tuple[str, ...]] = ("train",)
 
     low: Tensor
     high: Tensor

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector
-from hpamdp.policies.high_level.options import FixedOptions
+from hpamdp.policies.high_level.options import CARDS, FixedOptions
 from hpamdp.policies.masks import allowed_or_first
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -24,8 +24,7 @@ class Fixed(Selector):
     """
 
     Options = FixedOptions
-    lengths_refusal: ClassVar[str | None] = "has a setting for the option, but none for its length"
-    takes_pictures = True
+    card = CARDS["Fixed"]
 
     def __init__(self, specs: PAMDPSpecs, options: FixedOptions | None = None, **settings: Any) -> None:
         super().__init__(specs)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector
+from hpamdp.policies.high_level.options import CARDS
 from hpamdp.specs import PAMDPSpecs
 
 
 class Human(Selector):
     """Choose each option with the probability that humans choose it in the same situation, greedy or not."""
 
-    needs: ClassVar[tuple[str, ...]] = ("human",)
-    takes_pictures = True
+    card = CARDS["Human"]
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

@@ -18,6 +18,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hpamdp.policies.high_level.options import CARDS
 from hpamdp.policies.shared.linear_bandit import LinearBandit
 
 
@@ -26,6 +27,8 @@ class LinThompson(LinearBandit):
 
     With `exploration=1` the samples are Bayesian.
     """
+
+    card = CARDS["LinThompson"]
 
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
         """Return samples of the expected rewards."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from hpamdp.policies.high_level.options import LinUCBOptions
+from hpamdp.policies.high_level.options import CARDS, LinUCBOptions
 from hpamdp.policies.shared.linear_bandit import LinearBandit
 
 
@@ -24,6 +24,7 @@ class LinUCB(LinearBandit):
     """Choose the option with the highest expected reward + exploration x its standard deviation."""
 
     Options = LinUCBOptions
+    card = CARDS["LinUCB"]
 
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
         """Return the upper confidence bounds."""

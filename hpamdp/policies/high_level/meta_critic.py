@@ -18,7 +18,7 @@ Differs from the sources:
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -28,7 +28,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
-from hpamdp.policies.high_level.options import MetaCriticOptions
+from hpamdp.policies.high_level.options import CARDS, MetaCriticOptions
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
@@ -43,9 +43,7 @@ class MetaCritic(RemembersDecisions):
     """Choose the option with the highest mean Q of an ensemble."""
 
     Options = MetaCriticOptions
-    takes_pictures = True
-    sees_state = True
-    ends_options: ClassVar[bool] = True
+    card = CARDS["MetaCritic"]
     num_decisions: Tensor
 
     def __init__(

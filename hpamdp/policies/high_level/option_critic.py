@@ -24,7 +24,7 @@ Differs from the sources:
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -35,7 +35,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
-from hpamdp.policies.high_level.options import OptionCriticOptions
+from hpamdp.policies.high_level.options import CARDS, OptionCriticOptions
 from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.networks import mlp, polyak_update
@@ -48,11 +48,7 @@ class OptionCritic(RemembersDecisions):
     """Choose the option with the highest Q, and learn where it ends."""
 
     Options = OptionCriticOptions
-    ends_options: ClassVar[bool] = True
-    modes: ClassVar[tuple[str, ...]] = ("train",)
-    lengths_refusal: ClassVar[str | None] = (
-        "learns from single steps, which do not tell how long their options still last"
-    )
+    card = CARDS["OptionCritic"]
 
     num_steps: Tensor
 

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from hpamdp.policies.shared.bandit_options import BanditOptions, LinearBanditOptions, SessionBanditOptions
+from hpamdp.cards import SelectorCard
+from hpamdp.policies.shared.bandit_options import (
+    BANDIT_CARD,
+    LINEAR_BANDIT_CARD,
+    BanditOptions,
+    LinearBanditOptions,
+    SessionBanditOptions,
+)
 from hpamdp.policies.shared.options import (
     OnPolicyOptions,
     OptionValueOptions,
@@ -133,3 +141,30 @@ class FixedOptions(Settings):
 
     option: str | int = 0
     """Name or number of the option."""
+
+
+CARDS = {
+    "Actor": SelectorCard(options=ActorOptions, modes=("train",), takes_pictures=True, sees_state=True),
+    "EpsilonGreedy": replace(BANDIT_CARD, options=EpsilonGreedyOptions),
+    "Exp3": replace(BANDIT_CARD, options=Exp3Options, modes=("train",)),
+    "Fixed": SelectorCard(
+        options=FixedOptions,
+        takes_pictures=True,
+        lengths_refusal="has a setting for the option, but none for its length",
+    ),
+    "Human": SelectorCard(needs=("human",), takes_pictures=True),
+    "LinThompson": replace(LINEAR_BANDIT_CARD, options=LinearBanditOptions),
+    "LinUCB": replace(LINEAR_BANDIT_CARD, options=LinUCBOptions),
+    "MetaCritic": SelectorCard(options=MetaCriticOptions, takes_pictures=True, sees_state=True, ends_options=True),
+    "OptionCritic": SelectorCard(
+        options=OptionCriticOptions,
+        modes=("train",),
+        ends_options=True,
+        lengths_refusal="learns from single steps, which do not tell how long their options still last",
+    ),
+    "Oracle": SelectorCard(needs=("oracle",), takes_pictures=True),
+    "Thompson": replace(BANDIT_CARD, options=ThompsonOptions),
+    "UCB": replace(BANDIT_CARD, options=UCBOptions),
+    "Uniform": SelectorCard(takes_pictures=True),
+    "Value": SelectorCard(options=ValueOptions, takes_pictures=True, asks_learners=True, sees_state=True),
+}

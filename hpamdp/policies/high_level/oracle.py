@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector
+from hpamdp.policies.high_level.options import CARDS
 from hpamdp.specs import PAMDPSpecs
 
 
 class Oracle(Selector):
     """Choose the option whose best plan has the highest score."""
 
-    needs: ClassVar[tuple[str, ...]] = ("oracle",)
-    takes_pictures = True
+    card = CARDS["Oracle"]
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hpamdp.policies.high_level.options import ThompsonOptions
+from hpamdp.policies.high_level.options import CARDS, ThompsonOptions
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.bandit import above_all
 from hpamdp.policies.shared.session_bandit import SessionBandit, SessionRewards
@@ -27,6 +27,7 @@ class Thompson(SessionBandit):
     """Choose the option with the highest sample from the Gaussian posterior distributions of the mean rewards."""
 
     Options = ThompsonOptions
+    card = CARDS["Thompson"]
     options: ThompsonOptions
 
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:

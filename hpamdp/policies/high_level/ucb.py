@@ -20,7 +20,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hpamdp.policies.high_level.options import UCBOptions
+from hpamdp.policies.high_level.options import CARDS, UCBOptions
 from hpamdp.policies.shared.session_bandit import SessionBandit, SessionRewards
 
 
@@ -32,6 +32,7 @@ class UCB(SessionBandit):
     """
 
     Options = UCBOptions
+    card = CARDS["UCB"]
     options: UCBOptions
 
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:

@@ -8,13 +8,14 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector
+from hpamdp.policies.high_level.options import CARDS
 from hpamdp.policies.masks import random_choice
 
 
 class Uniform(Selector):
     """Choose each allowed option with the same probability."""
 
-    takes_pictures = True
+    card = CARDS["Uniform"]
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return a random option for every environment, int64 `[*B]`."""

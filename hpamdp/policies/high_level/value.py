@@ -27,7 +27,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
-from hpamdp.policies.high_level.options import ValueOptions
+from hpamdp.policies.high_level.options import CARDS, ValueOptions
 from hpamdp.policies.masks import allowed_or_first, masked_values, random_choice
 from hpamdp.specs import PAMDPSpecs
 
@@ -42,10 +42,8 @@ class Value(Selector):
     """
 
     Options = ValueOptions
+    card = CARDS["Value"]
     learners_memory_key: str | None = None
-    asks_learners = True
-    sees_state = True
-    takes_pictures = True
 
     def __init__(self, specs: PAMDPSpecs, options: ValueOptions | None = None, **settings: Any) -> None:
         super().__init__(specs)

@@ -13,14 +13,13 @@ TorchRL's BCLoss does not fit: it reads a single action leaf.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.low_level.bc_options import BCOptions
+from hpamdp.policies.low_level.bc_options import CARDS, BCOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
 from hpamdp.policies.shared.options import ReplayOptions
@@ -32,10 +31,8 @@ class BC(ReplayLearner):
     """Maximum-likelihood imitation; learns from data sets alone."""
 
     Options = BCOptions
+    card = CARDS["BC"]
     stores_own_parameters = True
-    takes = frozenset(ActionFeature)
-    explores_with: ClassVar[frozenset[str]] = frozenset()  # it takes no steps
-    modes: ClassVar[tuple[str, ...]] = ("offline",)
 
     def __init__(
         self,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat, PositiveInt
 
-from hpamdp.policies.shared.options import BufferOptions, HeadOptions, ScaleOptions
+from hpamdp.cards import ActionFeature
+from hpamdp.policies.shared.options import REPLAY_CARD, BufferOptions, HeadOptions, ScaleOptions
 from hpamdp.settings import LearningRate, Widths
 
 
@@ -23,3 +25,10 @@ class BCOptions(HeadOptions, ScaleOptions, BufferOptions):
     """Learning rate of AdamW."""
     weight_decay: NonNegativeFloat = 1e-2
     """Weight decay of AdamW."""
+
+
+CARDS = {
+    "BC": replace(
+        REPLAY_CARD, options=BCOptions, modes=("offline",), takes=frozenset(ActionFeature), explores_with=frozenset()
+    )
+}

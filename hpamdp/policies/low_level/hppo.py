@@ -36,8 +36,8 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.devices import checked_device
-from hpamdp.policies.base import ActionFeature, Learner, step_discounts
-from hpamdp.policies.low_level.hppo_options import HPPOOptions
+from hpamdp.policies.base import Learner, step_discounts
+from hpamdp.policies.low_level.hppo_options import CARDS, HPPOOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.credit import CreditCritic
 from hpamdp.policies.shared.exported_policy import exported_actor
@@ -59,10 +59,7 @@ class HPPO(OnPolicy, Learner):
     """Clipped policy-gradient updates of both actors from the steps just collected."""
 
     Options = HPPOOptions
-    takes = frozenset(ActionFeature)
-    takes_pictures = True
-    counts_durations = True
-    explores_with = frozenset({"actions", "rewards"})
+    card = CARDS["HPPO"]
     # Waiting rows are of the run that sampled them, maybe on another problem.
     progress = Learner.progress | {"log_min_scale", "log_max_scale", WAITING}
 

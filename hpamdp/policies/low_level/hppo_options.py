@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 from typing_extensions import Self
 
+from hpamdp.cards import ActionFeature, LearnerCard
 from hpamdp.policies.shared.options import Credit, HeadOptions, InitialParameters, MemoryOptions, OnPolicyOptions
 from hpamdp.settings import Fraction, LearningRate, Widths
 
@@ -111,3 +112,15 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
         if self.lr_final > self.lr:
             raise ValueError(f"lr_final={self.lr_final}: must be at most lr={self.lr}")
         return self
+
+
+CARDS = {
+    "HPPO": LearnerCard(
+        options=HPPOOptions,
+        takes=frozenset(ActionFeature),
+        takes_pictures=True,
+        has_value=True,
+        counts_durations=True,
+        explores_with=frozenset({"actions", "rewards"}),
+    )
+}

@@ -49,8 +49,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.low_level.hsac_options import HSACOptions
+from hpamdp.policies.low_level.hsac_options import CARDS, HSACOptions
 from hpamdp.policies.masks import masked_logits, random_discrete, zero_fixed
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.hybrid_actor import HybridActor
@@ -163,8 +162,7 @@ class HSAC(ReplayLearner):
     """Soft policy iteration over discrete actions and their parameters, from a replay buffer of its own."""
 
     Options = HSACOptions
-    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
-    takes_pictures = True
+    card = CARDS["HSAC"]
     stores_own_parameters = True
 
     options: HSACOptions

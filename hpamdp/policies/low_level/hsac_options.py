@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Annotated
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
+from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import (
+    REPLAY_CARD,
     ActorCriticOptions,
     HeadOptions,
     InitialParameters,
@@ -51,3 +54,14 @@ class HSACOptions(HeadOptions, ReplayMemoryOptions, ActorCriticOptions, TargetRa
 
     With `autoregressive`, only targets use samples: the actor's loss values all choices of one component in each state.
     """
+
+
+CARDS = {
+    "HSAC": replace(
+        REPLAY_CARD,
+        options=HSACOptions,
+        takes=frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS}),
+        takes_pictures=True,
+        has_value=True,
+    )
+}

@@ -57,13 +57,12 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import ActionFeature
 from hpamdp.policies.low_level.hyar_codec import HybridCodec
-from hpamdp.policies.low_level.hyar_options import HyAROptions
+from hpamdp.policies.low_level.hyar_options import CARDS, HyAROptions
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
-from hpamdp.policies.shared.actor_critic import set_learning_rates
 from hpamdp.policies.shared.actor_search import even_normal, in_pieces, searching_actor_loss, with_variations
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
+from hpamdp.policies.shared.gradients import set_learning_rates
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     InvertingGradients,
@@ -242,10 +241,8 @@ class HyAR(ReplayLearner):
     """TD3 or DDPG over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
     Options = HyAROptions
-    takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
-    modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
+    card = CARDS["HyAR"]
     may_be_nan: ClassVar[frozenset[str]] = frozenset({LATENT})
-    step_sizes: ClassVar[tuple[str, ...]] = ("embedding_dim", "latent_dim")
     progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"episodes", "warmup_rows"}
 
     options: HyAROptions

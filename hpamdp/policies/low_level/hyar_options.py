@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from typing_extensions import Self
 
-from hpamdp.policies.shared.options import SearchingActorOptions, TargetRateOptions
+from hpamdp.cards import ActionFeature
+from hpamdp.policies.shared.options import REPLAY_CARD, SearchingActorOptions, TargetRateOptions
 from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction, Settings
 
 
@@ -128,3 +130,15 @@ class HyAROptions(CodecOptions, TargetRateOptions, SearchingActorOptions):
                 f"noise_initial={self.noise_initial}: must be at least parameter_noise={self.parameter_noise}"
             )
         return self
+
+
+CARDS = {
+    "HyAR": replace(
+        REPLAY_CARD,
+        options=HyAROptions,
+        modes=("train",),
+        takes=frozenset({ActionFeature.PARAMETER_BOUNDS}),
+        has_value=True,
+        step_sizes=("embedding_dim", "latent_dim"),
+    )
+}

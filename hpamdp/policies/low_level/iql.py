@@ -35,12 +35,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.low_level.iql_options import IQLOptions
-from hpamdp.policies.shared.actor_critic import set_learning_rates
+from hpamdp.policies.low_level.iql_options import CARDS, IQLOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.exploration import cosine_schedule
-from hpamdp.policies.shared.gradients import expectile_loss
+from hpamdp.policies.shared.gradients import expectile_loss, set_learning_rates
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, JointCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -51,8 +49,7 @@ class IQL(ReplayLearner):
     """Twin critics, a state value and an advantage-weighted policy, from a data set or a replay buffer."""
 
     Options = IQLOptions
-    takes = frozenset(ActionFeature)
-    explores_with: ClassVar[frozenset[str]] = frozenset()  # its policy stays near the actions in the data
+    card = CARDS["IQL"]
     stores_own_parameters = True
     progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"actor_updates"}
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
-from hpamdp.policies.shared.options import ActorCriticOptions, HeadOptions, ScaleOptions, TargetRateOptions
+from hpamdp.cards import ActionFeature
+from hpamdp.policies.shared.options import REPLAY_CARD, ActorCriticOptions, HeadOptions, ScaleOptions, TargetRateOptions
 from hpamdp.settings import Expectile, LearningRate, OwnSteps, PositiveFraction, Widths
 
 
@@ -35,3 +37,10 @@ class IQLOptions(HeadOptions, ActorCriticOptions, TargetRateOptions, ScaleOption
     """
     max_weight: PositiveFloat = 100.0
     """Largest weight of an action."""
+
+
+CARDS = {
+    "IQL": replace(
+        REPLAY_CARD, options=IQLOptions, takes=frozenset(ActionFeature), has_value=True, explores_with=frozenset()
+    )
+}

@@ -30,7 +30,7 @@ inverting gradients, for which the gradient must be changed between critic and a
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -40,8 +40,7 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.components import Components
-from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.low_level.paddpg_options import PADDPGOptions
+from hpamdp.policies.low_level.paddpg_options import CARDS, PADDPGOptions
 from hpamdp.policies.masks import masked_values, zero_fixed
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
 from hpamdp.policies.shared.networks import (
@@ -145,10 +144,8 @@ class PADDPGPolicy(TensorDictModuleBase):
 class PADDPG(ReplayLearner):
     """Deterministic policy gradients on scores and parameters together, from a replay buffer of its own."""
 
-    modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no scores
-
     Options = PADDPGOptions
-    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
+    card = CARDS["PADDPG"]
     options: PADDPGOptions
     policy: PADDPGPolicy
 

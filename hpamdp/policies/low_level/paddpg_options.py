@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
+from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import (
+    REPLAY_CARD,
     ActorCriticOptions,
     EpsilonOptions,
     InitialParameters,
@@ -37,3 +40,14 @@ class PADDPGOptions(ActorCriticOptions, TargetRateOptions, TwinCriticOptions, Ep
     """Standard deviation of the exploring noise on scores and parameters."""
     augment: Literal[False] = False
     """Always false: the symmetries of a problem map no scores."""
+
+
+CARDS = {
+    "PADDPG": replace(
+        REPLAY_CARD,
+        options=PADDPGOptions,
+        modes=("train",),
+        takes=frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS}),
+        has_value=True,
+    )
+}

@@ -52,12 +52,12 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import ActionFeature, option_ends, step_discounts
-from hpamdp.policies.low_level.pdqn_options import PDQNOptions
+from hpamdp.policies.base import option_ends, step_discounts
+from hpamdp.policies.low_level.pdqn_options import CARDS, PDQNOptions
 from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete, zero_fixed
-from hpamdp.policies.shared.actor_critic import set_learning_rates
 from hpamdp.policies.shared.actor_search import even_normal, in_pieces, searching_actor_loss, with_variations
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
+from hpamdp.policies.shared.gradients import set_learning_rates
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,
@@ -222,8 +222,7 @@ class PDQN(ReplayLearner):
     """Q-learning over discrete actions and gradient ascent on their parameters, from a replay buffer of its own."""
 
     Options = PDQNOptions
-    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
-    takes_pictures = True
+    card = CARDS["PDQN"]
     exploring_keys = frozenset({PROCESS})
     progress = ReplayLearner.progress | {"episodes"}
 

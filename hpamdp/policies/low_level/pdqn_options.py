@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from typing_extensions import Self
 
-from hpamdp.policies.shared.options import InitialParameters, ReplayMemoryOptions, SearchingActorOptions
+from hpamdp.cards import ActionFeature
+from hpamdp.policies.shared.options import REPLAY_CARD, InitialParameters, ReplayMemoryOptions, SearchingActorOptions
 from hpamdp.settings import OnlyWith, OwnSteps, PositiveFraction
 
 
@@ -62,3 +64,14 @@ class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
                 "parameters"
             )
         return self
+
+
+CARDS = {
+    "PDQN": replace(
+        REPLAY_CARD,
+        options=PDQNOptions,
+        takes=frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS}),
+        takes_pictures=True,
+        has_value=True,
+    )
+}

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
+from hpamdp.policies.low_level.options import CARDS
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -44,9 +43,9 @@ class PlannerPolicy(TensorDictModuleBase):
 class Planner(Learner):
     """Follows the planner and learns nothing."""
 
-    needs: ClassVar[tuple[str, ...]] = ("oracle",)
+    card = CARDS["Planner"]
+
     export_refusal = "plans at every step"
-    takes_pictures = True
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

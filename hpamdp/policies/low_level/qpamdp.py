@@ -46,9 +46,9 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
-from hpamdp.policies.base import ActionFeature, Learner, known_ends
+from hpamdp.policies.base import Learner, known_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
-from hpamdp.policies.low_level.qpamdp_options import QPAMDPOptions
+from hpamdp.policies.low_level.qpamdp_options import CARDS, QPAMDPOptions
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
 from hpamdp.policies.shared.hybrid_actor import RAW
 from hpamdp.policies.shared.networks import InitialLayer
@@ -346,9 +346,7 @@ class QPAMDP(Learner):
     """
 
     Options = QPAMDPOptions
-    needs_current_policy = True  # the scores of the rows are those of the parameters' present distribution
-    takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
-    explores_with: ClassVar[frozenset[str]] = frozenset({"actions", "rewards"})
+    card = CARDS["QPAMDP"]
     # A run from `low.checkpoint` goes on in the saved phase: a second warm-up would fit other bases under the weights.
     progress: ClassVar[frozenset[str]] = frozenset()
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from typing_extensions import Self
 
+from hpamdp.cards import ActionFeature, LearnerCard
 from hpamdp.policies.shared.options import InitialParameters
 from hpamdp.settings import Fraction, FromList, OnlyWith, PositiveFraction, Settings
 
@@ -99,3 +100,14 @@ class QPAMDPOptions(Settings):
         if self.sigma_final > self.sigma:
             raise ValueError(f"sigma_final={self.sigma_final}: must be at most sigma={self.sigma}")
         return self
+
+
+CARDS = {
+    "QPAMDP": LearnerCard(
+        options=QPAMDPOptions,
+        takes=frozenset({ActionFeature.PARAMETER_BOUNDS}),
+        has_value=True,
+        needs_current_policy=True,
+        explores_with=frozenset({"actions", "rewards"}),
+    )
+}

@@ -7,7 +7,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from hpamdp import keys
-from hpamdp.policies.base import ActionFeature, Learner
+from hpamdp.policies.base import Learner
+from hpamdp.policies.low_level.options import CARDS
 from hpamdp.policies.masks import random_discrete
 from hpamdp.specs import PAMDPSpecs
 
@@ -36,8 +37,7 @@ class RandomPolicy(TensorDictModuleBase):
 class Random(Learner):
     """Acts at random and learns nothing."""
 
-    takes = frozenset(ActionFeature)
-    takes_pictures = True
+    card = CARDS["Random"]
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

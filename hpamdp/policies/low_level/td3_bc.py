@@ -26,7 +26,7 @@ TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, wi
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -36,8 +36,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import ActionFeature
-from hpamdp.policies.low_level.td3_bc_options import TD3BCOptions
+from hpamdp.policies.low_level.td3_bc_options import CARDS, TD3BCOptions
 from hpamdp.policies.masks import allowed_rows, masked_logits, zero_fixed
 from hpamdp.policies.shared.exploration import with_exploring_noise
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
@@ -106,8 +105,7 @@ class TD3BC(ReplayLearner):
     """Q-learning on the data's discrete actions with parameters near the data's, from a data set or a replay buffer."""
 
     Options = TD3BCOptions
-    takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
-    explores_with: ClassVar[frozenset[str]] = frozenset()  # it would imitate random actions
+    card = CARDS["TD3BC"]
     stores_own_parameters = True
 
     options: TD3BCOptions

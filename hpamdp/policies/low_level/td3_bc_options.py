@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 
+from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import (
+    REPLAY_CARD,
     ActorCriticOptions,
     ParameterNoiseOptions,
     SmoothedTargetOptions,
@@ -41,3 +44,14 @@ class TD3BCOptions(ActorCriticOptions, TargetRateOptions, SmoothedTargetOptions,
     """Steps before the first update."""
     batch_size: PositiveInt = 256
     """Transitions in an update."""
+
+
+CARDS = {
+    "TD3BC": replace(
+        REPLAY_CARD,
+        options=TD3BCOptions,
+        takes=frozenset({ActionFeature.PARAMETER_BOUNDS}),
+        has_value=True,
+        explores_with=frozenset(),
+    )
+}

@@ -18,7 +18,7 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit_options import BanditOptions
+from hpamdp.policies.shared.bandit_options import BANDIT_CARD, BanditOptions
 from hpamdp.policies.stored_rows import check_choices
 from hpamdp.specs import PAMDPSpecs
 
@@ -131,9 +131,8 @@ class Bandit(Selector):
             count.
     """
 
-    is_bandit: ClassVar[bool] = True
-    takes_pictures = True
     Options: ClassVar[type[BanditOptions]] = BanditOptions
+    card = BANDIT_CARD
     options: BanditOptions
 
     num_decisions: Tensor

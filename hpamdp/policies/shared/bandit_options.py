@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
+from hpamdp.cards import SelectorCard
 from hpamdp.settings import Indices, OnlyWith, Settings
 
 
@@ -48,3 +49,7 @@ class LinearBanditOptions(BanditOptions):
     """Number added to the diagonal of each option's Gram matrix."""
     exploration: PositiveFloat = 1.0
     """Factor of the prediction's standard deviation in exploring choices."""
+
+
+BANDIT_CARD = SelectorCard(is_bandit=True, takes_pictures=True)
+LINEAR_BANDIT_CARD = SelectorCard(is_bandit=True, sees_state=True)

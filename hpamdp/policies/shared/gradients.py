@@ -93,6 +93,15 @@ class Descent:
         return scalars
 
 
+def set_learning_rates(
+    optimizers: Mapping[str, torch.optim.Optimizer], rates: Mapping[str, float], fraction: float
+) -> None:
+    """Set the learning rate of each optimizer to a fraction of the rate of the same name."""
+    for name, rate in rates.items():
+        for group in optimizers[name].param_groups:
+            group["lr"] = rate * fraction
+
+
 def expectile_loss(excess: Tensor, expectile: float) -> Tensor:
     """Return a scalar, least where a prediction is the expectile of its targets: Kostrikov et al. 2021, equation 5.
 

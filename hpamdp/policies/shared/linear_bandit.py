@@ -17,7 +17,7 @@ from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.bandit import RewardStatistics, above_all, check_statistics
-from hpamdp.policies.shared.bandit_options import LinearBanditOptions
+from hpamdp.policies.shared.bandit_options import LINEAR_BANDIT_CARD, LinearBanditOptions
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
@@ -84,9 +84,8 @@ class LinearBandit(Selector):
         recent_features: of the decisions in `statistics.recent_options`, float64 `[window, num_features]`.
     """
 
-    is_bandit: ClassVar[bool] = True
-    sees_state = True
     Options: ClassVar[type[LinearBanditOptions]] = LinearBanditOptions
+    card = LINEAR_BANDIT_CARD
     options: LinearBanditOptions
 
     gram: Tensor

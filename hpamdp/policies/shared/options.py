@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from typing_extensions import Self
 
+from hpamdp.cards import LearnerCard
 from hpamdp.settings import Expectile, Fraction, LearningRate, OnlyWith, OwnSteps, PositiveFraction, Settings, Widths
 
 
@@ -384,3 +385,12 @@ class PlanningOptions(SearchOptions, EndValueOptions, ReplayOptions):
 
     bfloat16 is faster on hardware with instructions for it (AVX-512 BF16, AMX, GPUs) and slower elsewhere.
     """
+
+
+# Learners with a replay buffer count durations, learn from data sets, and take any exploration.
+REPLAY_CARD = LearnerCard(
+    modes=("train", "offline"),
+    counts_durations=True,
+    explores_with=frozenset({"actions", "rewards"}),
+    novelty_by="sample",
+)

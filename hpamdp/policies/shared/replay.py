@@ -6,7 +6,7 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -18,7 +18,7 @@ from hpamdp.devices import checked_device
 from hpamdp.observation_entries import packed, unpacked
 from hpamdp.policies.base import Bonus, Learner, step_discounts
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
-from hpamdp.policies.shared.options import MemoryOptions, ReplayMemoryOptions, ReplayOptions
+from hpamdp.policies.shared.options import REPLAY_CARD, MemoryOptions, ReplayMemoryOptions, ReplayOptions
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
 from hpamdp.policies.shared.symmetry import RandomSymmetry
@@ -58,11 +58,9 @@ class ReplayLearner(Learner):
         max_grad_norm: largest gradient norm of a gradient step; if None, there is no limit.
     """
 
-    modes: ClassVar[tuple[str, ...]] = ("train", "offline")
-    explores_with: ClassVar[frozenset[str]] = frozenset({"actions", "rewards"})
-    novelty_by: ClassVar[Literal["reward", "sample", "plan"]] = "sample"
+    card = REPLAY_CARD
+
     progress: ClassVar[frozenset[str]] = Learner.progress | {"last_rows"}
-    counts_durations: ClassVar[bool] = True
     stores_own_parameters: bool = False
     catches_up: bool = False
     max_grad_norm: float | None = None
@@ -142,7 +140,7 @@ class ReplayLearner(Learner):
             self.start()
         history: dict[str, list[Tensor]] = {}
         for sample in self.sample_batches(num_updates) if num_updates > 0 else ():
-            if self.bonus is not None and self.novelty_by == "sample":
+            if self.bonus is not None and self.card.novelty_by == "sample":
                 sample = self.with_bonus(sample, self.bonus)
             self.updates += 1
             for name, value in self.update_once(sample).items():
@@ -270,7 +268,7 @@ class ReplayLearner(Learner):
         otherwise it is the discount from `step_discounts`, or `gamma` if the learner does not count durations.
         """
         goes_on = (~batch["next", keys.TERMINATED]).float()
-        discount = step_discounts(batch, self.options.gamma) if self.counts_durations else self.options.gamma
+        discount = step_discounts(batch, self.options.gamma) if self.card.counts_durations else self.options.gamma
         rows = TensorDict(
             {
                 "state": batch[keys.OBSERVATION],

@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
+from hpamdp.cards import CollectorCard
 from hpamdp.policies.stored_rows import check_choices
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.state_checks import SavedPart, check_columns, check_generator, checked, example_steps
@@ -126,9 +127,7 @@ class Collection:
     collection uses the current policy, or the policy of the previous batch if it collects ahead.
     """
 
-    package: ClassVar[str | None] = None  # an optional package that it needs; also the name of the extra
-    guarded_settings: ClassVar[tuple[str, ...]] = ()  # settings that can run code, read files or reach servers
-    has_workers: ClassVar[bool] = False  # whether other processes step the environments
+    card: ClassVar[CollectorCard] = CollectorCard()
     cpu_s: float = 0.0  # spent collecting in other processes
 
     @abstractmethod

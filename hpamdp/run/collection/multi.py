@@ -16,8 +16,9 @@ from hpamdp.files import read_regular
 from hpamdp.limits import full_shared_memory
 from hpamdp.messages import warn
 from hpamdp.run.assemble import AssembledRun
+from hpamdp.run.collection.options import CARDS, WorkerOptions
 from hpamdp.run.collection.worker import EnvShard, SharedMemoryCollector
-from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, children_without, modules_here_last
+from hpamdp.run.collection.workers import WorkerCollection, children_without, modules_here_last
 from hpamdp.run.stopping import STOP_SIGNALS
 from hpamdp.run_files import MAX_TEXT_BYTES
 
@@ -26,6 +27,8 @@ _PATIENCE_S = 2.0  # from the moment a worker's pipe is closed until it has an e
 
 class MultiCollection(WorkerCollection):
     """Steps the environments in processes of TorchRL's MultiSyncCollector, which write into shared memory."""
+
+    card = CARDS["MultiCollection"]
 
     def __init__(
         self, config: Config, parts: AssembledRun, frames: int, options: WorkerOptions | None = None, **settings: Any

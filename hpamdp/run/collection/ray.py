@@ -10,7 +10,7 @@ import sys
 import threading
 import warnings
 from pathlib import Path
-from typing import Any, ClassVar, NoReturn
+from typing import Any, NoReturn
 
 from torchrl.collectors.distributed import RayCollector
 
@@ -18,8 +18,9 @@ from hpamdp.config.schema import Config
 from hpamdp.messages import first_line, one_line, warn
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import CollectionError
+from hpamdp.run.collection.options import CARDS, RayOptions
 from hpamdp.run.collection.worker import EnvShard, RemoteShard, ShardCollector, WorkingDir
-from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, children_without
+from hpamdp.run.collection.workers import WorkerCollection, children_without
 from hpamdp.run.stopping import STOP_SIGNALS
 
 _CONNECT_S = 10.0  # until a cluster's address must have answered
@@ -27,19 +28,11 @@ _SLOW_START_S = 120.0
 _SLOW = f"an actor has not started after {_SLOW_START_S:.0f} s; the run waits for it, see `ray status` and Ray's logs"
 
 
-class RayOptions(WorkerOptions):
-    """Settings of `RayCollection`; the workers are Ray actors, each with a CPU."""
-
-    address: str | None = None
-    """Address of a running cluster, as for `ray.init`. If null, Ray runs on this machine for the time of the run."""
-
-
 class RayCollection(WorkerCollection):
     """Steps the environments in the actors of TorchRL's RayCollector."""
 
     Options = RayOptions
-    package: ClassVar[str | None] = "ray"
-    guarded_settings: ClassVar[tuple[str, ...]] = ("address",)
+    card = CARDS["RayCollection"]
 
     def __init__(
         self, config: Config, parts: AssembledRun, frames: int, options: RayOptions | None = None, **settings: Any

@@ -18,10 +18,13 @@ from hpamdp.acting import acting
 from hpamdp.config.schema import Config
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, checked_state, random_seeds
+from hpamdp.run.collection.options import CARDS
 
 
 class SingleCollection(Collection):
     """Steps the environments in the learner's own process, between two updates."""
+
+    card = CARDS["SingleCollection"]
 
     def __init__(self, config: Config, parts: AssembledRun, frames: int = 0) -> None:
         self._parts = parts

@@ -11,11 +11,11 @@ from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn, TypeVar
 
 import torch
-from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
+from hpamdp.cards import CollectorCard
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
@@ -24,24 +24,13 @@ from hpamdp.limits import limit_of
 from hpamdp.messages import first_line
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state, random_seeds
+from hpamdp.run.collection.options import WorkerOptions
 from hpamdp.run.collection.worker import EnvShard, RemoteError, pack_state
 from hpamdp.search_path import protect_children, unprotect_children
-from hpamdp.settings import Settings
 
 _PATIENCE_S = 2.0  # for workers in the middle of a batch that is no longer needed
 
 _Returned = TypeVar("_Returned")
-
-
-class WorkerOptions(Settings):
-    """Settings of collections in several processes."""
-
-    num_workers: PositiveInt = 2
-    """Number of processes, each with an equal part of `num_envs` and a CPU thread."""
-    ahead: bool = False
-    """Collect the next batch, with the earlier policy, while the agent learns from the last batch."""
-    max_restarts: NonNegativeInt = 0
-    """Number of dead workers that are replaced over the whole run. If another worker dies, the run ends."""
 
 
 class WorkerCollection(Collection):
@@ -61,7 +50,7 @@ class WorkerCollection(Collection):
     """
 
     Options: ClassVar[type[WorkerOptions]] = WorkerOptions
-    has_workers: ClassVar[bool] = True
+    card = CollectorCard(has_workers=True)
     options: WorkerOptions
 
     def __init__(

@@ -14,8 +14,7 @@ from pydantic import BaseModel, Field
 from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.play.episodes import STRICT, Point, Record, Trip, parse, problems_of_trips
 from hpamdp.env.boatdock_unseen import fleet
-from hpamdp.env.boatdock_unseen.fleet import Family
-from hpamdp.env.boatdock_unseen.options import MOST_TRIPS, UnseenBoatsOptions
+from hpamdp.env.boatdock_unseen.options import MOST_TRIPS, Family, UnseenBoatsOptions
 from hpamdp.env.play_page import EpisodeError
 
 # Largest difference between a boat and the one that its family has for the number. Sines differ between machines.

@@ -56,7 +56,7 @@ predicted states only. On this project's benchmark the score after 8,000 steps w
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -65,9 +65,9 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import ActionFeature, Bonus, known_ends
+from hpamdp.policies.base import Bonus, known_ends
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
-from hpamdp.policies.low_level.dlpa.options import DLPAOptions
+from hpamdp.policies.low_level.dlpa.options import CARDS, DLPAOptions
 from hpamdp.policies.low_level.dlpa.planner import Planner
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.memory import Stack
@@ -120,12 +120,8 @@ class DLPA(ReplayLearner):
     """
 
     Options = DLPAOptions
-    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
-    modes: ClassVar[tuple[str, ...]] = ("train",)
-    value_setting = "end_values"
+    card = CARDS["DLPA"]
     catches_up = True
-    counts_durations = False  # a plan does not know how long its steps take
-    novelty_by = "plan"
     export_refusal = "plans at every step"
 
     options: DLPAOptions

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 from typing_extensions import Self
 
-from hpamdp.policies.shared.options import PlanningOptions, ReplayMemoryOptions
+from hpamdp.cards import ActionFeature
+from hpamdp.policies.shared.options import REPLAY_CARD, PlanningOptions, ReplayMemoryOptions
 from hpamdp.settings import PositiveFraction, Widths
 
 
@@ -56,3 +58,17 @@ class DLPAOptions(ReplayMemoryOptions, PlannerOptions):
     """Windows in an update."""
     updates_per_step: PositiveFloat = 1.0
     """Updates for each step that the learner collects; the first ones make up for the warm-up."""
+
+
+CARDS = {
+    "DLPA": replace(
+        REPLAY_CARD,
+        options=DLPAOptions,
+        modes=("train",),
+        takes=frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS}),
+        has_value=True,
+        value_setting="end_values",
+        counts_durations=False,
+        novelty_by="plan",
+    )
+}

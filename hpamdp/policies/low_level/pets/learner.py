@@ -59,16 +59,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from hpamdp.policies.base import ActionFeature, Bonus
+from hpamdp.policies.base import Bonus
 from hpamdp.policies.low_level.pets.model import PETSModel
-from hpamdp.policies.low_level.pets.options import PETSOptions
+from hpamdp.policies.low_level.pets.options import CARDS, PETSOptions
 from hpamdp.policies.low_level.pets.policy import PETSPolicy
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.known_directions import KnownDirections
@@ -87,14 +87,9 @@ class PETS(ReplayLearner):
     """A PETSModel trained on all steps so far, and a SequenceSearch that plans in it."""
 
     Options = PETSOptions
-    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
-    modes: ClassVar[tuple[str, ...]] = ("train",)
+    card = CARDS["PETS"]
     stores_own_parameters = True
     catches_up = True
-    remembers_directions = True
-    counts_durations = False  # a plan does not know how long its steps take
-    novelty_by = "plan"
-    knows_disagreement = True
     export_refusal = "plans at every step"
 
     options: PETSOptions

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
+from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import (
+    REPLAY_CARD,
     ParameterNoiseOptions,
     PlanningOptions,
     ReplayMemoryOptions,
@@ -87,3 +90,18 @@ class PETSOptions(PETSPolicyOptions, ReplayMemoryOptions):
     """Steps in a member's minibatch."""
     buffer_size: PositiveInt = 20_000
     """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
+
+
+CARDS = {
+    "PETS": replace(
+        REPLAY_CARD,
+        options=PETSOptions,
+        modes=("train",),
+        takes=frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS}),
+        has_value=True,
+        remembers_directions=True,
+        counts_durations=False,
+        novelty_by="plan",
+        knows_disagreement=True,
+    )
+}

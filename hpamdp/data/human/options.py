@@ -1,0 +1,47 @@
+"""The settings of people's recorded actions."""
+
+from __future__ import annotations
+
+from pydantic import PositiveInt
+
+from hpamdp.cards import DataCard
+from hpamdp.settings import Settings
+
+SHA256 = "9de16874b43de9e377c2c10749cb2bd435a6db3ca7cead445b826d64ec399d20"
+
+
+class PeoplesOptions(Settings):
+    """Settings that select people's episodes and the form of their presses."""
+
+    successes: bool = False
+    """Take only episodes that ended in the dock."""
+    best_people: PositiveInt | None = None
+    """Take only episodes of this many people with the highest mean scores. If null, of all people."""
+    rest_to_rest: bool = True
+    """Convert interrupted presses to rest-to-rest presses, the only presses that the environment has."""
+
+
+class HumanOptions(PeoplesOptions):
+    """Settings of `HumanDemonstrations`."""
+
+    path: str | None = None
+    """The released file. If null, the path in $HPAMDP_HUMAN_DATA, or else the downloaded file."""
+    checksum: str | None = SHA256
+    """The SHA-256 that the file must have, by default the released file's. If null, any file is accepted."""
+    complete: bool = False
+    """Take only episodes with a complete log of presses."""
+
+
+class PlayedOptions(PeoplesOptions):
+    """Settings of `PlayedDemonstrations`."""
+
+    path: str = "played.jsonl"
+    """The file of episodes. Lines without a valid episode are left out, with a warning."""
+    practice: bool = False
+    """Also take practice episodes."""
+
+
+CARDS = {
+    "HumanDemonstrations": DataCard(options=HumanOptions),
+    "PlayedDemonstrations": DataCard(options=PlayedOptions),
+}

@@ -1,0 +1,29 @@
+"""The settings of Moving and Sliding."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import PositiveInt
+
+from hpamdp.cards import ProblemCard
+from hpamdp.env.facts import ProblemOptions
+
+PUBLISHED_STEPS = 201
+
+
+class VehicleOptions(ProblemOptions):
+    """Settings of `MovingEnv` and `SlidingEnv`."""
+
+    max_steps: PositiveInt = PUBLISHED_STEPS
+    """Steps after which an episode ends."""
+    limit: Literal["truncated", "terminated"] = "truncated"
+    """If `terminated`, values stop at the time limit, as in the published code; if `truncated`, they bootstrap past it.
+
+    The time is observed, and the reward at the limit is -1.
+    """
+    compile_rules: bool = False
+    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
+
+
+CARDS = {name: ProblemCard(options=VehicleOptions) for name in ("MovingEnv", "SlidingEnv")}

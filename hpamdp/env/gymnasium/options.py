@@ -1,0 +1,76 @@
+"""The settings of environments made with Gymnasium."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import NonNegativeInt, PositiveInt
+
+from hpamdp.cards import ProblemCard
+from hpamdp.env.facts import SOURCE_SETTINGS
+from hpamdp.settings import PositiveFraction, Settings
+
+ActionForm = Literal["auto", "components"]
+MaskSource = Literal["info", "ignore"]
+OutOfBounds = Literal["refuse", "clip", "allow"]
+Scaling = Literal["bounds", "running", "none"]
+
+
+class GymnasiumOptions(Settings):
+    """Settings of `GymnasiumEnv`."""
+
+    id: str | None = None
+    """The registered name, as `gymnasium.make` takes it; `module:Name-v0` imports the module, which registers it."""
+    entry_point: str | None = None
+    """Instead of `id`, a class or function `package.module:name` that returns the environment."""
+    kwargs: dict[str, Any] | None = None
+    """Arguments of the environment's constructor, as in `env.kwargs={size:5}`."""
+    max_steps: PositiveInt | None = None
+    """Steps after which an episode is truncated. If null, the limit of the `TimeLimit` wrapper or of the spec."""
+    action_form: ActionForm = "auto"
+    """How the action space is read. `auto`: a `Discrete` and boxes beside it can be one choice with its parameters.
+
+    `components`: all parts are independent, so that a `Box` beside a `Discrete` counts whatever is chosen. Only a
+    `OneOf` is then a choice with parameters of its own.
+    """
+    parameter_dims: list[int] | None = None
+    """How many parameters each discrete action takes of one box for all, as in [1, 1, 0]. If null, the whole box."""
+    option_key: int | str | None = None
+    """The option's name in a `Dict` of actions or its number in a `Tuple`. If null, the entry `option`, if any."""
+    action_mask: MaskSource | None = None
+    """Where the environment says which actions it forbids. `info`: `action_mask` and `option_mask` in each info.
+
+    `ignore`: masks are ignored. If null, the entries `action_mask` and `option_mask` of a `Dict` of observations, if it
+    has them. A mask in an info, or a method `action_masks()`, is then refused.
+    """
+    pair_mask: MaskSource | None = None
+    """Where the environment says which discrete actions of different components go together, `pair_mask`.
+
+    `info`: in each info; `ignore`: it is ignored. If null, the entry of a `Dict` of observations, if it has one.
+    """
+    parameter_bounds: MaskSource | None = None
+    """Where the environment gives bounds of the current state, `parameter_low` and `parameter_high`.
+
+    `info`: in each info; `ignore`: they are ignored. If null, entries of a `Dict` of observations, if it has them.
+    """
+    observation_keys: list[int | str] | None = None
+    """Entries of a `Tuple` or `Dict` to observe, as in [0] or [position, speed]. If null, all but masks and bounds."""
+    observation_scaling: Scaling = "bounds"
+    """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not.
+
+    Pictures stay as they are; an encoder divides them by 255.
+    """
+    raw_observations: list[int | str] | None = None
+    """Entries that stay unscaled: names in a `Dict`, numbers in a `Tuple` or of the vector. If null, all are scaled."""
+    reward_scaling: PositiveFraction | None = None
+    """Divide rewards in training by the running standard deviation of the return with this discount.
+
+    If null, rewards are not scaled.
+    """
+    out_of_bounds: OutOfBounds = "refuse"
+    """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""
+    num_workers: NonNegativeInt = 0
+    """Processes that step the copies at the same time, for slow environments. If 0, this process steps them."""
+
+
+CARDS = {"GymnasiumEnv": ProblemCard(options=GymnasiumOptions, guarded_settings=SOURCE_SETTINGS)}
