@@ -182,7 +182,7 @@ def test_a_file_of_sessions_takes_each_once_and_no_episodes_of_people_s_two_boat
         (["env.fleet_size=4", "env.scored_boats=training"], "scored_boats=training, but the page has new"),
         (["env.shortest_press=1"], "env: shortest_press=1: it leads to"),
         (["--agent", "linucb_hppo"], "--agent linucb_hppo: people play env=boatdock_unseen alone; leave it out"),
-        (["--to", "nowhere/a.jsonl", "--agent", "none"], "there is no folder nowhere"),
+        (["--to", "nowhere/a.jsonl", "--agent", "none"], "No such file or directory"),
     ],
 )
 def test_play_tells_what_does_not_go_with_sessions_in_one_line(command, words, said):

@@ -2,7 +2,6 @@
 
 import http.client
 import json
-import random
 import resource
 import socket
 import socketserver
@@ -12,13 +11,11 @@ from contextlib import contextmanager
 
 import pytest
 import torch
-from filelock import FileLock
 from play_players import docked
 
 from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
 from hpamdp.env.play_page import EpisodeError
-from hpamdp.run import page_server
 from hpamdp.run.page_server import EpisodeFile, PageServer
 
 EPISODES = docked(6)
@@ -75,13 +72,12 @@ def raw(server, text, *, shut=True):
         return answer.decode(errors="replace")
 
 
-def test_the_page_and_its_data_are_served_and_nothing_from_elsewhere_is_allowed(server):
+def test_the_page_and_its_data_are_served(server):
     status, text, answer = ask(server, "GET", "/")
-    assert status == 200 and "game.js" in text and "default-src 'self'" in answer.headers["Content-Security-Policy"]
+    assert status == 200 and "game.js" in text and answer.headers["Cross-Origin-Opener-Policy"] == "same-origin"
     assert ask(server, "GET", "/data.js")[1] == 'window.HPAMDP_DATA = {"answer":42};\n'
     for name in BoatPage.files:
         assert ask(server, "GET", f"/{name}?version=1")[0] == 200
-    assert ask(server, "HEAD", "/game.js")[:2] == (200, "")
 
 
 def test_the_page_names_no_other_site():
@@ -126,15 +122,6 @@ def test_a_line_that_was_cut_short_stays_one_line(tmp_path):
     assert [json.loads(lines[0]), json.loads(lines[2])] == EPISODES[:2] and len(lines) == 3
 
 
-def test_a_file_of_something_else_is_refused(tmp_path):
-    path = tmp_path / "notes.txt"
-    path.write_text("dear diary\nnothing happened\n")
-    with pytest.raises(EpisodeError, match="no line is an episode"):
-        EpisodeFile(path, BoatPage(seed=0))
-    with pytest.raises(EpisodeError, match="there is no folder"):
-        EpisodeFile(tmp_path / "nowhere" / "a.jsonl", BoatPage(seed=0))
-
-
 @pytest.mark.parametrize("text", ["dear diary", "{}", '{"player": "me", "index": 1}', "[1, 2]\n", "\0\0\0", "{\n}\n"])
 def test_a_file_without_an_episode_is_refused_and_left_as_it_is(tmp_path, text, command):
     path = tmp_path / "notes.txt"
@@ -142,15 +129,6 @@ def test_a_file_without_an_episode_is_refused_and_left_as_it_is(tmp_path, text, 
     with pytest.raises(EpisodeError, match="no line is an episode; take another file"):
         EpisodeFile(path, BoatPage(seed=0))
     assert path.read_text() == text and [*tmp_path.iterdir()] == [path]
-
-
-def test_a_damaged_line_is_named_and_the_file_is_added_to(tmp_path, capsys):
-    path = tmp_path / "a.jsonl"
-    cut = json.dumps(EPISODES[1])[:50]
-    path.write_text(f"{cut}{json.dumps(EPISODES[0])}\n{json.dumps(EPISODES[2])}\n")
-    with serving(path) as server:
-        assert capsys.readouterr().err == f"{path}: 1 of 2 lines left out: line 1 (no episode)\n"
-        assert [send(server, episode)[0] for episode in EPISODES[:3]] == [201, 201, 200]
 
 
 def test_two_servers_store_an_episode_once(tmp_path):
@@ -161,37 +139,6 @@ def test_two_servers_store_an_episode_once(tmp_path):
         path.rename(tmp_path / "kept.jsonl")  # and a file that is taken away begins again
         assert send(one, EPISODES[0])[0] == 201
     assert len(path.read_text().splitlines()) == 1 and len((tmp_path / "kept.jsonl").read_text().splitlines()) == 2
-
-
-def test_a_lock_that_is_held_is_reported_in_time_and_the_episode_can_be_sent_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(page_server, "_LOCK_PATIENCE", 0.2)
-    with serving(tmp_path / "a.jsonl") as server:
-        with FileLock(tmp_path / ".a.jsonl.lock"):
-            status, text, _ = send(server, EPISODES[0])
-        assert status == 503 and text == "the episode was not stored: another program holds the lock of a.jsonl\n"
-        assert send(server, EPISODES[0])[0] == 201
-
-
-def test_links_in_a_foreign_folder_empty_no_file(tmp_path):
-    (tmp_path / "mine").write_text("precious")
-    (tmp_path / ".a.jsonl.lock").symlink_to("mine")
-    with pytest.raises(EpisodeError, match=r"\.a\.jsonl\.lock: is a link; remove it"):
-        EpisodeFile(tmp_path / "a.jsonl", BoatPage(seed=0))
-    (tmp_path / "b.jsonl").symlink_to("mine")
-    with pytest.raises(EpisodeError, match="no line is an episode"):
-        EpisodeFile(tmp_path / "b.jsonl", BoatPage(seed=0))
-    assert (tmp_path / "mine").read_text() == "precious"
-
-
-def test_a_place_that_cannot_be_written_to_is_reported_at_the_start(tmp_path, monkeypatch):
-    monkeypatch.setattr(page_server.os, "access", lambda path, mode: False)
-    with pytest.raises(EpisodeError, match="cannot be written to"):
-        EpisodeFile(tmp_path / "a.jsonl", BoatPage(seed=0))
-    (tmp_path / "a.jsonl").write_text(json.dumps(EPISODES[0]))
-    with pytest.raises(EpisodeError, match=r"a\.jsonl cannot be written to"):
-        EpisodeFile(tmp_path / "a.jsonl", BoatPage(seed=0))
-    with pytest.raises(EpisodeError, match="File name too long"):
-        EpisodeFile(tmp_path / ("a" * 300), BoatPage(seed=0))
 
 
 @pytest.mark.parametrize("after", [0, 1, 500])
@@ -211,104 +158,44 @@ def test_a_disk_that_is_full_in_the_middle_of_a_line_leaves_the_file_as_it_was(t
     assert [json.loads(line) for line in path.read_text().splitlines()] == EPISODES[:2]
 
 
-def forged(rng, number):
-    """Return a way to spoil an episode, and the body that comes of it."""
-    episode = json.loads(json.dumps(EPISODES[number % len(EPISODES)]))
-    episode["index"] = 10_000 + number
-    names = list(episode)
-    kind = number % 8
-    if kind == 0:  # a figure that does not follow from the presses
-        name = rng.choice(["score", "fuel"])
-        episode[name] = episode[name] * rng.uniform(0.1, 0.9)
-    elif kind == 1:  # a press of another time
-        press = rng.choice(episode["presses"])
-        press["duration"] += rng.choice([-1, 1]) * rng.uniform(1e-5, 0.1)
-    elif kind == 2:  # another end
-        episode["end"] = [episode["end"][0] + rng.uniform(0.01, 5.0), episode["end"][1]]
-    elif kind == 3:  # a field that is missing or has another type
-        name = rng.choice(names)
-        if rng.random() < 0.5:
-            del episode[name]
-        else:
-            episode[name] = rng.choice([None, [], {}, "x" * 100, -7, 1e300, [[[]]], {"a": {"b": 1}}])
-    elif kind == 4:  # a field that does not exist
-        episode[rng.choice(["name", "address", "__proto__", "x" * 200])] = rng.choice(["Ada", 1, None])
-    elif kind == 5:  # other events
-        episode["events"] = episode["events"][: rng.randrange(len(episode["events"]) - 1)]
-    elif kind == 6:  # cut
-        text = json.dumps(episode)
-        return text[: rng.randrange(1, len(text) - 1)].encode()
-    else:  # something else altogether
-        values = [[episode], {**episode, "index": 10**400}, {**episode, "fuel": 10**400}, None, [], 17, "text"]
-        texts = ["", "{" * 50_000, "[" * 50_000, '{"a":NaN}', "\0" * 99, '{"format":1e999}', "<xml/>", "\ud800"]
-        texts += map(json.dumps, values)
-        return rng.choice([*(text.encode(errors="surrogatepass") for text in texts), b"\xff\xfe\x00"])
-    return json.dumps(episode).encode()
-
-
-def test_five_hundred_forged_cut_and_foreign_episodes_are_refused_in_a_line_and_leave_no_trace(tmp_path):
-    rng = random.Random(1)
-    with serving(tmp_path / "a.jsonl") as server:
-        for number in range(500):
-            body = forged(rng, number)
-            status, text, _ = ask(server, "POST", "/episodes", body, JSON)
-            assert status in (400, 411, 422), (number, status, text)
-            assert text.count("\n") == 1 and len(text) < 500 and "Traceback" not in text, text
-        assert not (tmp_path / "a.jsonl").exists()
-        assert send(server, EPISODES[0])[0] == 201  # it still serves
-
-
 @pytest.mark.parametrize(
     "path",
     [
-        *(
-            "/../../etc/passwd",
-            "/..%2f..%2fetc%2fpasswd",
-            "//etc/passwd",
-            "/page/../../boat_page.py",
-            "/%2e%2e/game.js",
-        ),
-        *("/game.js/", "/index.html%00.png", "/.", "/..", "/boat_page.py", "/" + "a" * 5000, "/played.jsonl"),
+        *("/../../etc/passwd", "/..%2f..%2fetc%2fpasswd", "//etc/passwd", "/page/../../boat_page.py"),
+        *("/.", "/..", "/boat_page.py", "/played.jsonl", "/episodes"),
     ],
 )
 def test_nothing_but_the_files_of_the_page_is_sent(server, path):
     status, text, _ = ask(server, "GET", path)
-    assert status in (404, 414) and text.count("\n") == 1 and "import" not in text
+    assert status == 404 and text.count("\n") == 1
 
 
-@pytest.mark.parametrize("method", ["PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "BREW"])
-def test_other_methods_are_refused(server, method):
-    status, text, _ = ask(server, method, "/episodes")
-    assert status == 405 and text.count("\n") == 1
-
-
-def test_episodes_cannot_be_read_and_pages_not_posted_to(server):
-    assert ask(server, "GET", "/episodes")[0] == 405
-    assert ask(server, "POST", "/", "{}", JSON)[0] == 404
-
-
-def test_other_sites_may_neither_send_nor_read(server):
-    port = server.server_port
-    assert send(server, EPISODES[0], Origin="http://evil.example")[0] == 403
-    assert send(server, EPISODES[0], Origin="null")[0] == 403
-    assert send(server, EPISODES[0], Origin=f"ftp://127.0.0.1:{server.server_port}")[0] == 403
-    assert ask(server, "GET", "/", headers={"Host": f"localhost:{port}"})[0] == 200
-    assert ask(server, "POST", "/episodes", "{}", {"Content-Type": "text/plain"})[0] == 415  # as a form could send
+@pytest.mark.parametrize(
+    ("body", "headers", "status"),
+    [
+        ("{}", {"Content-Type": "text/plain"}, 415),  # as a form of another site could send
+        ("{" * 50_000, JSON, 400),
+        ('{"a":NaN}', JSON, 400),
+        ("null", JSON, 422),
+        (json.dumps({**EPISODES[0], "score": 4.9}), JSON, 422),
+    ],
+)
+def test_what_is_no_episode_is_refused_in_a_line(server, body, headers, status):
+    found, text, _ = ask(server, "POST", "/episodes", body, headers)
+    assert found == status and text.count("\n") == 1 and len(text) < 500
+    assert server.episodes.path.read_bytes() == b""
 
 
 def test_an_oversized_episode_is_refused_before_it_is_read(server):
     head = f"POST /episodes HTTP/1.1\r\nHost: localhost:{server.server_port}\r\nContent-Type: application/json\r\n"
     assert " 413 " in raw(server, f"{head}Content-Length: 99999999\r\n\r\n".encode())
-    assert " 413 " in raw(server, f"{head}Content-Length: {'9' * 400}\r\n\r\n".encode())
-    for length in ("-1", "1e3", "ten", "\u0663"):
-        assert " 411 " in raw(server, f"{head}Content-Length: {length}\r\n\r\n".encode())
     assert " 411 " in raw(server, f"{head}Transfer-Encoding: chunked\r\n\r\n5\r\nhello\r\n0\r\n\r\n".encode())
 
 
 def test_a_body_that_is_shorter_than_it_says_is_refused_and_a_silent_client_keeps_nobody_waiting(tmp_path):
     with serving(tmp_path / "a.jsonl", patience=0.2) as server:
         head = f"POST /episodes HTTP/1.1\r\nHost: localhost:{server.server_port}\r\nContent-Type: application/json\r\n"
-        assert " 400 " in raw(server, f"{head}Content-Length: 500\r\n\r\n{{}}".encode())
+        assert " 400 " in raw(server, f"{head}Content-Length: 500\r\n\r\n{{".encode())
         silent = [socket.create_connection(("127.0.0.1", server.server_port)) for _ in range(20)]
         assert send(server, EPISODES[0])[0] == 201
         assert raw(server, f"{head}Content-Length: 500\r\n\r\n{{}}".encode(), shut=False) == ""
@@ -332,15 +219,6 @@ def test_a_class_of_browsers_connects_at_once(tmp_path):
 def test_requests_that_are_none_break_nothing(server, text):
     raw(server, text)
     assert ask(server, "GET", "/")[0] == 200
-
-
-def test_a_disk_that_is_full_is_told_and_the_episode_can_be_sent_again(tmp_path, monkeypatch):
-    with serving(tmp_path / "a.jsonl") as server:
-        with monkeypatch.context() as patch:
-            patch.setattr(page_server.os, "fsync", lambda number: (_ for _ in ()).throw(OSError(28, "No space left")))
-            status, text, _ = send(server, EPISODES[0])
-        assert status == 507 and "No space left" in text
-        assert send(server, EPISODES[0])[0] == 201
 
 
 def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch, command):
@@ -375,7 +253,7 @@ def test_the_plans_of_the_page_are_made_with_the_threads_that_are_set(tmp_path, 
         ),
         (["somewhere"], "--agent somewhere"),
         (["--port", "99999"], "whole number"),
-        (["--to", "nowhere/a.jsonl", "--agent", "none"], "there is no folder nowhere"),
+        (["--to", "nowhere/a.jsonl", "--agent", "none"], "No such file or directory"),
         (["--agent", "none", "--host", "256.1.1.1"], "--host 256.1.1.1"),
     ],
 )
@@ -383,13 +261,6 @@ def test_play_tells_a_mistake_in_one_line(monkeypatch, command, words, said):
     monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
     code, _, err = command("play", *words)
     assert code == 2 and said in err and err.count("\n") == 1
-
-
-def test_the_page_may_send_episodes_through_a_web_server_that_encrypts(tmp_path):
-    with serving(tmp_path / "played.jsonl") as server:
-        host = f"127.0.0.1:{server.server_port}"
-        assert send(server, EPISODES[0], Host=host, Origin=f"https://{host}")[0] == 201
-        assert send(server, EPISODES[1], Host=host, Origin="https://127.0.0.1")[0] == 403
 
 
 @pytest.mark.parametrize(

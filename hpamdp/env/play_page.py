@@ -47,6 +47,3 @@ class PlayPage(Protocol):
 
     def told(self, episodes: Sequence[Mapping[str, Any]]) -> str:
         """Return a sentence about checked episodes, for the end of the command; an empty text tells nothing."""
-
-    def identity(self, episode: Mapping[str, Any]) -> str:
-        """Return a text that identifies a checked episode. An episode that is sent twice is stored once."""

@@ -209,7 +209,7 @@ def serve(page: PlayPage, data: dict[str, Any], options: argparse.Namespace) -> 
         raise ConfigError(f"--to {file_and_reason(error)}") from error
     try:
         server = PageServer((options.host, options.port), page, data, episodes)
-    except (OSError, TypeError) as error:  # the latter for a name that is too long
+    except OSError as error:
         raise ConfigError(f"--host {options.host} --port {options.port}: {reason_of(error)}") from error
     if not server.is_local:
         warn(f"--host {options.host}: others who reach this address can play and add episodes to {options.to}")

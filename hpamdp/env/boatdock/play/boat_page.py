@@ -110,10 +110,6 @@ class BoatPage:
         """Check an episode, as `episodes.check` does, and return it in the form of the file."""
         return episodes.check(episode).model_dump(mode="json")
 
-    def identity(self, episode: Mapping[str, Any]) -> str:
-        """Return a text that identifies an episode: the player and the episode's number."""
-        return episodes.identity(episode["player"], episode["index"])
-
     def told(self, episodes: Sequence[Mapping[str, Any]]) -> str:
         """Tell nothing: the page has the means, and `python -m hpamdp.data.human summary` those of a file."""
         return ""

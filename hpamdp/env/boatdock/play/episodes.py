@@ -117,11 +117,6 @@ def check(value: object) -> Episode:
     return episode
 
 
-def identity(player: object, index: object) -> str:
-    """Return a text that identifies an episode: the player, and the episode's number among that player's."""
-    return f"{player}-{index}"
-
-
 def sail(episodes: Sequence[Episode], presses: Sequence[Sequence[Press | SettledPress]] | None = None) -> Replay:
     """Replay episodes from the given presses. If None, from their own presses."""
     return sail_trips(episodes, _directions(episodes), presses)
@@ -200,9 +195,9 @@ def read_with_problems(path: Path) -> tuple[dict[int, Episode], dict[int, str]]:
         except ValueError as error:
             problems[number] = str(error)
     episodes: dict[int, Episode] = {}
-    line_of: dict[str, int] = {}
+    line_of: dict[tuple[str, int], int] = {}
     for (number, episode), problem in zip(parsed.items(), _problems([*parsed.values()]), strict=True):
-        name = identity(episode.player, episode.index)
+        name = (episode.player, episode.index)
         if problem is None and name in line_of:
             problem = f"the same episode as line {line_of[name]}"
         if problem is None:

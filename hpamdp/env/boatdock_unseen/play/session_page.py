@@ -73,10 +73,6 @@ class SessionPage:
         """Check a session, as `sessions.check` does, and return it in the form of the file."""
         return sessions.check(episode).model_dump(mode="json")
 
-    def identity(self, episode: Mapping[str, Any]) -> str:
-        """Return a text that identifies a session: the player and the session's number."""
-        return episodes.identity(episode["player"], episode["index"])
-
     def told(self, episodes: Sequence[Mapping[str, Any]]) -> str:
         """Return the mean score by number of the trip, of those sessions that have the page's rules."""
         own = [each for each in episodes if each["rules"] == self.rules.model_dump(mode="json")]
