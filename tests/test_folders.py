@@ -499,14 +499,6 @@ def test_a_run_outlives_wandbs_service_and_the_next_run_starts_another(
     assert last[0] == 128 and "continues without" not in capsys.readouterr().err
 
 
-def test_a_run_outlives_the_folder_of_its_tensorboard_events(tmp_path, monkeypatch, capsys):
-    after_batches(monkeypatch, 2, lambda: (tmp_path / "tensorboard").rename(tmp_path / "moved"))
-    assert start(tmp_path, "logger=tensorboard") == 0
-    err = capsys.readouterr().err
-    assert err.count("the run continues without this logger") == 1 and "Traceback" not in err
-    assert len(read_rows(tmp_path / "metrics.csv")) == 5
-
-
 def test_a_job_that_a_signal_stops_is_saved_before_its_launcher_gets_the_signal(tmp_path, command, monkeypatch):
     """As submitit does, whose handler requeues the job and exits."""
     found = []

@@ -138,7 +138,7 @@ def test_nothing_but_numbers_enters_the_file(tmp_path):
 def test_every_logger_takes_a_run(tmp_path, without_login):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    log_a_run(CSVLogger(tmp_path), tmp_path)
+    log_a_run(CSVLogger(), tmp_path)
     log_a_run(TensorboardLogger(tmp_path), tmp_path)
     log_a_run(wandb_logger(tmp_path, "disabled"), tmp_path)
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()

@@ -24,7 +24,6 @@ class NamedLogger(CSVLogger):
         per_option: dict[str, str] | None,
         output_dir: Path,
     ) -> None:
-        super().__init__(output_dir)
         settings = (name, budget, checkpoint, choices, freeze, options, per_option)
         with Path("logged.txt").open("a") as file:
             file.write(f"{settings}\n")

@@ -7,7 +7,6 @@ import netrc
 import os
 import re
 import shutil
-import socket
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -123,32 +122,10 @@ class LenientLogger:
         self._pass(lambda logger: logger.close())
 
 
-class CSVLogger:
-    """Log nothing beyond the files that every run writes.
-
-    Args:
-        output_dir: the run's folder, which has these files.
-    """
+class CSVLogger(Logger):
+    """Log nothing beyond the files that every run writes."""
 
     card = CARDS["CSVLogger"]
-
-    def __init__(self, output_dir: Path) -> None:
-        self.output_dir = output_dir
-
-    def log(self, row: dict[str, float], step: int) -> None:
-        """Do nothing: the row is in `metrics.csv`."""
-
-    def images(self, paths: Iterable[Path]) -> None:
-        """Do nothing: the figures are in the folder."""
-
-    def film(self, path: Path) -> None:
-        """Do nothing: the film is in the folder."""
-
-    def summary(self, figures: dict[str, Any]) -> None:
-        """Do nothing: the summary is in `summary.json`."""
-
-    def close(self) -> None:
-        """Do nothing."""
 
 
 class TensorboardLogger:
@@ -156,8 +133,6 @@ class TensorboardLogger:
 
     The file is complete after each row, and holds the times of training. A resumed run deletes the old events, since
     they may go past its checkpoint, and writes its earlier rows again.
-
-    torch's `SummaryWriter` is not used, because it writes in a thread and prints its errors with a traceback.
 
     Args:
         output_dir: the run's folder; the events go to `tensorboard` in it.
@@ -167,38 +142,37 @@ class TensorboardLogger:
     card = CARDS["TensorboardLogger"]
 
     def __init__(self, output_dir: Path, earlier: EarlierRun | None = None) -> None:
-        from tensorboard.compat.proto.event_pb2 import Event
+        from torch.utils.tensorboard import SummaryWriter
 
         folder = output_dir / TENSORBOARD_NAME
-        folder.mkdir(parents=True, exist_ok=True)
         rows = [] if earlier is None else earlier.rows
         if rows:
             for events in folder.glob("events.out.tfevents.*"):
                 events.unlink()
-        now = time.time()
-        self._file = folder / f"events.out.tfevents.{now:.0f}.{socket.gethostname()}.{os.getpid()}"
-        self._step, self._wall_s = 0, 0.0
-        self._started = now - (rows[-1].get(WALL_SECONDS, 0.0) if rows else 0.0)
-        self._append(Event(wall_time=self._started, file_version="brain.Event:2"))
+        self._started = time.time() - (rows[-1].get(WALL_SECONDS, 0.0) if rows else 0.0)
+        self._step, self._time = 0, self._started
+        self._writer = SummaryWriter(str(folder))
         for row in rows:
             self.log(dict(row), int(row[FRAMES]))
 
     def log(self, row: dict[str, float], step: int) -> None:
         """Write each metric as a scalar after `step` frames."""
-        from torch.utils.tensorboard.summary import scalar
-
-        self._step, self._wall_s = step, row.get(WALL_SECONDS, self._wall_s)
-        self._write([scalar(name, value) for name, value in row.items()])
+        self._step = step
+        if WALL_SECONDS in row:
+            self._time = self._started + row[WALL_SECONDS]
+        for name, value in row.items():
+            self._writer.add_scalar(name, value, step, self._time)
+        self._writer.flush()
 
     def images(self, paths: Iterable[Path]) -> None:
         """Write figures under their file names."""
         import numpy as np
         from PIL import Image
-        from torch.utils.tensorboard.summary import image
 
         for path in paths:
             with Image.open(path) as picture:
-                self._write([image(path.stem, np.asarray(picture.convert("RGB")), dataformats="HWC")])
+                pixels = np.asarray(picture.convert("RGB"))
+            self._writer.add_image(path.stem, pixels, self._step, self._time, dataformats="HWC")
 
     def film(self, path: Path) -> None:
         """Write the GIF unchanged; TensorBoard plays it."""
@@ -207,33 +181,19 @@ class TensorboardLogger:
 
         with Image.open(path) as image:
             width, height = image.size
-        # torch's `video` would encode the pictures again, and needs moviepy.
+        # `add_video` would encode the pictures again, and needs moviepy.
         encoded = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=path.read_bytes())
-        self._write([Summary(value=[Summary.Value(tag=path.stem, image=encoded)])])
+        events: Any = self._writer.file_writer
+        events.add_summary(Summary(value=[Summary.Value(tag=path.stem, image=encoded)]), self._step, self._time)
 
     def summary(self, figures: dict[str, Any]) -> None:
         """Write the summary as a table in text."""
-        from torch.utils.tensorboard.summary import text
-
         lines = [f"| {name} | {value} |" for name, value in figures.items()]
-        self._write([text("summary", "\n".join(["| | |", "|---|---|", *lines]))])
+        self._writer.add_text("summary", "\n".join(["| | |", "|---|---|", *lines]), self._step, self._time)
 
     def close(self) -> None:
-        """Do nothing: the file is complete."""
-
-    def _write(self, summaries: Iterable[Any]) -> None:
-        from tensorboard.compat.proto.event_pb2 import Event
-        from tensorboard.compat.proto.summary_pb2 import Summary
-
-        values = [value for summary in summaries for value in summary.value]
-        time_of_row = self._started + self._wall_s
-        self._append(Event(wall_time=time_of_row, step=self._step, summary=Summary(value=values)))
-
-    def _append(self, event: Any) -> None:
-        from tensorboard.summary.writer.record_writer import RecordWriter
-
-        with self._file.open("ab") as file:
-            RecordWriter(file).write(event.SerializeToString())
+        """Write what waits, and close the file."""
+        self._writer.close()
 
 
 class WandbLogger:
