@@ -12,7 +12,7 @@ from toy_options import Toll, steppers
 from hpamdp import keys
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent, with_option
-from hpamdp.policies.base import Selector
+from hpamdp.policies.base import Selector, States
 from hpamdp.policies.high_level.actor import Actor
 from hpamdp.policies.high_level.fixed import Fixed
 from hpamdp.policies.high_level.uniform import Uniform
@@ -76,8 +76,8 @@ def value(agent: HierarchicalAgent, option: int, observation: torch.Tensor) -> f
     """Return the mean value of observations `[N, 2]` under an option."""
     if agent.is_shared:
         one_hot = torch.nn.functional.one_hot(torch.full((len(observation),), option), 2)
-        return agent.learners[0].value(torch.cat([observation, one_hot], -1)).mean().item()
-    return agent.learners[option].value(observation).mean().item()
+        return agent.learners[0].value(States(torch.cat([observation, one_hot], -1))).mean().item()
+    return agent.learners[option].value(States(observation)).mean().item()
 
 
 def two_options(agent: HierarchicalAgent, num: int, num_steps: int = 2) -> TensorDict:
@@ -148,12 +148,14 @@ def test_the_advantages_of_hppo_count_what_the_options_earn_that_follow(is_share
     batch["next", keys.REWARD] = torch.tensor([1.0, 2.0, 4.0, 8.0]).expand(4, 4).unsqueeze(-1).clone()
     batch = agent.next_options.with_next_option(batch)
     seen = with_option(batch, 2) if is_shared else batch
-    of_option = [agent.next_options.value(seen[keys.OBSERVATION][:, t], batch[keys.OPTION][:, t]) for t in range(4)]
+    of_option = [
+        agent.next_options.value(States(seen[keys.OBSERVATION][:, t]), batch[keys.OPTION][:, t]) for t in range(4)
+    ]
     is_mine = torch.ones(4, 4, dtype=torch.bool) if is_shared else batch[keys.OPTION] == 0
     advantage, target = agent.learners[0].advantages(seen, is_mine)
     for t in (0, 2):
         first, second = batch["next", keys.REWARD][:, t : t + 2].squeeze(-1).unbind(1)
-        after = agent.next_options.value(seen["next", keys.OBSERVATION][:, t], torch.ones(4).long())
+        after = agent.next_options.value(States(seen["next", keys.OBSERVATION][:, t]), torch.ones(4).long())
         expected = first + GAMMA * after - of_option[t] + GAMMA * 0.95 * (second - of_option[t + 1])
         torch.testing.assert_close(advantage[:, t], expected)
         torch.testing.assert_close(target[:, t], expected + of_option[t])
@@ -337,7 +339,7 @@ def test_what_q_pamdp_learns_depends_on_no_step_of_another_option(phase):
         batch["next", keys.REWARD] = torch.rand(64, 6, 1)
         is_other = batch[keys.OPTION] == 1
         # Nothing follows that the other steps could change but by what this learner makes of them itself.
-        agent.learners[1].value = lambda observation: torch.full((len(observation),), 3.0)
+        agent.learners[1].value = lambda states, is_target: torch.full((len(states.observation),), 3.0)
         batch["next", keys.REWARD][is_other] *= scale
         batch[keys.OBSERVATION][is_other] = batch[keys.OBSERVATION][is_other] * scale
         batch["raw_parameters"][is_other] *= scale
@@ -355,7 +357,7 @@ def test_an_option_is_an_episode_of_the_natural_actor_critic_and_what_follows_be
     agent = make_agent("qpamdp", Fixed(SPECS, option="second"), is_shared=False)
     learner = agent.learners[0]
     agent.learn(two_options(agent, 64))
-    agent.learners[1].value = lambda observation: torch.full((len(observation),), 3.0)
+    agent.learners[1].value = lambda states, is_target: torch.full((len(states.observation),), 3.0)
     batch = two_options(agent, 64)
     rows = learner.rows(agent.next_options.with_next_option(batch), batch[keys.OPTION] == 0)
     assert rows["reward"][:, 0].tolist() == pytest.approx([GAMMA * 3.0] * 64)

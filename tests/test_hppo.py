@@ -13,6 +13,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
 from hpamdp.geometry import PlaneGeometry
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.hppo import HPPO, RAW
 from hpamdp.policies.shared.on_policy import generalised_advantages, normalised
 from hpamdp.specs import PAMDPSpecs
@@ -308,7 +309,7 @@ def test_further_passes_of_the_critic_leave_the_actors_alone():
     for learner in (once, more):
         torch.manual_seed(1)
         learner.learn(td, everything(td))
-        errors.append((learner.value(td[keys.OBSERVATION].flatten(0, 1)) - targets.flatten()).square().mean())
+        errors.append((learner.value(States(td[keys.OBSERVATION].flatten(0, 1))) - targets.flatten()).square().mean())
     assert errors[1] < errors[0]
     for name, parameter in once.actor.named_parameters():
         assert torch.equal(parameter, more.actor.get_parameter(name)), name

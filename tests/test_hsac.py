@@ -11,6 +11,7 @@ from torchrl.modules import TanhNormal
 from toy_steps import SPECS, one_step_rows, sample, states
 
 from hpamdp import keys
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.hsac import HSAC
 from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.specs import PAMDPSpecs
@@ -146,7 +147,7 @@ def test_the_value_that_selectors_compare_is_that_of_the_greedy_action_without_e
         acted = learner.policy(td.clone())
         unit_parameters = SPECS.to_unit(acted[keys.PARAMETERS])
         q = learner.target_critics.of_discrete(td[keys.OBSERVATION], acted[keys.DISCRETE], unit_parameters).amin(0)
-        torch.testing.assert_close(learner.value(td[keys.OBSERVATION]), q)
+        torch.testing.assert_close(learner.value(States(td[keys.OBSERVATION])), q)
 
 
 def test_the_greedy_policy_samples_nothing_and_the_exploring_one_is_uniform_in_the_warm_up_alone():

@@ -17,7 +17,7 @@ from hpamdp import keys
 from hpamdp.env.base import ProblemError
 from hpamdp.env.decisions import DecisionEnv, with_decisions
 from hpamdp.policies.agent import HierarchicalAgent, OptionValues
-from hpamdp.policies.base import Selector
+from hpamdp.policies.base import Selector, States
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.random import Random
 from hpamdp.policies.masks import masked_logits
@@ -135,7 +135,7 @@ def test_what_a_forbidden_action_is_worth_does_not_change_a_value(name):
 
     def value() -> torch.Tensor:
         torch.manual_seed(1)
-        return learner.target_value(observation, mask)
+        return learner.value(States(observation, mask), is_target=True)
 
     before = value()
     inflate(learner, 1)
@@ -151,7 +151,8 @@ def test_a_latent_action_is_worth_what_its_allowed_action_is_worth(name):
 
     def value(*allowed: int) -> torch.Tensor:
         torch.manual_seed(1)
-        return learner.value(observation, torch.isin(torch.arange(NUM_DISCRETE), torch.tensor(allowed)).expand(3, -1))
+        mask = torch.isin(torch.arange(NUM_DISCRETE), torch.tensor(allowed)).expand(3, -1)
+        return learner.value(States(observation, mask))
 
     single = torch.stack([value(0), value(1), value(2)])
     assert (single - single[0]).abs().max() > 0.0
@@ -221,8 +222,8 @@ def test_a_forbidden_option_is_never_chosen(high):
 class BestAction(Random):
     """Its value of a state is the highest number of an allowed action."""
 
-    def value(self, observation, action_mask=None):
-        allowed = self.specs.allowed(observation, action_mask)
+    def value(self, states, *, is_target=False):
+        allowed = self.specs.allowed(states.observation, states.action_mask)
         return torch.where(allowed, torch.arange(float(NUM_DISCRETE)), -torch.inf).amax(-1)
 
 
@@ -234,7 +235,7 @@ def test_what_learners_expect_of_an_option_counts_allowed_actions_alone():
     values = OptionValues([BestAction(specs.of_option(i)) for i in range(3)], 3)
     action_mask = torch.tensor([[True, True, True], [True, True, False], [False, False, True]])
     expected = [[1.0, 2.0, 2.0], [1.0, 1.0, 0.0], [-torch.inf, 2.0, 2.0]]
-    assert values(torch.zeros(3, NUM_DISCRETE), action_mask).tolist() == expected
+    assert values(States(torch.zeros(3, NUM_DISCRETE), action_mask)).tolist() == expected
 
 
 def grouped(problem: Forbidden, actions: dict[str, list[int]] | None = None) -> Forbidden:
@@ -296,7 +297,7 @@ def test_an_episode_may_end_where_no_action_of_its_option_is_allowed(name):
     is_stuck = (batch[keys.OPTION] == 2) & is_forbidden & after[keys.DONE].squeeze(-1)
     assert is_stuck.any() and has_action[is_stuck].all()
     assert not after[keys.ACTION_MASK][is_forbidden & ~after[keys.DONE].squeeze(-1)].all(-1).any()
-    for learner, rows in zip(agent.learners, agent._batches_of_learners(batch), strict=True):
+    for learner, rows in zip(agent.learners, agent._views(batch), strict=True):
         learner.store(*rows[2:])
         assert learner.target(learner.augmented(learner.buffer[:])).isfinite().all()
 

@@ -9,6 +9,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_steps import SPECS, one_step_rows, sample, states
 
 from hpamdp import keys
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.paddpg import PADDPG, SCORES
 from hpamdp.specs import PAMDPSpecs
 
@@ -120,4 +121,4 @@ def test_the_value_is_that_of_the_actors_output():
     learner = make(twin=True, target_smoothing=0.0)
     state = torch.randn(10, 4)
     q = learner.critics(torch.cat([state, learner.actor(state)], -1)).squeeze(-1).amin(0)
-    torch.testing.assert_close(learner.value(state), q)
+    torch.testing.assert_close(learner.value(States(state)), q)

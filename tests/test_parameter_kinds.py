@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from hpamdp import keys
 from hpamdp.env.decisions import with_decisions
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.hppo import HPPO
 from hpamdp.policies.low_level.hsac import HSAC
@@ -209,8 +210,7 @@ def test_critics_are_asked_about_zero_where_a_parameter_has_a_single_value(learn
 
     def results():
         torch.manual_seed(0)
-        memory = {"memory": rows["memory"]} if "memory" in rows.keys() else {}
-        value = learner.value(rows["state"], **memory)
+        value = learner.value(States(rows["state"], memory=rows.get("memory", None)))
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             action = learner.policy(empty.select(*learner.policy.in_keys, *BOUNDS).clone())[keys.ACTION]
         given = (rows, None) if learner_class is TD3BC else (rows["state"], None)

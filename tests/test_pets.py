@@ -8,6 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.pets.policy import MEMBER
@@ -585,8 +586,8 @@ def test_before_planning_the_value_assumes_the_only_known_reward():
     learner = make()
     learn(learner, random_batch(64, reward=-torch.ones(64), terminated=torch.zeros(64, dtype=torch.bool)))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert learner.value(torch.randn(3, 4)).tolist() == pytest.approx([-1.97] * 3)
-    assert learner.value(torch.randn(3, 4)).tolist() == [torch.inf] * 3
+        assert learner.value(States(torch.randn(3, 4))).tolist() == pytest.approx([-1.97] * 3)
+    assert learner.value(States(torch.randn(3, 4))).tolist() == [torch.inf] * 3
 
 
 @pytest.mark.parametrize(("reward", "is_good"), [(1.0, False), (-1.0, True)])

@@ -11,6 +11,7 @@ from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.shared.planning import Prediction
@@ -121,7 +122,9 @@ def test_values_at_the_ends_of_plans_know_what_is_remembered(memory, kind):
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         observation = torch.tensor([[0.0, 0.5]]).expand(2, -1)
         held = learner.perception.after(torch.tensor([[1.0, 0.0], [-1.0, 0.0]]))
-        assert (learner.value(observation, memory=held) > 0.5).all(), "after either cue the right action is known"
+        assert (learner.value(States(observation, memory=held)) > 0.5).all(), (
+            "after either cue the right action is known"
+        )
 
 
 def test_with_a_memory_no_states_are_turned():

@@ -340,8 +340,8 @@ class Always7:
 
     decides_ends = True
 
-    def value(self, observation, option, *masks):
-        return torch.full((len(observation),), 7.0)
+    def value(self, states, option):
+        return torch.full((len(option),), 7.0)
 
 
 @pytest.mark.parametrize("num_steps", [1, 3, 6])

@@ -20,7 +20,7 @@ from hpamdp.config.outside_jobs import choosing_class
 from hpamdp.env.base import ProblemError
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent, ended_with_trips, with_option
-from hpamdp.policies.base import Learner, Selector
+from hpamdp.policies.base import Learner, Selector, States
 from hpamdp.policies.high_level.actor import Actor
 from hpamdp.policies.high_level.meta_critic import MetaCritic
 from hpamdp.policies.high_level.option_critic import OptionCritic
@@ -192,8 +192,8 @@ def test_the_targets_of_q_pamdp_count_later_trips_only_if_values_last_a_session(
 class Valuing(HPPO):
     """H-PPO whose every state has the value 10; it keeps its targets and learns nothing."""
 
-    def value(self, observation, *_, **__):
-        return torch.full((len(observation),), 10.0)
+    def value(self, states, *, is_target=False):
+        return torch.full((len(states.observation),), 10.0)
 
     def learn(self, batch, mask):
         self.mask, self.targets = mask, self.advantages(batch, mask)[1]
@@ -449,7 +449,7 @@ def test_options_are_compared_by_what_the_learner_remembers_of_the_session(memor
     values = []
     for option in range(2):
         seen = torch.cat([rolled[keys.OBSERVATION], torch.eye(2)[option].expand(6, 12, 2)], -1)
-        values.append(learner.value(seen.flatten(0, 1), memory=held.flatten(0, 1)).reshape(6, 12))
+        values.append(learner.value(States(seen.flatten(0, 1), memory=held.flatten(0, 1))).reshape(6, 12))
     is_decision = rolled[keys.IS_DECISION].squeeze(-1)
     assert is_decision.sum() == 6 * 6
     assert torch.equal(rolled[keys.OPTION][is_decision], torch.stack(values, -1).argmax(-1)[is_decision])

@@ -14,6 +14,7 @@ from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.base import States
 from hpamdp.policies.high_level.value import Value
 from hpamdp.policies.low_level.hyar import HyAR
 from hpamdp.policies.low_level.paddpg import PADDPG
@@ -34,9 +35,9 @@ class Expects(nn.Module):
         super().__init__()
         self.asked = []
 
-    def forward(self, observation, action_mask=None):
-        self.asked.append(len(observation))
-        return observation[:, :2]
+    def forward(self, states):
+        self.asked.append(len(states.observation))
+        return states.observation[:, :2]
 
 
 def selector(epsilon=0.0) -> Value:
@@ -125,7 +126,7 @@ def test_plans_choose_the_boat(is_shared):
     for learner in agent.learners:
         learner.policy.is_trained.fill_(True)
     with set_exploration_type(GREEDY):
-        value = agent.selector.option_values(observation)
+        value = agent.selector.option_values(States(observation))
     assert value.shape == (16, 2) and value.isfinite().all()
     assert len(value.argmax(-1).unique()) == 2 or not is_shared, "another boat for another layout"
 
@@ -135,9 +136,9 @@ def test_values_are_free_of_the_noise_that_smooths_targets(make):
     learner = make(BOATS, target_smoothing=0.5, target_smoothing_clip=1.0)
     states = torch.randn(50, BOATS.observation_dim)
     with global_generators_unmoved():
-        value = learner.value(states)
-    assert torch.equal(learner.value(states), value)
-    assert not torch.equal(learner.target_value(states), value)
+        value = learner.value(States(states))
+    assert torch.equal(learner.value(States(states)), value)
+    assert not torch.equal(learner.value(States(states), is_target=True), value)
 
 
 @pytest.mark.parametrize("end_values", [False, True])
@@ -147,10 +148,10 @@ def test_while_exploring_options_without_an_update_come_first(end_values):
     learners[0].updates += 1
     learners[0].policy.is_trained.fill_(True)
     observation = with_decisions(BoatDockEnv(4, controller="choose")).reset()[keys.OBSERVATION]
-    value = agent.selector.option_values(observation)
+    value = agent.selector.option_values(States(observation))
     assert value[:, 0].isfinite().all() and value[:, 1].isinf().all()
     with set_exploration_type(GREEDY):
-        assert agent.selector.option_values(observation).isfinite().all()
+        assert agent.selector.option_values(States(observation)).isfinite().all()
 
 
 def test_one_model_of_both_boats_sees_directions_alone():

@@ -31,6 +31,7 @@ from hpamdp.env.rooms import rules
 from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.messages import exit_code
 from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.base import States
 from hpamdp.run.assemble import AssembledRun, assemble
 from hpamdp.run.trainer import Trainer
 
@@ -294,7 +295,7 @@ def learned_values(agent: HierarchicalAgent, observation: torch.Tensor) -> torch
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         option = follows.choose(shown, none, none)
         try:
-            value = torch.stack([follows.value(shown, option) for _ in range(10)]).mean(0)  # some are noisy
+            value = torch.stack([follows.value(States(shown), option) for _ in range(10)]).mean(0)  # some are noisy
         except NotImplementedError:
             value = torch.full(none.shape, torch.nan)
     return value.double()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType
 
 from hpamdp import keys
 from hpamdp.acting import acting, is_greedy
-from hpamdp.policies.base import Learner, Level, Selector, finished_decisions
+from hpamdp.policies.base import Learner, Level, Selector, States, finished_decisions
 from hpamdp.policies.exploration.base import Exploration
 from hpamdp.policies.masks import allowed_or_first
 from hpamdp.policies.option_lengths import OptionLengths, PairSelector
@@ -159,24 +159,18 @@ class OptionValues(nn.Module):
         self.memory_key = memory_keys.pop() if len(memory_keys) == 1 else None
 
     @torch.no_grad()
-    def forward(self, observation: Tensor, action_mask: Tensor | None = None, memory: Tensor | None = None) -> Tensor:
-        """Return the values `[N, num_options]` of observations `[N, observation_dim]`.
+    def forward(self, states: States) -> Tensor:
+        """Return the values `[N, num_options]` of states `[N]`.
 
         While exploring, an option's value is infinite if its learner has made no update yet.
-
-        Args:
-            observation: of the states.
-            action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
-            memory: what the learners remember of the steps before, `[N, size]`. If None, nothing.
         """
         if len(self.learners) == self.num_options:
-            values = [_exploring_value(each, observation, action_mask, memory) for each in self._learners()]
-            return torch.stack(values, -1)
+            return torch.stack([_exploring_value(each, states) for each in self._learners()], -1)
         (learner,) = self._learners()
-        values = []
+        observation, values = states.observation, []
         for one_hot in torch.eye(self.num_options, device=observation.device, dtype=torch.float32):
             seen = torch.cat([observation, one_hot.expand(observation.shape[0], -1)], -1)
-            values.append(_exploring_value(learner, seen, action_mask, memory))
+            values.append(_exploring_value(learner, states._replace(observation=seen)))
         return torch.stack(values, -1)
 
     def _learners(self) -> Iterator[Learner]:
@@ -185,28 +179,11 @@ class OptionValues(nn.Module):
             yield learner
 
 
-def _exploring_value(
-    learner: Learner, observation: Tensor, action_mask: Tensor | None, memory: Tensor | None
-) -> Tensor:
-    """Return a learner's values `[N]` of observations `[N, *]`; infinite if exploring before its first update."""
+def _exploring_value(learner: Learner, states: States) -> Tensor:
+    """Return a learner's values `[N]` of states `[N]`; infinite if exploring before its first update."""
     if not is_greedy() and learner.is_untrained():
-        return torch.full_like(observation[:, 0], torch.inf, dtype=torch.float32)
-    masks = () if action_mask is None else (action_mask,)
-    return learner.value(observation, *masks, **({} if memory is None else {"memory": memory}))
-
-
-def _value(
-    learner: Learner,
-    observation: Tensor,
-    action_mask: Tensor | None,
-    memory: TensorDictBase | None,
-    has_seen: bool,
-) -> Tensor:
-    """Return a learner's values `[N]` for a target, see `NextOptions.value`."""
-    held = None if memory is None or learner.memory_key is None else memory.get(learner.memory_key, None)
-    if held is None:
-        return learner.target_value(observation, action_mask)
-    return learner.target_value(observation, action_mask, memory=held, has_seen=has_seen)
+        return torch.full_like(states.observation[:, 0], torch.inf, dtype=torch.float32)
+    return learner.value(states)
 
 
 class HeldOption(TensorDictModuleBase):
@@ -267,27 +244,17 @@ class AgentNextOptions:
         self.sees_observation_alone = {*selector.in_keys} <= {keys.OBSERVATION, keys.IS_DECISION}
 
     @torch.no_grad()
-    def value(
-        self,
-        observation: Tensor,
-        option: Tensor,
-        action_mask: Tensor | None = None,
-        memory: TensorDictBase | None = None,
-        *,
-        has_seen: bool = False,
-    ) -> Tensor:
+    def value(self, states: States, option: Tensor) -> Tensor:
         """Return the values `[N]` of states under the options chosen there, see `NextOptions.value`."""
         if self.is_shared:
             one_hot = F.one_hot(option, self.num_options).to(torch.float32)
-            seen = torch.cat([self._without_option(observation), one_hot], -1)
-            return _value(self.learners[0], seen, action_mask, memory, has_seen)
-        value = torch.zeros(len(observation), device=observation.device, dtype=torch.float32)
+            seen = torch.cat([self._without_option(states.observation), one_hot], -1)
+            return self.learners[0].value(states._replace(observation=seen), is_target=True)
+        value = torch.zeros(len(option), device=option.device, dtype=torch.float32)
         for i, learner in enumerate(self.learners):
             rows = option == i
             if rows.any():
-                mask = None if action_mask is None else action_mask[rows]
-                held = None if memory is None else memory[rows]
-                value[rows] = _value(learner, observation[rows], mask, held, has_seen)
+                value[rows] = learner.value(states.at(rows).for_memory(learner.memory_key), is_target=True)
         return value
 
     @property
@@ -339,10 +306,13 @@ class AgentNextOptions:
     def with_ends(self, batch: TensorDictBase) -> TensorDictBase:
         """Return a shallow copy of a batch `[*B, T]` in which the selector's decisions mark the ends of options.
 
-        The selector decides on an end one step later. So the next batch will show whether an option ends with the last
-        step. Until then learners take it as ended (`option_ended`), possibly followed by itself. The selector does not
-        (`is_decision`), and hears of it with the next batch (`with_steps_before`).
+        If the selector does not decide on ends, the batch is returned as it is. Otherwise it decides one step later, so
+        the next batch will show whether an option ends with the last step. Until then learners take it as ended
+        (`option_ended`), possibly followed by itself. The selector does not (`is_decision`), and hears of it with the
+        next batch (`with_steps_before`).
         """
+        if not self.decides_ends:
+            return batch
         done = batch.get(("next", keys.DONE))
         is_ended = batch.get(keys.IS_DECISION).roll(-1, -2) & ~done
         is_ended[..., -1, :] = False
@@ -391,6 +361,26 @@ class AgentNextOptions:
 
     def _without_option(self, observation: Tensor) -> Tensor:
         return observation[..., : -self.num_options] if self.is_shared else observation
+
+
+class LearnerView(NamedTuple):
+    """What a learner sees of a batch.
+
+    Attributes:
+        prefix: of its scalars in logs.
+        learner: the learner.
+        batch: the steps `[*B, T]`, with the next options and, if the learner observes it, the option.
+        mask: the steps that are the learner's, bool `[*B, T]`.
+    """
+
+    prefix: str
+    learner: Learner
+    batch: TensorDictBase
+    mask: Tensor
+
+    def named(self, scalars: Mapping[str, float]) -> dict[str, float]:
+        """Return scalars under their names in logs."""
+        return {f"{self.prefix}/{name}": value for name, value in scalars.items()}
 
 
 class HierarchicalAgent(nn.Module):
@@ -491,48 +481,42 @@ class HierarchicalAgent(nn.Module):
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Let both levels learn from a collected batch `[*B, T]`; return scalars named `high/...` and `low/...`."""
-        scalars: dict[str, float] = {}
         self.frames += batch.numel()
-        if self.next_options is not None and self.next_options.decides_ends:
-            batch = self.next_options.with_ends(batch)
-        if self.selector is not None and self.next_options is not None:
-            seen = ended_with_trips(batch) if self.selector_values_end_with_trips else batch
-            seen = steps = self._seen_by_selector(seen)
-            self._set_pending(self.selector, seen)
-            if self.next_options.decides_ends:
-                steps = self.next_options.with_steps_before(seen)
-                if self.selector_values_end_with_trips:  # the step before the batch may have ended a trip
-                    steps = ended_with_trips(steps)
-            scalars.update(self._practise(seen, steps))
-            learned = self.selector.learn_from_options(steps)
-            learned = {**learned, **self.selector.learn_from_steps(seen), **self._mean_length(batch)}
-            scalars.update({f"high/{name}": value for name, value in learned.items()})
-        if self.is_frozen:
-            return scalars
-        if self.values_end_with_trips:
-            batch = ended_with_trips(batch)
-        if len(self.explorations):
-            batch, explored = self._explored(batch)
-            scalars.update(explored)
-        for prefix, learner, rows, mask in self._batches_of_learners(batch):
-            learned = learner.learn(rows, mask)
-            scalars.update({f"{prefix}/{name}": value for name, value in learned.items()})
-        return scalars
-
-    def _explored(self, batch: TensorDictBase) -> tuple[TensorDictBase, dict[str, float]]:
-        """Let the explorations learn from a batch; return it with their bonuses in its rewards, and scalars to log."""
         scalars: dict[str, float] = {}
+        if self.selector is not None and self.next_options is not None:
+            batch = self.next_options.with_ends(batch)
+            scalars |= self._learn_to_choose(self.selector, self.next_options, batch)
+        return scalars if self.is_frozen else scalars | self._learn_to_act(batch)
+
+    def _learn_to_choose(
+        self, selector: Selector, options: AgentNextOptions, batch: TensorDictBase
+    ) -> dict[str, float]:
+        """Let the selector learn from a batch `[*B, T]`, and return scalars to log."""
+        seen = steps = self._seen_by_selector(batch)
+        self._set_pending(selector, seen)
+        if options.decides_ends:
+            steps = options.with_steps_before(seen)
+            if self.selector_values_end_with_trips:  # the step before the batch may have ended a trip
+                steps = ended_with_trips(steps)
+        scalars = self._practise(selector, seen, steps)
+        learned = {**selector.learn_from_options(steps), **selector.learn_from_steps(seen), **self._mean_length(batch)}
+        return scalars | {f"high/{name}": value for name, value in learned.items()}
+
+    def _learn_to_act(self, batch: TensorDictBase) -> dict[str, float]:
+        """Let the explorations and the learners learn from a batch `[*B, T]`, and return scalars to log."""
+        scalars: dict[str, float] = {}
+        views = self._views(ended_with_trips(batch) if self.values_end_with_trips else batch)
         bonuses = []
-        of_learners = self._batches_of_learners(batch)
-        for exploration, (prefix, _, rows, mask) in zip(self.explorations, of_learners, strict=True):
-            assert isinstance(exploration, Exploration)
-            bonus, explored = exploration.learn(rows, mask)
+        for exploration, view in zip(self._explorations(), views, strict=False):
+            bonus, explored = exploration.learn(view.batch, view.mask)
             bonuses += [] if bonus is None else [bonus]
-            scalars.update({f"{prefix}/{name}": value for name, value in explored.items()})
+            scalars |= view.named(explored)
         if bonuses:
             reward = batch.get(("next", keys.REWARD)) + torch.stack(bonuses).sum(0)
-            batch = batch.copy().set(("next", keys.REWARD), reward)
-        return batch, scalars
+            views = [view._replace(batch=view.batch.copy().set(("next", keys.REWARD), reward)) for view in views]
+        for view in views:
+            scalars |= view.named(view.learner.learn(view.batch, view.mask))
+        return scalars
 
     def add_demonstrations(self, batch: TensorDictBase, decisions: TensorDictBase | None = None) -> None:
         """Let the selector learn from a data set `[*B, T]`, if it can, and the learners keep their own transitions.
@@ -547,8 +531,8 @@ class HierarchicalAgent(nn.Module):
             # A row without its option would be stored with option 0, beside the agent's own rows.
             goes_on = torch.zeros_like(batch.get(("next", keys.DONE)))
             batch = batch.copy().set(("next", keys.OPTION_ENDED), goes_on)
-        for _, learner, rows, mask in self._batches_of_learners(batch):
-            learner.add_demonstrations(rows, mask)
+        for view in self._views(batch):
+            view.learner.add_demonstrations(view.batch, view.mask)
 
     def update(self, num_updates: int) -> dict[str, float]:
         """Let both levels make updates from a data set; return scalars named `high/...` and `low/...`."""
@@ -574,9 +558,7 @@ class HierarchicalAgent(nn.Module):
         if self.selector is not None:
             levels["selector"] = self.selector
         owners: dict[str, Level | Exploration] = dict(levels)
-        for i, exploration in enumerate(self.explorations):
-            assert isinstance(exploration, Exploration)
-            owners[f"exploration{i}"] = exploration
+        owners |= {f"exploration{i}": exploration for i, exploration in enumerate(self._explorations())}
         return {f"{owner}_{name}": part for owner, module in owners.items() for name, part in module.stateful().items()}
 
     @torch.no_grad()
@@ -588,15 +570,13 @@ class HierarchicalAgent(nn.Module):
             steps: steps of the environments `[N]`, with the entries that the policy writes.
         """
         batch = steps.unsqueeze(-1)
-        if self.selector is not None and self.selector.decides_ends and self.next_options is not None:
+        if self.next_options is not None:
             batch = self.next_options.with_ends(batch)
         owner, _, part = name.partition("_")
         if owner == "selector":
             return self._level(owner).replay_rows(self._seen_by_selector(batch)).get(part)
-        for i, (_, learner, seen, _) in enumerate(self._batches_of_learners(batch)):
-            if owner == f"learner{i}":
-                return learner.replay_rows(seen).get(part)
-        return None
+        views = {f"learner{i}": view for i, view in enumerate(self._views(batch))}
+        return views[owner].learner.replay_rows(views[owner].batch).get(part) if owner in views else None
 
     def check_rows(self, name: str, rows: TensorDictBase, example: TensorDictBase) -> None:
         """Refuse invalid saved rows of a replay buffer.
@@ -637,28 +617,38 @@ class HierarchicalAgent(nn.Module):
             assert isinstance(learner, Learner)
             yield learner
 
-    def _batches_of_learners(self, batch: TensorDictBase) -> Iterator[tuple[str, Learner, TensorDictBase, Tensor]]:
-        """Yield each learner with its prefix in logs, the batch in its own form, and the mask of its transitions."""
-        everything = torch.ones(batch.shape, dtype=torch.bool, device=batch.get(keys.OBSERVATION).device)
+    def _explorations(self) -> Iterator[Exploration]:
+        for exploration in self.explorations:
+            assert isinstance(exploration, Exploration)
+            yield exploration
+
+    def _views(self, batch: TensorDictBase) -> list[LearnerView]:
+        """Return what each learner sees of a batch `[*B, T]`."""
         if self.next_options is not None and ("next", keys.OPTION_ENDED) in batch.keys(include_nested=True):
             batch = self.next_options.with_next_option(batch)
         if self.is_shared:
             batch = with_option(batch, self.specs.num_options)
-        for i, learner in enumerate(self._learners()):
-            mask = everything if len(self.learners) == 1 else batch.get(keys.OPTION) == i
-            yield self._prefix_of(i), learner, batch, mask
+        if len(self.learners) == 1:
+            masks = [torch.ones(batch.shape, dtype=torch.bool, device=batch.get(keys.OBSERVATION).device)]
+        else:
+            masks = [batch.get(keys.OPTION) == i for i in range(len(self.learners))]
+        return [
+            LearnerView(self._prefix_of(i), learner, batch, mask)
+            for i, (learner, mask) in enumerate(zip(self._learners(), masks, strict=True))
+        ]
 
     def _prefix_of(self, learner: int) -> str:
         return "low" if len(self.learners) == 1 else f"low/{self.specs.option_names[learner]}"
 
-    def _practise(self, batch: TensorDictBase, steps: TensorDictBase) -> dict[str, float]:
+    def _practise(self, selector: Selector, batch: TensorDictBase, steps: TensorDictBase) -> dict[str, float]:
         """Count the practice in a batch `[*B, T]`, and return the next probabilities to log.
 
         Args:
+            selector: the selector.
             batch: its steps.
             steps: those of them whose ends are known, see `Selector.learn_from_options`.
         """
-        if self.selector is None or self.practice is None:
+        if self.practice is None:
             return {}
         decisions = finished_decisions(
             steps.select(keys.OPTION, ("next", keys.IS_DECISION), ("next", keys.OPTION_RETURN))
@@ -668,8 +658,8 @@ class HierarchicalAgent(nn.Module):
         self._set_practice()
         if not self.practice.can_overrule:
             return {}
-        names = self.selector.specs.option_names
-        return {f"high/practice_{name}": p for name, p in zip(names, self.selector.practice.tolist(), strict=True)}
+        names = selector.specs.option_names
+        return {f"high/practice_{name}": p for name, p in zip(names, selector.practice.tolist(), strict=True)}
 
     def practised(self) -> dict[str, float]:
         """Return the fraction of the steps that each choice of the selector has practised, by name."""
@@ -683,6 +673,8 @@ class HierarchicalAgent(nn.Module):
             self.selector.practice.copy_(self.practice.probabilities(int(self.frames)))
 
     def _seen_by_selector(self, batch: TensorDictBase) -> TensorDictBase:
+        if self.selector_values_end_with_trips:
+            batch = ended_with_trips(batch)
         return batch if self.pairs is None else self.pairs.with_pairs(batch)
 
     def _mean_length(self, batch: TensorDictBase) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -98,6 +98,33 @@ def finished_decisions(steps: TensorDictBase) -> TensorDictBase:
     return steps.transpose(0, -1)[is_end.transpose(0, -1)]
 
 
+class States(NamedTuple):
+    """States `[N]` whose values are asked for.
+
+    Attributes:
+        observation: of the states, `[N, observation_dim]`, in the form that the asked learner sees.
+        action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
+        memory: what a learner's policy remembers there, `[N, size]`; zeros where an option begins. If None, nothing.
+        memory_key: the `memory_key` of that learner.
+        has_seen: whether the memory has seen the observations already, as that of a stored step has.
+    """
+
+    observation: Tensor
+    action_mask: Tensor | None = None
+    memory: Tensor | None = None
+    memory_key: str | None = None
+    has_seen: bool = False
+
+    def at(self, rows: Tensor) -> States:
+        """Return the states in some rows, bool `[N]`."""
+        mask, memory = (None if each is None else each[rows] for each in (self.action_mask, self.memory))
+        return self._replace(observation=self.observation[rows], action_mask=mask, memory=memory)
+
+    def for_memory(self, memory_key: str | None) -> States:
+        """Return the states for a learner whose memory has this key, which cannot read another memory."""
+        return self if memory_key == self.memory_key else self._replace(memory=None, memory_key=None, has_seen=False)
+
+
 class NextOptions(Protocol):
     """Which options follow the one that ended, and their values; the agent gives it to its learners.
 
@@ -105,25 +132,8 @@ class NextOptions(Protocol):
     own learner. Learners reach one another in this way only. Observations are in the form that the asking learner sees.
     """
 
-    def value(
-        self,
-        observation: Tensor,
-        option: Tensor,
-        action_mask: Tensor | None = None,
-        memory: TensorDictBase | None = None,
-        *,
-        has_seen: bool = False,
-    ) -> Tensor:
-        """Return the values `[N]` of states under the options chosen there.
-
-        Args:
-            observation: of the states, `[N, observation_dim]`.
-            option: the options chosen there, `[N]`.
-            action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
-            memory: what the learners' policies remember there, `[N]`, under each learner's `memory_key`; zeros where an
-                option begins. If None, nothing.
-            has_seen: whether these memories have seen the observations already.
-        """
+    def value(self, states: States, option: Tensor) -> Tensor:
+        """Return the values `[N]` of states under the options chosen there, int64 `[N]`."""
         ...
 
     @property
@@ -283,9 +293,8 @@ class Selector(Level, TensorDictModuleBase):
 
     Attributes:
         card: what the class declares.
-        option_values: the learners' values of each option, `[N, num_options]`, as a function. Its arguments are
-            observations `[N, observation_dim]`, the states' action masks or None, and what the learners remember of the
-            steps before or None. The agent gives it if the card says `asks_learners`.
+        option_values: the learners' values of each option, `[N, num_options]`, as a function of `States`. The agent
+            gives it if the card says `asks_learners`.
         gamma: discount of an environment step, whatever the length of the options. It discounts `option_return` and
             the value of the next decision, see `next_discount`.
         decides_ends: whether the selector decides where options end, by `ends`, in this run
@@ -599,29 +608,16 @@ class Learner(Level, nn.Module):
                     f"{type(self).__name__} cannot learn {feature.value}; hppo, for example, can (docs/spaces.md)"
                 )
 
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the values `[N]` of states `[N, observation_dim]` from which this learner would bootstrap.
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
+        """Return the values `[N]` of states `[N]` from which this learner would bootstrap.
 
         Target networks give the value, if the learner has any.
 
-        A learner that can have a memory takes two more arguments. `memory`: the memory's states, `[N, size]`; if None,
-        the memory is empty. `has_seen`: whether the memory has seen the observations already, as that of a stored step
-        has. They are passed only to a learner with a `memory_key`, so other learners need not take them.
-
         Args:
-            observation: of the states.
-            action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
+            states: the states.
+            is_target: whether a target is made of the values, as with the target smoothing of TD3.
         """
         raise NotImplementedError(f"{type(self).__name__} has no value to bootstrap from")
-
-    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
-        """Return the values `[N]` of states for a target; arguments as for `value`.
-
-        By default they are those of `value`. Override it if a target needs other values, as with the target smoothing
-        of TD3.
-        """
-        given = [] if action_mask is None else [action_mask]
-        return self.value(observation, *given, **memory)
 
     def is_untrained(self) -> bool:
         """Return whether parameters and buffers show that `value` still comes from untrained networks.

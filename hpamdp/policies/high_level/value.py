@@ -26,7 +26,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import Selector
+from hpamdp.policies.base import Selector, States
 from hpamdp.policies.high_level.options import CARDS, ValueOptions
 from hpamdp.policies.masks import allowed_or_first, masked_values, random_choice
 from hpamdp.specs import PAMDPSpecs
@@ -112,10 +112,9 @@ class Value(Selector):
             option = allowed_or_first(option, option_mask)
         if not is_decision.any():
             return option
-        action_mask, option_mask = (None if mask is None else mask[is_decision] for mask in (action_mask, option_mask))
-        memory = self._learners_memory(td)
-        memory = None if memory is None else memory[is_decision]
-        value = self._values(td.get(keys.OBSERVATION)[is_decision], action_mask, option_mask, memory)
+        states = States(td.get(keys.OBSERVATION), action_mask, self._learners_memory(td), self.learners_memory_key)
+        option_mask = None if option_mask is None else option_mask[is_decision]
+        value = masked_values(self.option_values(states.at(is_decision)), option_mask)
         if is_greedy():
             best = value.argmax(-1)
         else:
@@ -129,21 +128,14 @@ class Value(Selector):
 
     def greedy_choice(self) -> Callable[[TensorDictBase], Tensor]:
         """Return the choice of the allowed option with the highest value, whether or not a decision is due."""
-        names = keys.OBSERVATION, keys.ACTION_MASK, keys.OPTION_MASK
-        return lambda td: self._values(*(td.get(name, None) for name in names)).argmax(-1)
+
+        def greedy(td: TensorDictBase) -> Tensor:
+            states = States(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
+            return masked_values(self.option_values(states), td.get(keys.OPTION_MASK, None)).argmax(-1)
+
+        return greedy
 
     def _learners_memory(self, td: TensorDictBase) -> Tensor | None:
         """Return what the learners remember of the episode's steps before, `[*B, size]`; None if nothing."""
         memory = None if self.learners_memory_key is None else td.get(self.learners_memory_key, None)
         return None if memory is None else torch.where(td.get(keys.EPISODE_STEPS) > 0, memory, 0.0)
-
-    def _values(
-        self,
-        observation: Tensor,
-        action_mask: Tensor | None,
-        option_mask: Tensor | None,
-        memory: Tensor | None = None,
-    ) -> Tensor:
-        """Return the value of each option, `[N, num_options]`, -inf where it is forbidden."""
-        remembered = () if memory is None else (memory,)
-        return masked_values(self.option_values(observation, action_mask, *remembered), option_mask)

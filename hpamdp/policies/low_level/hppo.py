@@ -36,7 +36,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.devices import checked_device
-from hpamdp.policies.base import Learner, step_discounts
+from hpamdp.policies.base import Learner, States, step_discounts
 from hpamdp.policies.low_level.hppo_options import CARDS, HPPOOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.credit import CreditCritic
@@ -281,16 +281,9 @@ class HPPO(OnPolicy, Learner):
         )
         return advantage.squeeze(-1), target.squeeze(-1)
 
-    def value(
-        self,
-        observation: Tensor,
-        action_mask: Tensor | None = None,
-        memory: Tensor | None = None,
-        *,
-        has_seen: bool = False,
-    ) -> Tensor:
-        """Return V(s), `[N]`, given the memory in these states; see `Learner.value`."""
-        return self.critic(self.perception(observation, memory, has_seen=has_seen)).squeeze(-1)
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
+        """Return V(s), `[N]`."""
+        return self.critic(self.perception.of_states(states)).squeeze(-1)
 
     def features(self, rows: Mapping[str, Tensor]) -> Tensor:
         """Return what actors and critic see of rows `[N]`, `[N, perception.specs.observation_dim]`."""
@@ -308,8 +301,8 @@ class HPPO(OnPolicy, Learner):
         memory = self._memory(batch)
 
         def value_of(states: TensorDictBase, rows: Tensor, *, has_seen: bool) -> Tensor:
-            held = None if memory is None else memory[rows]
-            return self.value(states.get(keys.OBSERVATION)[rows], memory=held, has_seen=has_seen).unsqueeze(-1)
+            asked = States(states.get(keys.OBSERVATION), None, memory, self.memory_key, has_seen)
+            return self.value(asked.at(rows)).unsqueeze(-1)
 
         value = torch.zeros(*mask.shape, 1, device=mask.device, dtype=torch.float32)
         value[mask] = value_of(batch, mask, has_seen=True)
@@ -329,11 +322,9 @@ class HPPO(OnPolicy, Learner):
         """Return the values `[*B, T, 1]` of states `[*B, T]` under options `[*B, T]`; see `NextOptions.value`."""
         observation = states.get(keys.OBSERVATION).flatten(0, -2)
         mask = states.get(keys.ACTION_MASK).flatten(0, -2) if self.specs.has_action_mask else None
-        held = None
-        if memory is not None:
-            held = TensorDict({self.memory_key: memory.flatten(0, -2)}, [len(observation)])
-        value = self.next_options.value(observation, option.flatten(), mask, held, has_seen=has_seen)
-        return value.reshape(*option.shape, 1)
+        memory = None if memory is None else memory.flatten(0, -2)
+        asked = States(observation, mask, memory, self.memory_key, has_seen)
+        return self.next_options.value(asked, option.flatten()).reshape(*option.shape, 1)
 
     def _held_on(self, batch: TensorDictBase) -> Tensor | None:
         """Return the memories `[*B, T, size]` for the values of the next states; zeros where an option has ended."""

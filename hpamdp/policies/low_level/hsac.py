@@ -49,6 +49,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.hsac_options import CARDS, HSACOptions
 from hpamdp.policies.masks import masked_logits, random_discrete, zero_fixed
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
@@ -254,30 +255,19 @@ class HSAC(ReplayLearner):
         return discrete_loss + self.log_parameter_temperature * parameter_excess, {}
 
     @torch.no_grad()
-    def value(
-        self,
-        observation: Tensor,
-        action_mask: Tensor | None = None,
-        memory: Tensor | None = None,
-        *,
-        has_seen: bool = False,
-    ) -> Tensor:
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
         """Return the value of the most probable action by the target critics, `[B]`; the actor sees their features.
 
-        It counts no entropy, which the greedy policy does not earn. `Learner.value` explains `memory` and `has_seen`.
+        It counts no entropy, which the greedy policy does not earn. Targets are the soft value V'(s).
         """
-        allowed, is_fixed = self.specs.allowed(observation, action_mask), self.specs.is_fixed(observation)
-        features = self.target_perception(observation, memory, has_seen=has_seen)
+        observation = states.observation
+        allowed, is_fixed = self.specs.allowed(observation, states.action_mask), self.specs.is_fixed(observation)
+        features = self.target_perception.of_states(states)
+        if is_target:
+            return self.soft_value(self.target_critics, features, allowed, is_fixed)[0]
         discrete, raw = self.actor.most_probable(features, allowed, None)
         unit_parameters = zero_fixed(raw.tanh(), is_fixed)
         return self.target_critics.of_discrete(features, discrete, unit_parameters).amin(0)
-
-    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
-        """Return the soft value V'(s) by the target critics, `[B]`; see `value`."""
-        allowed = self.specs.allowed(observation, action_mask)
-        features = self.target_perception(observation, memory.pop("memory", None), **memory)
-        value, _, _ = self.soft_value(self.target_critics, features, allowed, self.specs.is_fixed(observation))
-        return value
 
     def soft_value(
         self,

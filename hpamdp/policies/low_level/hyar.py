@@ -57,6 +57,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.hyar_codec import HybridCodec
 from hpamdp.policies.low_level.hyar_options import CARDS, HyAROptions
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
@@ -369,23 +370,18 @@ class HyAR(ReplayLearner):
         return loss, {"critic": loss, "redone": is_corrected.float().mean()}
 
     @torch.no_grad()
-    def value(
-        self, observation: Tensor, action_mask: Tensor | None = None, *, smoothing: tuple[float, float] = (0.0, 0.0)
-    ) -> Tensor:
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
         """Return the max over the target actor's allowed proposals a of min Q'(s, a), `[B]`.
 
-        With `smoothing`, a standard deviation and a bound, the proposals carry clipped noise.
+        The proposals of targets carry clipped noise.
         """
-        allowed = self.specs.allowed(observation, action_mask)
-        given = with_clipped_noise(self.target_actor(observation), *smoothing)
+        observation = states.observation
+        allowed = self.specs.allowed(observation, states.action_mask)
+        given = with_clipped_noise(self.target_actor(observation), *(self.smoothing if is_target else (0.0, 0.0)))
         proposals = self.target_actor.proposals(given, self.codec.embeddings)
         if not self.actor.proposes_each:
             return self.target_critics(observation, self.codec.of_allowed(proposals, allowed)).amin(0).amax(-1)
         return masked_values(self.target_critics(observation, proposals).amin(0), allowed).amax(-1)
-
-    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
-        """Return `value` with target smoothing."""
-        return self.value(observation, action_mask, **memory, smoothing=self.smoothing)
 
     def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls with the values of the actor's allowed proposals by the first critic."""

@@ -35,6 +35,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.iql_options import CARDS, IQLOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.exploration import cosine_schedule
@@ -100,7 +101,7 @@ class IQL(ReplayLearner):
 
     def value_loss(self, state: Tensor, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the distance of V from the expectile of the values `[B]` of the data's actions."""
-        excess = q - self.value(state)
+        excess = q - self.state_value(state).squeeze(-1)
         loss = expectile_loss(excess, self.options.expectile)
         return loss, {"value": loss}
 
@@ -113,7 +114,7 @@ class IQL(ReplayLearner):
     def actor_loss(self, sample: TensorDictBase, allowed: Tensor | None, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the negative log-likelihood of the data's actions, weighted by their advantages."""
         with torch.no_grad():
-            advantage = q - self.value(sample["state"])
+            advantage = q - self.state_value(sample["state"]).squeeze(-1)
             weight = (self.options.temperature * advantage).exp().clamp(max=self.options.max_weight)
         discrete, unit_parameters = sample["discrete"], sample["unit"]
         distribution = self.actor.given(sample["state"], discrete, unit_parameters, allowed, self.pairs(sample))
@@ -122,6 +123,6 @@ class IQL(ReplayLearner):
         loss = -(weight * (discrete_log_prob + parameter_log_prob)).mean()
         return loss, {"advantage_weight": weight.mean()}
 
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
         """Return V(s), `[B]`."""
-        return self.state_value(observation).squeeze(-1)
+        return self.state_value(states.observation).squeeze(-1)

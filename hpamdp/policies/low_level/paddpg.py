@@ -40,6 +40,7 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.components import Components
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.paddpg_options import CARDS, PADDPGOptions
 from hpamdp.policies.masks import masked_values, zero_fixed
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
@@ -195,18 +196,16 @@ class PADDPG(ReplayLearner):
         return loss, {"actor": loss}
 
     @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None, *, smoothing: float = 0.0) -> Tensor:
-        """Return min Q'(s, a), `[B]`, with a the target actor's output, plus noise of the deviation `smoothing`."""
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
+        """Return min Q'(s, a), `[B]`, with a the target actor's output; targets of a twin learner add clipped noise."""
+        observation = states.observation
         output = self.target_actor(observation)
         if self.options.twin:
+            smoothing = self.options.target_smoothing if is_target else 0.0
             output = with_clipped_noise(output, smoothing, self.options.target_smoothing_clip)
             output = self.target_actor.as_stored(output, observation)
-        output = with_lowest_scores(output, self.specs.allowed(observation, action_mask))
+        output = with_lowest_scores(output, self.specs.allowed(observation, states.action_mask))
         return q_values(self.target_critics, observation, output).amin(0)
-
-    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
-        """Return `value` with target smoothing, if the learner is twin."""
-        return self.value(observation, action_mask, **memory, smoothing=self.options.target_smoothing)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the rows to store, with all scores; where an exploration acted, with the highest for its action."""

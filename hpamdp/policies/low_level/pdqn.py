@@ -52,7 +52,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import option_ends, step_discounts
+from hpamdp.policies.base import States, option_ends, step_discounts
 from hpamdp.policies.low_level.pdqn_options import CARDS, PDQNOptions
 from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete, zero_fixed
 from hpamdp.policies.shared.actor_search import even_normal, in_pieces, searching_actor_loss, with_variations
@@ -281,7 +281,7 @@ class PDQN(ReplayLearner):
     def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared TD error, summed over the critics.
 
-        The target is r + discount * V(s'), where V is `target_value`. A subclass may override `target`, which returns
+        The target is r + discount * V(s'), where V is `value`. A subclass may override `target`, which returns
         it as `[B]`, given a sample with `state`, `discrete`, `unit` (the executed parameters in [-1, 1]), `reward`,
         `next_state` and `discount`. `sample` also has the masks if the problem has any, and the options.
         """
@@ -290,36 +290,22 @@ class PDQN(ReplayLearner):
         return loss, {"critic": loss, "q": q.mean()}
 
     @torch.no_grad()
-    def value(
-        self,
-        observation: Tensor,
-        action_mask: Tensor | None = None,
-        memory: Tensor | None = None,
-        *,
-        has_seen: bool = False,
-        smoothing: float = 0.0,
-    ) -> Tensor:
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
         """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`; the sum over the components.
 
-        With `double_q`, the learned critics choose k instead of the target critics. `Learner.value` explains `memory`
-        and `has_seen`; `smoothing` is the standard deviation of noise on x'(s).
+        With `double_q`, the learned critics choose k instead of the target critics. Targets have `target_smoothing`.
         """
-        state = self.target_perception(observation, memory, has_seen=has_seen)
-        clip = self.options.target_smoothing_clip
-        unit_parameters = with_clipped_noise(self.target_actor(state), smoothing, clip)
-        unit_parameters = zero_fixed(unit_parameters, self.specs.is_fixed(observation))
+        state = self.target_perception.of_states(states)
+        smoothing = self.options.target_smoothing if is_target else 0.0
+        unit_parameters = with_clipped_noise(self.target_actor(state), smoothing, self.options.target_smoothing_clip)
+        unit_parameters = zero_fixed(unit_parameters, self.specs.is_fixed(states.observation))
         q = self.target_critics(state, unit_parameters).amin(0)
         choosing_q = q
         if self.options.double_q:
-            own_state = self.perception(observation, memory, has_seen=has_seen)
-            choosing_q = self.critics(own_state, unit_parameters).amin(0)
-        choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
+            choosing_q = self.critics(self.perception.of_states(states), unit_parameters).amin(0)
+        choosing_q = masked_values(choosing_q, self.specs.allowed(states.observation, states.action_mask))
         components = self.specs.components
         return components.total(components.of_choice(q, components.best(choosing_q)))
-
-    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
-        """Return `value` with target smoothing."""
-        return self.value(observation, action_mask, **memory, smoothing=self.options.target_smoothing)
 
     def actor_loss(
         self, state: Tensor, allowed: Tensor | None, is_fixed: Tensor | None = None

@@ -46,7 +46,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
-from hpamdp.policies.base import Learner, known_ends
+from hpamdp.policies.base import Learner, States, known_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
 from hpamdp.policies.low_level.qpamdp_options import CARDS, QPAMDPOptions
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
@@ -496,10 +496,11 @@ class QPAMDP(Learner):
         self.policy.widen()
 
     @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
         """Return the expected value of the softmax policy's discrete action, `[N]`."""
-        q = self.policy.q(observation)
-        logits = masked_logits(q / self.policy.temperature, self.specs.allowed(observation, action_mask))
+        q = self.policy.q(states.observation)
+        allowed = self.specs.allowed(states.observation, states.action_mask)
+        logits = masked_logits(q / self.policy.temperature, allowed)
         return (logits.softmax(-1) * q).sum(-1)
 
     def rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
@@ -516,9 +517,9 @@ class QPAMDP(Learner):
         is_open, open_value = torch.zeros_like(mask), torch.zeros_like(reward)
         if option_ended is not None:
             is_followed = (option_ended & ~batch["next", keys.DONE]).squeeze(-1) & mask
-            next_observation = batch["next", keys.OBSERVATION][is_followed]
-            masks = [batch["next", keys.ACTION_MASK][is_followed]] if self.specs.has_action_mask else []
-            value = self.next_options.value(next_observation, batch[keys.NEXT_OPTION][is_followed], *masks)
+            allowed = batch["next", keys.ACTION_MASK] if self.specs.has_action_mask else None
+            following = States(batch["next", keys.OBSERVATION], allowed).at(is_followed)
+            value = self.next_options.value(following, batch[keys.NEXT_OPTION][is_followed])
             followed = torch.zeros_like(reward).index_put((is_followed,), self.options.gamma * value)
             is_over = is_followed & known_ends(batch).squeeze(-1)
             is_open = is_followed & ~is_over

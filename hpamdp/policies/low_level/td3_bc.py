@@ -36,6 +36,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
+from hpamdp.policies.base import States
 from hpamdp.policies.low_level.td3_bc_options import CARDS, TD3BCOptions
 from hpamdp.policies.masks import allowed_rows, masked_logits, zero_fixed
 from hpamdp.policies.shared.exploration import with_exploring_noise
@@ -171,18 +172,16 @@ class TD3BC(ReplayLearner):
         return loss, {"actor": loss}
 
     @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None, *, smoothing: float = 0.0) -> Tensor:
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
         """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`.
 
-        With `smoothing`, noise of this standard deviation is added to x'(s).
+        For targets, clipped noise is added to x'(s).
         """
+        observation = states.observation
+        smoothing = self.options.target_smoothing if is_target else 0.0
         clip = self.options.target_smoothing_clip
         unit_parameters = with_clipped_noise(self.target_actor(observation), smoothing, clip)
         unit_parameters = zero_fixed(unit_parameters, self.specs.is_fixed(observation))
         q = self.target_critics(observation, unit_parameters).amin(0)
-        is_refused = self.policy.is_refused(observation, self.specs.allowed(observation, action_mask))
+        is_refused = self.policy.is_refused(observation, self.specs.allowed(observation, states.action_mask))
         return q.masked_fill(is_refused, -torch.inf).amax(-1)
-
-    def target_value(self, observation: Tensor, action_mask: Tensor | None = None, **memory: Any) -> Tensor:
-        """Return `value` with target smoothing."""
-        return self.value(observation, action_mask, **memory, smoothing=self.options.target_smoothing)

@@ -9,6 +9,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
 from hpamdp import keys
+from hpamdp.policies.base import States
 from hpamdp.policies.encoders.base import JoinedEncoders
 from hpamdp.policies.shared.known_directions import KnownDirections
 from hpamdp.policies.shared.memory import GRU, Stack
@@ -148,6 +149,10 @@ class Perception(nn.Module):
             return encoded
         state = memory if has_seen and memory is not None else self._after(encoded, memory)
         return self.memory.features(encoded, state)
+
+    def of_states(self, states: States) -> Tensor:
+        """Return the features `[N, specs.observation_dim]` of states `[N]`."""
+        return self(states.observation, states.memory, has_seen=states.has_seen)
 
     def after(self, observation: Tensor, memory: Tensor | None = None) -> Tensor:
         """Return the memory's states `[*B, size]` after observations `[*B, *]`, given the states before.

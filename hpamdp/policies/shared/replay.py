@@ -16,7 +16,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.devices import checked_device
 from hpamdp.observation_entries import packed, unpacked
-from hpamdp.policies.base import Bonus, Learner, step_discounts
+from hpamdp.policies.base import Bonus, Learner, States, step_discounts
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
 from hpamdp.policies.shared.options import REPLAY_CARD, MemoryOptions, ReplayMemoryOptions, ReplayOptions
 from hpamdp.policies.shared.perception import Perception
@@ -42,7 +42,7 @@ class ReplayLearner(Learner):
     be able to trace it in one piece, with dicts in place of TensorDicts. A subclass whose losses cannot be traced has
     to refuse it.
 
-    The `target` of a value is `reward + discount * next_value(sample)`, which asks `target_value`.
+    The `target` of a value is `reward + discount * next_value(sample)`, which asks `value`.
 
     Attributes:
         perception: what the networks see of an observation, if `set_perception` was called; its target copy beside it.
@@ -306,26 +306,23 @@ class ReplayLearner(Learner):
         Where an option has ended, it is the value under the option that the selector would choose now, by that option's
         learner: the selector has learned since. If the selector's policy is stochastic, it is the expected value.
         """
-        state = sample["next_state"]
-        masks = [sample["next_action_mask"]] if self.specs.has_action_mask else []
-        memory = self.last_memory(sample)
-        remembered: dict[str, Any] = {} if memory is None else {"memory": memory}
-        value = self.target_value(state, *masks, **remembered)
+        mask = sample["next_action_mask"] if self.specs.has_action_mask else None
+        states = States(sample["next_state"], mask, self.last_memory(sample), self.memory_key)
+        value = self.value(states, is_target=True)
         if "option_ended" not in sample.keys():
             return value
         is_ended = sample["option_ended"] | self.next_options.decides_ends
         if is_ended.any():
-            state, held = state[is_ended], sample["option"][is_ended]
-            mask = masks[0][is_ended] if masks else None
-            memory = None if memory is None else memory[is_ended]
+            states, held = states.at(is_ended), sample["option"][is_ended]
 
             def value_under(option: Tensor) -> Tensor:
-                begun = None if memory is None else self._memory_of_next(memory, option == held)
-                return self.next_options.value(state, option, mask, begun)
+                memory = None if states.memory is None else self._memory_of_next(states.memory, option == held)
+                return self.next_options.value(states._replace(memory=memory), option)
 
-            probabilities = self.next_options.probabilities(state)
+            probabilities = self.next_options.probabilities(states.observation)
             if probabilities is None:
-                value[is_ended] = value_under(self.next_options.choose(state, sample["next_option"][is_ended], held))
+                chosen = self.next_options.choose(states.observation, sample["next_option"][is_ended], held)
+                value[is_ended] = value_under(chosen)
             else:
                 options = (torch.full_like(held, i) for i in range(probabilities.shape[-1]))
                 values = torch.stack([value_under(option) for option in options], -1)
@@ -338,7 +335,7 @@ class ReplayLearner(Learner):
             return sample["last_memory"]
         return self.memory_of(sample, self.target_perception) if self.memory_key is not None else None
 
-    def _memory_of_next(self, memory: Tensor, is_same: Tensor) -> TensorDict:
+    def _memory_of_next(self, memory: Tensor, is_same: Tensor) -> Tensor:
         """Return the memories with which the next options begin: empty ones, if each option has its own learner.
 
         Args:
@@ -346,11 +343,10 @@ class ReplayLearner(Learner):
             is_same: whether the next option is the held one, bool `[N]`. If the selector decides where options end,
                 such an option continues, and keeps its memory.
         """
-        assert self.memory_key is not None
-        if not self.perception.lasts_an_episode:
-            goes_on = is_same if self.next_options.decides_ends else torch.zeros_like(is_same)
-            memory = torch.where(goes_on.unsqueeze(-1), memory, 0.0)
-        return TensorDict({self.memory_key: memory}, [len(memory)])
+        if self.perception.lasts_an_episode:
+            return memory
+        goes_on = is_same if self.next_options.decides_ends else torch.zeros_like(is_same)
+        return torch.where(goes_on.unsqueeze(-1), memory, 0.0)
 
     def features(self, sample: TensorDictBase) -> Tensor:
         """Return what the networks see of a sample's states, `[B, perception.specs.observation_dim]`."""

@@ -65,7 +65,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import Bonus, known_ends
+from hpamdp.policies.base import Bonus, States, known_ends
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
 from hpamdp.policies.low_level.dlpa.options import CARDS, DLPAOptions
 from hpamdp.policies.low_level.dlpa.planner import Planner
@@ -212,24 +212,15 @@ class DLPA(ReplayLearner):
                 parts[name] = parts[name] + self.options.rho**h * (error * step["valid"]).mean()
         return parts
 
-    def value(
-        self,
-        observation: Tensor,
-        action_mask: Tensor | None = None,
-        *,
-        memory: Tensor | None = None,
-        has_seen: bool = False,
-    ) -> Tensor:
-        """Return the values `[N]` of states `[N, observation_dim]` that `end_values` has learned, whatever is allowed.
-
-        `Learner.value` explains `memory` and `has_seen`.
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
+        """Return the values `[N]` of states that `end_values` has learned, whatever is allowed.
 
         Raises:
             NotImplementedError: there are none.
         """
         if self.end_values is None:
-            return super().value(observation)
-        return self.end_values.of_own(self.target_perception(observation, memory, has_seen=has_seen))
+            return super().value(states)
+        return self.end_values.of_own(self.target_perception.of_states(states))
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the model's inputs and targets in a batch `[*B, T]`, and those of the values, if they are learned.

@@ -66,7 +66,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from hpamdp.policies.base import Bonus
+from hpamdp.policies.base import Bonus, States
 from hpamdp.policies.low_level.pets.model import PETSModel
 from hpamdp.policies.low_level.pets.options import CARDS, PETSOptions
 from hpamdp.policies.low_level.pets.policy import PETSPolicy
@@ -193,21 +193,15 @@ class PETS(ReplayLearner):
         states = states_of_past(sample.flatten(0, 1), self.perception, self.burn_in)
         return states.unflatten(0, sample.batch_size)
 
-    def value(
-        self,
-        observation: Tensor,
-        action_mask: Tensor | None = None,
-        *,
-        memory: Tensor | None = None,
-        has_seen: bool = False,
-    ) -> Tensor:
-        """Return the values `[N]` of observations `[N, *]`; see `Learner.value` for the memory.
+    def value(self, states: States, *, is_target: bool = False) -> Tensor:
+        """Return the values `[N]` of states.
 
         With `end_values` they are what these have learned, whatever a mask allows; else see `PETSPolicy.value`.
         """
         if self.end_values is None:
-            return self.policy.value(observation, action_mask, memory=memory, has_seen=has_seen)
-        return self.end_values.of_own(self.target_perception(observation[..., self.entries], memory, has_seen=has_seen))
+            return self.policy.value(states)
+        seen = states._replace(observation=states.observation[..., self.entries])
+        return self.end_values.of_own(self.target_perception.of_states(seen))
 
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Yield samples `[num_members, batch_size]` of all stored steps, each with all its mirror images or maps."""

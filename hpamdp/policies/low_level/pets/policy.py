@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import Bonus
+from hpamdp.policies.base import Bonus, States
 from hpamdp.policies.low_level.pets.model import PETSModel
 from hpamdp.policies.low_level.pets.options import PETSPolicyOptions
 from hpamdp.policies.shared.contingent_planning import ContingentSearch
@@ -101,30 +101,22 @@ class PETSPolicy(PlanningPolicy):
         return self.joint.choice(planned.discrete), self.joint.spread(planned.discrete, own)
 
     @torch.no_grad()
-    def value(
-        self,
-        observation: Tensor,
-        action_mask: Tensor | None = None,
-        *,
-        memory: Tensor | None = None,
-        has_seen: bool = False,
-    ) -> Tensor:
-        """Return the expected returns `[N]` of the plans from observations `[N, *]`, with what a mask allows.
-
-        `Learner.value` explains `memory` and `has_seen`.
+    def value(self, states: States) -> Tensor:
+        """Return the expected returns `[N]` of the plans from states, with what their mask allows.
 
         A greedy policy uses the mean of all members, and `caution`. An exploring policy uses a random member for each
         observation (posterior sampling), or else the mean and `optimism`, so that it tries what members disagree on.
         Before the policy plans, the greedy value assumes the only known reward at every step; the exploring value is
         infinite.
         """
+        observation = states.observation
         num = len(observation)
         if not bool(self.is_trained):
             known = self.model.reward_mean[0] * sum(self.options.gamma**h for h in range(self.options.horizon))
             return known.expand(num) if is_greedy() else torch.full_like(observation[:, 0], torch.inf)
         member = torch.randint(self.model.num_members, (num,), device=observation.device)
-        allowed = self._allowed(observation, action_mask)
-        state = self.perception(observation[:, self.entries], memory, has_seen=has_seen)
+        allowed = self._allowed(observation, states.action_mask)
+        state = self.perception.of_states(states._replace(observation=observation[:, self.entries]))
         return self.plan(state, member if self._follows_member else None, allowed).value
 
     @property
