@@ -151,38 +151,50 @@ class HPPO(OnPolicy, Learner):
         """Return the loss of actors and critic on a minibatch `[B]`, and scalars to log."""
         features = self.features(rows)
         distribution = self._distribution(features, rows)
-        discrete_log_prob, parameter_log_prob = distribution.log_prob(rows["discrete"], rows[RAW])
-        discrete_log_ratio = discrete_log_prob - rows["discrete_log_prob"]
-        parameter_log_ratio = parameter_log_prob - rows["parameter_log_prob"]
-        own = rows.get(OWN)
-        if own is not None:  # before the exponential, which may overflow for actions that the policy hardly takes
-            is_own = own.reshape(-1, *[1] * (discrete_log_ratio.ndim - 1)) > 0.0
-            discrete_log_ratio = torch.where(is_own, discrete_log_ratio, 0.0)
-            parameter_log_ratio = torch.where(is_own, parameter_log_ratio, 0.0)
-        advantage = rows["advantage"]
-        if advantage.ndim < discrete_log_ratio.ndim:
-            advantage = advantage.unsqueeze(-1)
-        gain = self.surrogate(discrete_log_ratio, advantage) + self.surrogate(parameter_log_ratio, advantage)
-        gain = self.specs.components.total(gain)
-        gain = gain.mean() if own is None else (gain * own).sum() / own.sum().clamp(min=1.0)
+        log_ratios = self.log_ratios(distribution, rows)
+        gain = self.gain(log_ratios, rows)
         discrete_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
         bonus = self.options.discrete_entropy * discrete_entropy + self.options.parameter_entropy * parameter_entropy
         critic_loss = F.mse_loss(self.critic(features).squeeze(-1), rows["target"])
         if self.credit_critic is not None:
-            contributions = self.credit_critic.contributions(features, distribution, rows["discrete"], rows[RAW])
-            error = self.credit_critic.total(features, contributions) - rows["raw_advantage"]
-            critic_loss = critic_loss + error.square().mean()
+            action = rows["discrete"], rows[RAW]
+            critic_loss = critic_loss + self.credit_critic.loss(features, distribution, *action, rows["raw_advantage"])
         loss = self.options.critic_weight * critic_loss - gain - entropy_weight * bonus
         scale = distribution.log_scale.detach().mean().exp()
+        discrete_log_ratio, parameter_log_ratio = (log_ratio.detach() for log_ratio in log_ratios)
         return loss, {
             "critic": critic_loss,
             "discrete_entropy": discrete_entropy,
             "scale": scale if self.specs.num_parameters else torch.zeros_like(scale),
-            "discrete_kl": kl_estimate(discrete_log_ratio.detach()),
-            "parameter_kl": kl_estimate(parameter_log_ratio.detach()),
-            "discrete_clipped": clipped_fraction(discrete_log_ratio.detach(), self.options.clip),
-            "parameter_clipped": clipped_fraction(parameter_log_ratio.detach(), self.options.clip),
+            "discrete_kl": kl_estimate(discrete_log_ratio),
+            "parameter_kl": kl_estimate(parameter_log_ratio),
+            "discrete_clipped": clipped_fraction(discrete_log_ratio, self.options.clip),
+            "parameter_clipped": clipped_fraction(parameter_log_ratio, self.options.clip),
         }
+
+    def log_ratios(self, distribution: HybridDistribution, rows: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the log-ratios of new and old probabilities, of discrete actions and of parameters, each `[B, *]`.
+
+        They are 0 for actions of an exploration. These are set before the exponential, which may overflow for actions
+        that the policy hardly takes.
+        """
+        discrete, parameters = distribution.log_prob(rows["discrete"], rows[RAW])
+        log_ratios = discrete - rows["discrete_log_prob"], parameters - rows["parameter_log_prob"]
+        if OWN not in rows:
+            return log_ratios
+        is_own = rows[OWN].reshape(-1, *[1] * (discrete.ndim - 1)) > 0.0
+        return torch.where(is_own, log_ratios[0], 0.0), torch.where(is_own, log_ratios[1], 0.0)
+
+    def gain(self, log_ratios: tuple[Tensor, Tensor], rows: Mapping[str, Tensor]) -> Tensor:
+        """Return the mean surrogate of both actors over the actions that the policy has chosen, a scalar."""
+        advantage = rows["advantage"]
+        if advantage.ndim < log_ratios[0].ndim:  # the same for each component
+            advantage = advantage.unsqueeze(-1)
+        discrete_gain, parameter_gain = (self.surrogate(each, advantage) for each in log_ratios)
+        gain = self.specs.components.total(discrete_gain + parameter_gain)
+        if OWN not in rows:
+            return gain.mean()
+        return (gain * rows[OWN]).sum() / rows[OWN].sum().clamp(min=1.0)
 
     def critic_loss(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared error of V on a minibatch `[B]`, for a step of the critic alone, and nothing to log."""
@@ -226,8 +238,7 @@ class HPPO(OnPolicy, Learner):
             log_probs = distribution.log_prob(rows["discrete"], rows[RAW])
             rows["discrete_log_prob"], rows["parameter_log_prob"] = log_probs
             if self.credit_critic is not None:
-                contributions = self.credit_critic.contributions(features, distribution, rows["discrete"], rows[RAW])
-                rows[BASELINE] = self.credit_critic.baselines(features, contributions)
+                rows[BASELINE] = self.credit_critic.baselines(features, distribution, rows["discrete"], rows[RAW])
                 rows["raw_advantage"] = rows["advantage"]
         return TensorDict(rows, batch_size=[int(mask.sum())])
 

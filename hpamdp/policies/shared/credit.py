@@ -75,8 +75,19 @@ class CreditCritic(nn.Module):
         hidden = F.elu(mixed + bias) - F.elu(bias)
         return (hidden * out_weight.abs()).sum(-1)
 
-    def baselines(self, features: Tensor, contributions: Tensor) -> Tensor:
-        """Return for each component the advantage of the others' contributions alone, `[B, num_components]`."""
+    def loss(
+        self, features: Tensor, distribution: HybridDistribution, discrete: Tensor, raw: Tensor, advantage: Tensor
+    ) -> Tensor:
+        """Return the squared error of the advantages `[B]`; for the other arguments see `contributions`."""
+        contributions = self.contributions(features, distribution, discrete, raw)
+        return (self.total(features, contributions) - advantage).square().mean()
+
+    def baselines(self, features: Tensor, distribution: HybridDistribution, discrete: Tensor, raw: Tensor) -> Tensor:
+        """Return for each component the advantage of the others' contributions alone, `[B, num_components]`.
+
+        Arguments are those of `contributions`.
+        """
+        contributions = self.contributions(features, distribution, discrete, raw)
         num = contributions.shape[-1]
         is_other = 1.0 - torch.eye(num, device=contributions.device, dtype=torch.float32)
         of_others = contributions.unsqueeze(1) * is_other
