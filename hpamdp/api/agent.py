@@ -180,19 +180,14 @@ class Agent:
         num = len(fresh)
         if not self._kept:  # every step is like a first one
             return fresh.set(keys.IS_DECISION, torch.ones(num, 1, dtype=torch.bool, device=fresh.device))
-        never = torch.zeros(num, 1, dtype=torch.bool, device=fresh.device)
-        fresh.set(keys.DONE, never).set(keys.TERMINATED, never)
         if self._last is None:
             self._starts, self._starts_later = np.ones(num, bool), np.zeros(num, bool)
-            return self._tracker._reset(fresh.empty(), fresh)
-        if len(self._last) != num:
+        elif len(self._last) != num:
             running = len(self._last)
             raise ValueError(f"act: got {num} observations, but {running} episodes are running; call reset() first")
-        begun = self._tracker._reset(fresh.empty(), fresh.clone())
-        fresh.set(keys.REWARD, never.float())
-        going = self._tracker._step(self._last, fresh).exclude(keys.REWARD)
-        starts = torch.from_numpy(self._starts.copy()).to(fresh.device)
-        seen = begun.apply(lambda new, old: torch.where(_like(starts, new), new, old), going)
+        seen = self._tracker.follow(fresh, self._last, torch.from_numpy(self._starts.copy()).to(fresh.device))
+        if self._last is None:
+            return seen
         self._check_length(seen)
         for key in self._kept:
             value = self._last.get(key, None)
@@ -348,7 +343,3 @@ class Agent:
         """
         about = {group: getattr(self._config, group).name for group in ("env", "high", "low")}
         export_onnx(path_argument("export", path), self._agent, self._env, option_length(self._config), about)
-
-
-def _like(mask: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
-    return mask.reshape(-1, *[1] * (value.ndim - 1))

@@ -72,6 +72,24 @@ class DecisionTracker(Transform):
         self.ends_inside = option_length is not None or ends_with_trips
         self.keeps_observation = keeps_observation
 
+    def follow(self, fresh: TensorDictBase, before: TensorDictBase | None, begins: Tensor) -> TensorDictBase:
+        """Return observed states `[N]` with the tracked entries, for a caller who steps the environments elsewhere.
+
+        The rewards of the steps before are not known and count as 0.
+
+        Args:
+            fresh: what was observed: `observation` and the masks that the environment writes.
+            before: the states before, with what the policy has written there. If None, all episodes begin.
+            begins: in which rows an episode begins, bool `[N]`.
+        """
+        never = torch.zeros(*fresh.batch_size, 1, dtype=torch.bool, device=fresh.device)
+        fresh = fresh.copy().update({keys.DONE: never, keys.TERMINATED: never})
+        begun = self._reset(fresh.empty(), fresh.copy())
+        if before is None:
+            return begun
+        going = self._step(before, fresh.set(keys.REWARD, never.float())).exclude(keys.REWARD)
+        return begun.apply(lambda new, old: torch.where(_like(begins, new), new, old), going)
+
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Declare the keys that the tracker writes."""
         shape = (*observation_spec.shape, 1)
@@ -249,6 +267,10 @@ def _is_open_at_end(after: TensorDictBase, has_action: Tensor) -> Tensor:
     some_lack_action = ~has_action.all(-1, keepdim=True)
     all_lack_action = ~has_action.any(-1, keepdim=True)
     return (after.get(keys.TERMINATED) & some_lack_action) | (after.get(keys.DONE) & all_lack_action)
+
+
+def _like(mask: Tensor, value: Tensor) -> Tensor:
+    return mask.reshape(-1, *[1] * (value.ndim - 1))
 
 
 def _zero_where(mask: Tensor, values: Tensor) -> Tensor:
