@@ -234,7 +234,7 @@ def draw_all() -> Iterator[Callable[..., object]]:
 
     with pytest.MonkeyPatch.context() as patch:
         drawing = figures.draw_all
-        patch.setattr(figures, "draw_all", lambda folder, env: [])
+        patch.setattr(figures, "draw_all", lambda *_: [])
         yield drawing
 
 

@@ -15,7 +15,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import upgraded
 from hpamdp.run import checkpoint
 from hpamdp.run.play import described, own_agents
-from hpamdp.run.players import load_player
+from hpamdp.run.players import load_agent
 from hpamdp.run.resume import resolve
 from hpamdp.run.train import run
 
@@ -56,8 +56,8 @@ def skip_without_simulator(name: str) -> None:
 def test_an_agent_scores_as_its_summary_says(name):
     skip_without_simulator(name)
     num_layouts = min(200, config_of(name)["eval"]["layouts"])
-    player = load_player(str(FOLDER / name), [f"eval.layouts={num_layouts}", "film=false"])
-    score = player.evaluation.run(player.agent.policy)["score"]
+    player = load_agent(str(FOLDER / name), [f"eval.layouts={num_layouts}", "film=false"])
+    score = player.evaluation().run(player.agent.policy)["score"]
     summary = json.loads((FOLDER / name / "summary.json").read_text())
     # A subset of the episodes of the summary: four standard errors. Networks are stored in half precision after they
     # are scored. All episodes of Pinball are the same, and its walls amplify rounding.
@@ -66,11 +66,9 @@ def test_an_agent_scores_as_its_summary_says(name):
 
 
 def test_those_on_boats_can_be_played_against_and_the_others_are_not_even_built(monkeypatch):
-    config = load_player(str(FOLDER / "linucb_hppo"), ["eval.layouts=1"]).config
+    config = load_agent(str(FOLDER / "linucb_hppo"), ["eval.layouts=1"]).config
     built = []
-    monkeypatch.setattr(
-        "hpamdp.run.play.load_player", lambda path, words: built.append(path) or load_player(path, words)
-    )
+    monkeypatch.setattr("hpamdp.run.play.load_agent", lambda path, words: built.append(path) or load_agent(path, words))
     agents = own_agents(config)
     on_boats = [name for name in AGENTS if config_of(name)["choices"]["env"] == "boatdock"]
     assert [agent["name"] for agent in agents] == [Path(path).name for path in built] == on_boats

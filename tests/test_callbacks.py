@@ -24,7 +24,7 @@ from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, OwnMetrics, Patience, TimeLimit
 from hpamdp.run.continuation import rest_of
 from hpamdp.run.evaluate import Evaluation
-from hpamdp.run.players import load_player
+from hpamdp.run.players import load_agent
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import begin, run
 from hpamdp.run.trainer import Trainer
@@ -111,7 +111,7 @@ def test_the_best_agent_is_kept_and_can_be_scored_and_watched(scores, tmp_path):
     assert (best["frames"], best["last_score"]) == (64, 7.0)
     kept, last = (tensors_in(tmp_path / f"run/{name}.pt") for name in ("best", "policy"))
     assert not all(torch.equal(value, last[name]) for name, value in kept.items())
-    player = load_player(str(tmp_path / "run/best.pt"), [])
+    player = load_agent(str(tmp_path / "run/best.pt"), [])
     assert all(torch.equal(value, player.agent.state_dict()[name]) for name, value in kept.items())
     words = ["mode=eval", f"checkpoint={tmp_path / 'run/best.pt'}"]
     assert run(compose_config(words), tmp_path / "eval", words) == 0
@@ -477,7 +477,7 @@ def test_a_run_with_callbacks_of_ones_own_is_scored_and_watched_without_their_ya
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
     words = ["hydra.searchpath=[]", "mode=eval", f"checkpoint={tmp_path / 'a'}"]
     assert run(compose_config(words), tmp_path / "b", words) == 0
-    config: Config = load_player(str(tmp_path / "a"), []).config
+    config: Config = load_agent(str(tmp_path / "a"), []).config
     assert config.callbacks == ()
 
 

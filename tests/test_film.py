@@ -13,7 +13,7 @@ from PIL import Image, ImageSequence
 from hpamdp.analysis import film
 from hpamdp.env.boatdock import film as boat_film
 from hpamdp.env.boatdock import physics
-from hpamdp.run.players import load_player, split_words
+from hpamdp.run.players import load_agent, split_words
 
 SECONDS = torch.linspace(0.0, 2.0, 41, dtype=torch.float64)
 
@@ -45,9 +45,9 @@ def test_a_boat_rests_where_its_press_ends_and_stays_there():
 
 @pytest.fixture(scope="module")
 def played():
-    player = load_player(None, ["high=uniform", "low=random", "eval.layouts=8", "film=true"])
+    player = load_agent(None, ["high=uniform", "low=random", "eval.layouts=8", "film=true"])
     states = []
-    return player, player.evaluation.run(player.agent.policy, states), film.tracks_of(states)
+    return player, player.evaluation().run(player.agent.policy, states), film.tracks_of(states)
 
 
 def test_boats_move_smoothly_from_their_start_to_their_end(played, monkeypatch):
@@ -70,18 +70,18 @@ def test_boats_move_smoothly_from_their_start_to_their_end(played, monkeypatch):
 
 def test_the_film_of_an_evaluation_ends_with_the_picture_of_every_end(played):
     player, _, tracks = played
-    pictures = list(film.film(player.evaluation.problem, tracks[:4], 10.0, 40))
+    pictures = list(film.film(player.evaluation().problem, tracks[:4], 10.0, 40))
     assert pictures[0].shape == (80, 120, 3)  # three side by side, the fourth below
     np.testing.assert_array_equal(pictures[-1], pictures[-10])  # the pause
     assert any((one != other).any() for one, other in itertools.pairwise(pictures))
 
 
 def test_other_problems_are_filmed_by_their_own_pictures():
-    player = load_player(None, ["env=sliding", "high=none", "low=random", "eval.layouts=1", "film=true"])
+    player = load_agent(None, ["env=sliding", "high=none", "low=random", "eval.layouts=1", "film=true"])
     states = []
-    player.evaluation.run(player.agent.policy, states)
+    player.evaluation().run(player.agent.policy, states)
     (track,) = film.tracks_of(states, num_steps=3)
-    pictures = list(player.evaluation.problem.film(track, 8.0, 60))
+    pictures = list(player.evaluation().problem.film(track, 8.0, 60))
     assert len(pictures) == 2 * len(track) and pictures[0].shape == (60, 60, 3)
 
 

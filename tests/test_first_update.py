@@ -11,7 +11,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.policies.base import have_stepped
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.run.assemble import assemble, make_agent, make_env, set_up_updates
-from hpamdp.run.closing_table import short_sight
+from hpamdp.run.summary import short_sight
 from hpamdp.run.train import run
 from hpamdp.specs import PAMDPSpecs
 

@@ -21,7 +21,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.single import SingleCollection
-from hpamdp.run.players import load_player
+from hpamdp.run.players import load_agent
 from hpamdp.run.tensor_archive import TensorArchive
 from hpamdp.run.train import run
 from hpamdp.run.trainer import DivergedError, Trainer
@@ -430,7 +430,7 @@ def test_a_policy_with_other_progress_is_refused(entry, value, opener, tmp_path)
     saved["progress"] = json.dumps({**json.loads(saved["progress"]), entry: value})
     torch.save(saved, tmp_path / "policy.pt")
     with pytest.raises(ConfigError, match="damaged, or not a checkpoint") as error:
-        load_player(str(tmp_path / "policy.pt"), [])
+        load_agent(str(tmp_path / "policy.pt"), [])
     assert "\n" not in str(error.value)
 
 
@@ -460,7 +460,7 @@ def policy_of(opener, file, changes, *, has_weights=True):
 def load_without_memory(file) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     words = ["mode=eval", f"checkpoint={file}"]
-    for load in (lambda: load_player(str(file), []), lambda: run(compose_config(words), file.parent / "run", words)):
+    for load in (lambda: load_agent(str(file), []), lambda: run(compose_config(words), file.parent / "run", words)):
         with pytest.raises(ConfigError, match="does not fit this agent") as error:
             load()
         assert "\n" not in str(error.value)

@@ -9,8 +9,8 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised, human_references
 from hpamdp.messages import duration
 from hpamdp.metrics_file import MetricsFile, read_rows
-from hpamdp.run.closing_table import closing_table
 from hpamdp.run.loggers import CSVLogger, TensorboardLogger, WandbLogger
+from hpamdp.run.summary import closing_table
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.boatdock.play.replay import HELD, Press, settle
 from hpamdp.env.play_page import EpisodeError
-from hpamdp.run.players import load_player
+from hpamdp.run.players import load_agent
 
 NODE = shutil.which("node")
 START, GOAL = (0.0, 60.0), (0.0, -60.0)  # key 1 of the congruent controller goes from one to the other
@@ -225,12 +225,12 @@ def test_the_boat_on_the_page_moves_without_a_jump(tmp_path, page_data):
 def test_agents_act_in_the_page_as_they_do_in_torch(tmp_path, page_data):
     words = ["high=meta_critic", "low=hppo", "eval.layouts=20", "eval.seed=9", "film=false"]
     for settings in (words, [*words, "agent.sharing=shared"], ["high=linucb", *words[1:]]):
-        player = load_player(None, settings)
+        player = load_agent(None, settings)
         if "high=linucb" in settings:
             selector = player.agent.selector
             selector.moment.copy_(torch.randn_like(selector.moment))
             selector.gram.add_(torch.eye(selector.gram.shape[-1]))
-        results = player.evaluation.run(player.agent.policy)
+        results = player.evaluation().run(player.agent.policy)
         entry = {"name": "a", "title": "a", "controller": "choose", "keymap": 1, "agent": player.agent.exported()}
         places = [{"start": s.tolist(), "goal": g.tolist()}
                   for s, g in zip(results["start"], results["goal"], strict=True)]  # fmt: skip

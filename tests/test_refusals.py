@@ -20,7 +20,7 @@ from hpamdp.run import capacity
 from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.compatibility import check_effects_on, facts_of, settings_without_effect
-from hpamdp.run.players import load_player, split_words
+from hpamdp.run.players import load_agent, split_words
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.train import run
 from hpamdp.settings import OnlyWith, OwnSteps
@@ -308,18 +308,18 @@ def test_settings_of_training_are_refused_where_nothing_is_trained(saved, word):
     for player in (["low=random", "high=uniform"], [f"{saved}"]):
         path, settings = split_words([*player, word])
         with pytest.raises(ConfigError, match=line):
-            load_player(path, settings)
+            load_agent(path, settings)
 
 
 def test_exploration_is_refused_for_a_player_who_is_not_trained():
     with pytest.raises(ConfigError, match=r"^exploration=held: has no effect without training; leave it out$"):
-        load_player(None, ["low=random", "high=uniform", "exploration=held"])
+        load_agent(None, ["low=random", "high=uniform", "exploration=held"])
 
 
 @pytest.mark.parametrize("word", ["agent.values_end=trip", "agent.selector_values_end=trip", "low.freeze=true"])
 def test_how_the_parts_of_an_agent_learn_is_refused_for_a_player_who_is_not_trained(word):
     with pytest.raises(ConfigError, match=rf"^{re.escape(word)}: has no effect without training; leave it out$"):
-        load_player(None, ["env=boatdock_unseen", "env.boats=2", "low=random", "high=uniform", word])
+        load_agent(None, ["env=boatdock_unseen", "env.boats=2", "low=random", "high=uniform", word])
 
 
 @pytest.mark.parametrize("name", ["checkpoint", "resume", "low.checkpoint"])
@@ -327,7 +327,7 @@ def test_a_player_of_settings_takes_no_weights_from_a_saved_run_and_says_so(save
     for player in (["low=random", "high=uniform"], [f"{saved}"]):
         path, settings = split_words([*player, f"{name}={saved}"])
         with pytest.raises(ConfigError, match=rf"^{name}=.*: give the folder or the name of a saved agent alone"):
-            load_player(path, settings)
+            load_agent(path, settings)
 
 
 @pytest.mark.parametrize("word", ["mode=train", "overwrite=true", "logger=tensorboard"])
@@ -335,7 +335,7 @@ def test_what_only_a_run_uses_is_refused_for_a_player(saved, word):
     for player in (["low=random", "high=uniform"], [f"{saved}"]):
         path, settings = split_words([*player, word])
         with pytest.raises(ConfigError, match=rf"^{word}: has no effect on a player; leave it out$"):
-            load_player(path, settings)
+            load_agent(path, settings)
 
 
 @pytest.mark.parametrize(
@@ -348,7 +348,7 @@ def test_what_only_a_run_uses_is_refused_for_a_player(saved, word):
 )
 def test_the_settings_of_a_player_have_to_go_together_as_those_of_a_run(words, message):
     with pytest.raises(ConfigError, match=f"^{message}"):
-        load_player(None, ["low=random", *words])
+        load_agent(None, ["low=random", *words])
 
 
 @pytest.mark.parametrize(("word", "instead"), [("eval.layouts=3", "--episodes"), ("eval.seed=7", "--seed")])

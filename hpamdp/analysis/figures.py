@@ -1,10 +1,7 @@
-"""Draw figures of a finished or stopped run, using only the files in its folder."""
+"""Draw the figures of a finished or stopped run."""
 
 from __future__ import annotations
 
-import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,27 +14,25 @@ from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
 from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.figure_style import AGENT, REFERENCES, STYLE, label_ends
-from hpamdp.files import read_regular, regular_size, replacing
-from hpamdp.messages import duration, one_line, warn
+from hpamdp.files import replacing
+from hpamdp.messages import duration
 from hpamdp.metrics_file import EVALUATION, FRAMES, WALL_SECONDS, read_rows
-from hpamdp.run_files import EVALUATION_NAME, FIGURES_NAME, MAX_TEXT_BYTES, METRICS_NAME, SUMMARY_NAME
+from hpamdp.run_files import FIGURES_NAME, METRICS_NAME
 
 
-def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
-    """Draw all figures for which a run's folder has the files, and return their paths.
-
-    `learning_curves.png` shows `metrics.csv` and the references of `summary.json`. The environment draws its figures
-    from `evaluation.npz`. If a file is missing or damaged, its figures are left out.
+def draw_all(
+    output_dir: Path, env: type[PAMDPEnv], summary: Mapping[str, Any], evaluation: Mapping[str, np.ndarray]
+) -> list[Path]:
+    """Draw the figures of a run into its folder, and return their paths.
 
     Args:
-        output_dir: the run's folder, to which the figures are written.
+        output_dir: the run's folder, whose `metrics.csv` has the rows of `learning_curves.png`.
         env: the environment's class, which names the curves and draws its own figures.
+        summary: the run's summary, with the references.
+        evaluation: arrays of the last evaluation, of which the environment draws figures.
     """
-    summary = _read_summary(output_dir / SUMMARY_NAME)
-    rows = read_rows(output_dir / METRICS_NAME)
-    evaluation = _read_evaluation(output_dir / EVALUATION_NAME)
     with mpl.rc_context(STYLE):
-        curves = learning_curves(rows, summary, env.curves(summary))
+        curves = learning_curves(read_rows(output_dir / METRICS_NAME), summary, env.curves(summary))
         figures = {} if curves is None else {"learning_curves.png": curves}
         figures |= env.draw_figures(evaluation, summary)
         with replacing(output_dir / FIGURES_NAME) as partial:
@@ -46,29 +41,6 @@ def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
             with replacing(output_dir / name) as partial:
                 figure.savefig(partial)
     return [output_dir / name for name in figures]
-
-
-def _read_summary(path: Path) -> dict[str, Any]:
-    try:
-        summary = json.loads(read_regular(path, MAX_TEXT_BYTES)) if path.exists() else {}
-        if not isinstance(summary, dict):
-            raise ValueError("it is not a JSON object")
-    except (ValueError, OSError, RecursionError) as error:
-        warn(f"{path} cannot be read; its references are left out: {one_line(error)}")
-        return {}
-    return summary
-
-
-def _read_evaluation(path: Path) -> dict[str, np.ndarray]:
-    if not path.exists():
-        return {}
-    try:
-        regular_size(path)
-        with np.load(path, allow_pickle=False) as arrays:
-            return dict(arrays)
-    except (ValueError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        warn(f"{path} cannot be read; its figures are left out: {one_line(error)}")
-        return {}
 
 
 def _series(rows: list[dict[str, float]], name: str) -> tuple[np.ndarray, np.ndarray]:

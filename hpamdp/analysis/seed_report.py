@@ -1,7 +1,8 @@
-"""Report runs of many seeds: a row of statistics for each configuration, as a table and as files."""
+"""Run `hpamdp report`: a row of statistics for each configuration of runs, as a table and as files."""
 
 from __future__ import annotations
 
+import argparse
 import csv
 import os
 from collections.abc import Iterable, Sequence
@@ -26,9 +27,16 @@ from hpamdp.analysis.study import mean_interval, spread
 from hpamdp.complaints import no_such
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import regular_size, replacing
-from hpamdp.messages import duration, one_line
+from hpamdp.messages import duration, file_and_reason, one_line, say
 from hpamdp.metrics_file import EVALUATION
 
+_DESCRIPTION = """\
+Compare runs by their means over seeds.
+
+  hpamdp report multirun/mystudy                      the table that the sweep ended with
+  hpamdp report outputs/a outputs/b --to comparison   several runs; also writes report.csv and report.png
+  hpamdp report multirun/mystudy --metric eval/success
+"""
 DEFAULT_METRIC = "eval/score"
 TABLE_NAME, FIGURE_NAME = "report.csv", "report.png"
 _BEGINNING = b"configuration,folder,seed,state,"  # of a table
@@ -240,3 +248,31 @@ def _cells(configuration: Configuration, is_search: bool) -> list[str]:
         str(row["unfinished"] or ""),
         str(row["failed"] or ""),
     ]
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("must be a path, not an empty text")
+    return Path(text)
+
+
+def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
+    """Print the table, write the files if they are asked for, and return the exit code.
+
+    Raises:
+        ConfigError: a folder has no runs, no run has the metric, or a file cannot be written.
+    """
+    parser.description = _DESCRIPTION
+    parser.add_argument("folders", nargs="+", type=_path, metavar="FOLDER", help="a run, or a folder of runs")
+    parser.add_argument("--metric", default=DEFAULT_METRIC, help=f"a column of metrics.csv ({DEFAULT_METRIC})")
+    parser.add_argument("--to", type=_path, metavar="FOLDER", help="where to write report.csv and report.png")
+    options = parser.parse_intermixed_args(words)
+    report = report_on(options.folders, options.metric)
+    say(report.table())
+    if options.to is not None:
+        try:
+            files = report.write(options.to)
+        except OSError as error:
+            raise ConfigError(f"--to {options.to}: {file_and_reason(error)}") from error
+        say(f"Written: {', '.join(map(str, files))}")
+    return 0

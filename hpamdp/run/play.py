@@ -26,7 +26,7 @@ from hpamdp.messages import file_and_reason, first_line, reason_of, say, warn
 from hpamdp.run.assemble import make_env
 from hpamdp.run.checkpoint import find, progress_of
 from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
-from hpamdp.run.players import Player, add_config_dir, load_player, split_words, whole_number, with_config_dirs
+from hpamdp.run.players import LoadedAgent, add_config_dir, load_agent, split_words, whole_number, with_config_dirs
 from hpamdp.run.resume import saved_choices
 from hpamdp.run_files import POLICY_NAME, saved_summary
 
@@ -38,7 +38,6 @@ Play a problem yourself, beside agents.
   hpamdp play --export site                        the page as files that need no server
 """
 _LOOPBACK = "127.0.0.1"
-_ONE_EPISODE = ("eval.layouts=1", "film=false")
 # What a page takes from the command line: the problem, which an experiment may set too, and how it is built.
 _OF_A_PAGE = ("env", "experiment", "recipe", "device", "threads", "trust", "hydra")
 
@@ -120,7 +119,7 @@ def own_agents(config: Config) -> list[dict[str, Any]]:
     files = sorted(folder.glob(f"*/{POLICY_NAME}"))
     # Most agents are for other problems, and building an agent takes half a second.
     folders = [file.parent for file in files if choices_of(progress_of(file)["config"])["env"] == config.env.name]
-    agents = [described(each, load_player(str(each), _ONE_EPISODE)) for each in folders]
+    agents = [described(each, load_agent(str(each), [])) for each in folders]
     return [agent for agent in agents if agent is not None]
 
 
@@ -139,7 +138,7 @@ def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) 
     for name in names:
         if name == "none":
             continue
-        player = load_player(name, [*_ONE_EPISODE, *permissions(name, config, settings)])
+        player = load_agent(name, permissions(name, config, settings))
         if player.config.env.cls is not config.env.cls:
             raise ConfigError(f"--agent {name}: was trained on {player.config.env}, but the page is of {config.env}")
         agent = described(find(name, "--agent").parent, player)
@@ -164,7 +163,7 @@ def permissions(name: str, config: Config, settings: Sequence[str]) -> list[str]
     ]
 
 
-def described(folder: Path, player: Player) -> dict[str, Any] | None:
+def described(folder: Path, player: LoadedAgent) -> dict[str, Any] | None:
     """Return what the page needs of the agent in a folder; None if its networks cannot be exported."""
     form = player.agent.exported()
     if form is None:

@@ -44,20 +44,11 @@ class LoadedAgent:
     env: PAMDPEnv
     progress: Mapping[str, Any]
 
-
-@dataclass(frozen=True)
-class Player:
-    """An agent, and episodes to watch it play.
-
-    Attributes:
-        config: config of the agent and its problem.
-        agent: the agent, with the weights of its checkpoint if there is one.
-        evaluation: evaluation with `eval.layouts` episodes, all of them filmed.
-    """
-
-    config: Config
-    agent: HierarchicalAgent
-    evaluation: Evaluation
+    def evaluation(self) -> Evaluation:
+        """Return an evaluation with `eval.layouts` episodes, all of them filmed."""
+        num_filmed = self.config.run.eval.layouts
+        with closed_on_error(self.env):
+            return make_evaluation(self.config, self.env, num_filmed=num_filmed, filmed_steps=None)
 
 
 def split_words(words: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -101,30 +92,13 @@ def whole_number(least: int, most: int) -> Callable[[str], int]:
     return read_number
 
 
-def load_player(path: str | None, settings: Sequence[str]) -> Player:
-    """Build a player.
-
-    Args:
-        path: the agent's folder, a checkpoint, `policy.pt`, or the name of an agent that comes with the package. If
-            None, the settings describe the player.
-        settings: words of a command line, such as `env=goal` or `eval.layouts=6`.
-
-    Raises:
-        ConfigError: the agent does not exist, or a setting is wrong.
-    """
-    loaded = load_agent(path, settings)
-    num_filmed = loaded.config.run.eval.layouts
-    with closed_on_error(loaded.env):
-        evaluation = make_evaluation(loaded.config, loaded.env, num_filmed=num_filmed, filmed_steps=None)
-    return Player(loaded.config, loaded.agent, evaluation)
-
-
 def load_agent(path: str | None, settings: Sequence[str], objects: Mapping[str, Any] | None = None) -> LoadedAgent:
     """Load a saved agent, or build one that settings describe.
 
     Args:
-        path: as for `load_player`.
-        settings: words of a command line.
+        path: the agent's folder, a checkpoint, `policy.pt`, or the name of an agent that comes with the package. If
+            None, the settings describe the agent.
+        settings: words of a command line, such as `env=goal` or `eval.layouts=6`.
         objects: arguments for the problem's constructor from Python code.
 
     Raises:

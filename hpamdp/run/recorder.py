@@ -31,10 +31,9 @@ from hpamdp.metrics_file import (
 from hpamdp.policies.base import Learner
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.closing_table import ONE_OPTION, SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight
 from hpamdp.run.loggers import EarlierRun, LenientLogger, Logger
 from hpamdp.run.state_checks import SavedPart, check_columns, check_values, checked
-from hpamdp.run.summary import summarise
+from hpamdp.run.summary import ONE_OPTION, SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight, summarise
 from hpamdp.run_files import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
 
 # Small enough to film in a second or two.
@@ -245,7 +244,7 @@ class Recorder:
             np.savez_compressed(partial, **arrays)
         with replacing(folder / SUMMARY_NAME) as partial:
             partial.write_text(json.dumps(self.summary, indent=2) + "\n")
-        images = figures.draw_all(folder, type(self.parts.evaluation.problem))
+        images = figures.draw_all(folder, type(self.parts.evaluation.problem), self.summary, played)
         filmed = self._film(folder)
         if self._logger is None:
             return

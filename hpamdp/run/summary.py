@@ -1,16 +1,25 @@
-"""Summarise a run in one JSON object."""
+"""Summarise a run: in one JSON object, and in the table at its end, this agent beside the references."""
 
 from __future__ import annotations
 
+import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
 from hpamdp import __version__
+from hpamdp.config.components import Component
 from hpamdp.config.schema import Config
-from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.base import Metric, PAMDPEnv
+from hpamdp.figure_style import REFERENCES
+from hpamdp.messages import duration
+from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 
+WITHOUT_UPDATE = "without_update"  # names of the levels that made no update
+ONE_OPTION = "one_option"  # lines about a selector that holds one option in all episodes
+SHORT_SIGHT = "short_sight"  # lines about learners that look far less ahead than episodes last
+_FAR = 4.0  # times the steps that a learner looks ahead; longer episodes count as far longer
 _PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy")
 
 
@@ -52,3 +61,85 @@ def summarise(
             **{name: version(name) for name in _PACKAGES},
         },
     }
+
+
+def _number(value: float) -> str:
+    return f"{round(value, 3) + 0.0:.3f}"  # adding 0 turns -0.0 into 0.0
+
+
+_WRITE: dict[str, Callable[[float], str]] = {"number": _number, "share": "{:.1%}".format, "count": "{:.2f}".format}
+
+
+def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
+    """Return a plain aligned table of this agent beside the references.
+
+    Args:
+        summary: the agent's metrics by their names, `references`, `mode`, `frames`, `wall_s`, `without_update`,
+            `short_sight` and `one_option`.
+        metrics: the rows. Rows without a value for the agent are left out, and so are columns without any value.
+    """
+    titles = {name: title for name, (title, _, _) in REFERENCES.items()}
+    beside = summary.get("references", {})
+    columns = {titles.get(name, name): beside[name] for name in sorted(beside, key=_order)}
+    columns = {"this agent": summary, **columns}
+    rows = [metric for metric in metrics if _is_known(summary.get(metric.name))]
+    columns = {
+        title: measured
+        for title, measured in columns.items()
+        if any(_is_known(measured.get(metric.name)) for metric in rows)
+    }
+    cells = [["", *columns]] if rows else []
+    for metric in rows:
+        values = [measured.get(metric.name) for measured in columns.values()]
+        cells.append([metric.title, *(_WRITE[metric.kind](value) if _is_known(value) else "" for value in values)])
+    widths = [max(len(cell) for cell in column) for column in zip(*cells, strict=True)]
+    lines = []
+    for first, *others in cells:
+        aligned = [first.ljust(widths[0]), *map(str.rjust, others, widths[1:])]
+        lines.append("   ".join(aligned).rstrip())
+    if any("" in row[1:] for row in cells[1:]):
+        lines.append("empty cells: no figure is stored for that reference with these settings")
+    lines += summary.get(SHORT_SIGHT, []) + summary.get(ONE_OPTION, [])
+    without = summary.get(WITHOUT_UPDATE, [])
+    lines += [f"no update was made: {', '.join(without)}"] if without else []
+    return "\n".join([*lines, *_effort(summary)])
+
+
+def short_sight(learners: Iterable[Component], episode_steps: float) -> list[str]:
+    """Return a line for each learner that looks far less ahead than the episodes that were seen.
+
+    Args:
+        learners: with a discount `gamma` or a planning `horizon` among their settings.
+        episode_steps: mean length of the episodes.
+    """
+    lines: dict[str, None] = {}
+    for low in learners:
+        gamma, horizon = low.settings.get("gamma"), low.settings.get("horizon")
+        seen = ""
+        if isinstance(horizon, int) and not low.settings.get("end_values") and episode_steps > _FAR * horizon:
+            seen = f"{low}: plans see low.horizon={horizon} steps"
+        elif isinstance(gamma, float) and gamma < 1.0 and episode_steps > _FAR / (1.0 - gamma):
+            seen = f"{low}: low.gamma={gamma} counts about {1.0 / (1.0 - gamma):.0f} steps"
+        if seen:
+            lines[f"{seen}, but episodes have {episode_steps:.0f} on average"] = None
+    return list(lines)
+
+
+def _order(reference: str) -> int:
+    known = list(REFERENCES)
+    return known.index(reference) if reference in known else len(known)
+
+
+def _is_known(value: Any) -> bool:
+    return value is not None and not math.isnan(value)
+
+
+def _effort(summary: Mapping[str, Any]) -> list[str]:
+    parts = []
+    if _is_known(summary.get(FRAMES)):
+        unit = "updates" if summary.get("mode") == "offline" else "frames"
+        parts.append(f"{summary[FRAMES]:,.0f} {unit}")
+    if _is_known(summary.get(WALL_SECONDS)):
+        parts.append(duration(summary[WALL_SECONDS]))
+    joint = " of training, evaluated in " if summary.get("mode") == "eval" else " in "
+    return [joint.join(parts)] if parts else []

@@ -12,7 +12,7 @@ from hpamdp.analysis import film
 from hpamdp.config.compose import setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.messages import reason_of, say
-from hpamdp.run.players import add_config_dir, load_player, split_words, whole_number, with_config_dirs
+from hpamdp.run.players import add_config_dir, load_agent, split_words, whole_number, with_config_dirs
 
 _DESCRIPTION = """\
 Film an agent at its problem.
@@ -54,8 +54,8 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     if path is None and not settings:
         raise ConfigError("watch: nobody to watch; give a run's folder, or a player such as low=planner high=oracle")
     episodes = [f"eval.layouts={options.episodes}", f"eval.seed={options.seed}", "film=true"]
-    player = load_player(path, [*with_config_dirs(settings, options.config_dir), *episodes])
-    evaluation = player.evaluation
+    player = load_agent(path, [*with_config_dirs(settings, options.config_dir), *episodes])
+    evaluation = player.evaluation()
     draws = player.config.env.settings.get("render") is not False
     lack = f"{player.config.env}: has no pictures to film{'' if draws else '; use env.render=true'}"
     if not evaluation.problem.film_state(1):
