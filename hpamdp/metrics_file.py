@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from hpamdp.files import read_regular, replacing
 from hpamdp.messages import warn
@@ -74,19 +74,6 @@ def _numbers(cells: Mapping[str | None, Any]) -> Iterable[tuple[str, float]]:
             continue
 
 
-class Metrics(Protocol):
-    """The rows of a run's metrics, one for each log. Later rows may add columns."""
-
-    def append(self, row: Mapping[str, float]) -> None:
-        """Add one row."""
-
-    def rows(self) -> list[dict[str, float]]:
-        """Return all rows so far, each with the columns that have a number."""
-
-    def keep_resumed(self) -> None:
-        """Write the rows of the resumed run into a new folder, where nothing else has them."""
-
-
 def rows_up_to(frames: float, path: Path) -> list[dict[str, float]]:
     """Return the rows of a `metrics.csv` for a run that resumes from this many frames.
 
@@ -119,81 +106,57 @@ def what_is_lost(
     return None
 
 
-class MetricsInMemory:
-    """The metrics of a run that writes no files.
+class Metrics:
+    """The rows of a run's metrics, one for each log. Later rows may add columns.
+
+    If there is a file, it is complete on disk after every row.
 
     Args:
+        path: the csv file; None if the run writes no files. It does not change before the first row. Then a file of an
+            earlier run is kept as `<name>.previous`.
         resumed: the rows of the resumed run, which come first.
     """
 
-    def __init__(self, resumed: Iterable[Mapping[str, float]] = ()) -> None:
-        self._rows = [dict(row) for row in resumed]
-
-    def append(self, row: Mapping[str, float]) -> None:
-        """Add one row."""
-        self._rows.append({column: float(value) for column, value in row.items()})
-
-    def rows(self) -> list[dict[str, float]]:
-        """Return a copy of all rows so far."""
-        return [dict(row) for row in self._rows]
-
-    def keep_resumed(self) -> None:
-        """Do nothing: there is no folder."""
-
-
-class MetricsFile:
-    """A csv file with one row for each log, complete on disk after every row. Later rows may add columns.
-
-    Args:
-        path: the file. It does not change before the first row. Then a file of an earlier run is kept as
-            `<name>.previous`.
-        resume_from: the metrics file of the resumed run, which may be `path` itself. Its rows come first.
-        up_to_frames: resumed rows past this many frames are left out, and so is the last row of a stopped run.
-    """
-
-    def __init__(self, path: Path, resume_from: Path | None = None, up_to_frames: float = math.inf) -> None:
+    def __init__(self, path: Path | None = None, resumed: Iterable[Mapping[str, float]] = ()) -> None:
         self.path = path
-        self._columns: list[str] = []
-        # Rows that wait for the first one of this run; None once they are in the file.
-        self._resumed: list[dict[str, float]] | None = (
-            [] if resume_from is None else rows_up_to(up_to_frames, resume_from)
-        )
+        self._rows = [dict(row) for row in resumed]
+        self._columns: list[str] = []  # of the file, once this run has written it
 
     def append(self, row: Mapping[str, float]) -> None:
         """Add one row; it is on disk when this returns. Columns not seen before join the header."""
         row = {column: float(value) for column, value in row.items()}
-        if self._resumed is not None:
-            self._keep_previous()
-            self._rewrite([*self._resumed, row])
-            self._resumed = None
-        elif not row.keys() <= set(self._columns):
-            self._rewrite([*self.rows(), row])
-        else:
+        self._rows.append(row)
+        if self.path is None:
+            return
+        if not self._columns:
+            self._keep_previous(self.path)
+        if row.keys() <= set(self._columns):
             with self.path.open("a", newline="") as file:
                 self._writer(file).writerow(row)
+        else:
+            self._rewrite(self.path)
 
     def keep_resumed(self) -> None:
         """Write the rows of the resumed run into a new folder, where nothing else has them."""
-        if self._resumed:
-            self._rewrite(self._resumed)
-            self._resumed = None
+        if self.path is not None and self._rows:
+            self._rewrite(self.path)
 
     def rows(self) -> list[dict[str, float]]:
-        """Return all rows so far, each with the columns that have a number."""
-        return read_rows(self.path) if self._resumed is None else list(self._resumed)
+        """Return a copy of all rows so far, each with the columns that have a number."""
+        return [dict(row) for row in self._rows]
 
-    def _keep_previous(self) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self.path.is_file():
-            with replacing(self.path.with_name(self.path.name + ".previous")) as partial:
-                shutil.copyfile(self.path, partial)
+    def _keep_previous(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_file():
+            with replacing(path.with_name(path.name + ".previous")) as partial:
+                shutil.copyfile(path, partial)
 
-    def _rewrite(self, rows: list[dict[str, float]]) -> None:
-        self._columns = list(dict.fromkeys(column for column in [*self._columns, *(c for row in rows for c in row)]))
-        with replacing(self.path) as partial, partial.open("w", newline="") as file:
+    def _rewrite(self, path: Path) -> None:
+        self._columns = list(dict.fromkeys(column for row in self._rows for column in row))
+        with replacing(path) as partial, partial.open("w", newline="") as file:
             writer = self._writer(file)
             writer.writeheader()
-            writer.writerows(rows)
+            writer.writerows(self._rows)
 
     def _writer(self, file: Any) -> csv.DictWriter[str]:
         return csv.DictWriter(file, self._columns, restval="", lineterminator="\n")

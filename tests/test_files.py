@@ -14,7 +14,7 @@ import hpamdp
 from hpamdp import files
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import remove_link, replacing
-from hpamdp.metrics_file import MetricsFile
+from hpamdp.metrics_file import Metrics, rows_up_to
 from hpamdp.run import play
 from hpamdp.run.folder import locked
 from hpamdp.run.sweep import Job, Records
@@ -148,7 +148,7 @@ def test_only_links_are_removed(tmp_path):
 
 def test_metrics_that_are_no_file_are_neither_read_nor_replaced(tmp_path):
     os.mkfifo(tmp_path / "metrics.csv")
-    metrics = MetricsFile(tmp_path / "metrics.csv", tmp_path / "metrics.csv")
+    metrics = Metrics(tmp_path / "metrics.csv", rows_up_to(1.0, tmp_path / "metrics.csv"))
     assert metrics.rows() == []
     with pytest.raises(OSError, match="is a named pipe"):
         metrics.append({"frames": 1.0})

@@ -1,5 +1,6 @@
 import csv
 import io
+import math
 
 import pytest
 import wandb
@@ -8,7 +9,7 @@ from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised, human_references
 from hpamdp.messages import duration
-from hpamdp.metrics_file import MetricsFile, read_rows
+from hpamdp.metrics_file import Metrics, read_rows, rows_up_to
 from hpamdp.run.loggers import CSVLogger, TensorboardLogger, WandbLogger
 from hpamdp.run.summary import closing_table
 
@@ -39,7 +40,7 @@ def log_a_run(logger, output_dir):
 
 
 def test_rows_come_back_as_they_were_written(tmp_path):
-    file = MetricsFile(tmp_path / "metrics.csv")
+    file = Metrics(tmp_path / "metrics.csv")
     rows = [{"frames": 10.0, "loss": 0.1}, {"frames": 2**33 + 1.0, "loss": -1e-17}]
     for row in rows:
         file.append(row)
@@ -47,7 +48,7 @@ def test_rows_come_back_as_they_were_written(tmp_path):
 
 
 def test_a_row_with_a_new_column_keeps_old_rows_and_the_columns_order(tmp_path):
-    file = MetricsFile(tmp_path / "metrics.csv")
+    file = Metrics(tmp_path / "metrics.csv")
     rows = [{"frames": 1.0, "a": 1.0}, {"frames": 2.0, "b": 2.0}, {"c": 3.0}, {"frames": 4.0}]
     for row in rows:
         file.append(row)
@@ -57,7 +58,7 @@ def test_a_row_with_a_new_column_keeps_old_rows_and_the_columns_order(tmp_path):
 
 def test_the_file_is_a_complete_csv_after_every_row(tmp_path):
     path = tmp_path / "metrics.csv"
-    file = MetricsFile(path)
+    file = Metrics(path)
     assert file.rows() == []
     for i in range(5):
         file.append({"frames": i, f"column{i // 2}": i})
@@ -68,7 +69,7 @@ def test_the_file_is_a_complete_csv_after_every_row(tmp_path):
 
 
 def test_a_kill_while_the_header_is_rewritten_leaves_the_old_file(tmp_path, monkeypatch):
-    file = MetricsFile(tmp_path / "metrics.csv")
+    file = Metrics(tmp_path / "metrics.csv")
     file.append({"frames": 1.0})
 
     def killed(*_):
@@ -84,7 +85,7 @@ def test_a_last_line_that_was_cut_off_is_left_out_and_never_appended_to(tmp_path
     path = tmp_path / "metrics.csv"
     path.write_text("frames,a\n1,2\n10,2.5\n100,3.4")
     assert read_rows(path) == [{"frames": 1.0, "a": 2.0}, {"frames": 10.0, "a": 2.5}]
-    file = MetricsFile(path, resume_from=path)
+    file = Metrics(path, rows_up_to(math.inf, path))
     file.append({"frames": 100, "a": 3.45})
     assert [row["a"] for row in file.rows()] == [2.0, 2.5, 3.45]
 
@@ -102,20 +103,20 @@ def test_a_file_of_something_else_has_no_rows(tmp_path, capsys):
 
 
 def test_a_resumed_file_starts_with_the_rows_up_to_the_frame(tmp_path):
-    first = MetricsFile(tmp_path / "first" / "metrics.csv")
+    first = Metrics(tmp_path / "first" / "metrics.csv")
     for frames in (100, 200, 300):
         first.append({"frames": frames, "loss": 1.0})
-    other = MetricsFile(tmp_path / "other" / "metrics.csv", resume_from=first.path, up_to_frames=200)
+    other = Metrics(tmp_path / "other" / "metrics.csv", rows_up_to(200, first.path))
     other.append({"frames": 250, "loss": 2.0})
     assert [row["frames"] for row in other.rows()] == [100, 200, 250]
     assert len(first.rows()) == 3
-    in_place = MetricsFile(first.path, resume_from=first.path, up_to_frames=100)
+    in_place = Metrics(first.path, rows_up_to(100, first.path))
     assert in_place.rows() == [{"frames": 100.0, "loss": 1.0}]
 
 
 def test_a_new_run_in_an_old_folder_keeps_the_old_rows_beside_its_own(tmp_path):
-    MetricsFile(tmp_path / "metrics.csv").append({"frames": 1})
-    file = MetricsFile(tmp_path / "metrics.csv")
+    Metrics(tmp_path / "metrics.csv").append({"frames": 1})
+    file = Metrics(tmp_path / "metrics.csv")
     file.append({"frames": 2})
     assert file.rows() == [{"frames": 2.0}]
     assert read_rows(tmp_path / "metrics.csv.previous") == [{"frames": 1.0}]
@@ -123,13 +124,13 @@ def test_a_new_run_in_an_old_folder_keeps_the_old_rows_beside_its_own(tmp_path):
 
 def test_a_file_that_no_row_was_added_to_stays_as_it_was(tmp_path):
     path = tmp_path / "metrics.csv"
-    MetricsFile(path).append({"frames": 1})
-    assert MetricsFile(path).rows() == []
-    assert MetricsFile(path, resume_from=path).rows() == read_rows(path) == [{"frames": 1.0}]
+    Metrics(path).append({"frames": 1})
+    assert Metrics(path).rows() == []
+    assert Metrics(path, rows_up_to(math.inf, path)).rows() == read_rows(path) == [{"frames": 1.0}]
 
 
 def test_nothing_but_numbers_enters_the_file(tmp_path):
-    file = MetricsFile(tmp_path / "metrics.csv")
+    file = Metrics(tmp_path / "metrics.csv")
     with pytest.raises(ValueError):
         file.append({"frames": "many"})
     assert file.rows() == []

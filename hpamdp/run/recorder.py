@@ -23,8 +23,6 @@ from hpamdp.metrics_file import (
     STOPPED,
     WALL_SECONDS,
     Metrics,
-    MetricsFile,
-    MetricsInMemory,
     rows_up_to,
     what_is_lost,
 )
@@ -65,7 +63,7 @@ class Recorder:
         self.config = config
         self.parts = parts
         self.output_dir = output_dir
-        self.metrics: Metrics = MetricsInMemory() if output_dir is None else MetricsFile(output_dir / METRICS_NAME)
+        self.metrics = Metrics(None if output_dir is None else output_dir / METRICS_NAME)
         self.summary: dict[str, Any] = {}
         self._logger: Logger | None = None
         self._resumed_from: Path | None = None  # the folder of the run that is continued
@@ -87,10 +85,7 @@ class Recorder:
             log_every: largest distance of two of its rows, beside the length of a batch; 0 if unknown.
         """
         source = folder / METRICS_NAME
-        if self.output_dir is None:
-            self.metrics = MetricsInMemory(rows_up_to(frames, source))
-        else:
-            self.metrics = MetricsFile(self.output_dir / METRICS_NAME, source, frames)
+        self.metrics = Metrics(self.metrics.path, rows_up_to(frames, source))
         self._resumed_from = folder
         batch = self.config.run.num_envs * self.config.run.steps_per_batch
         lost = what_is_lost(self.metrics.rows(), source, frames, log_every, batch)
