@@ -29,9 +29,11 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import explained, not_understood
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError
-from hpamdp.exit_codes import FAILED, INTERRUPTED, MISTAKE
 from hpamdp.limits import limit_in
 from hpamdp.messages import (
+    FAILED,
+    INTERRUPTED,
+    MISTAKE,
     first_line,
     lenient_streams,
     lost_output,

@@ -1,4 +1,4 @@
-"""Write messages of one line to the user, on streams that may be closed."""
+"""Write messages of one line to the user, on streams that may be closed, and end with an exit code."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO, cast
 
+# Exit codes of the command line, beside 0.
+FAILED = 1
+MISTAKE = 2  # of the user: a refused setting, file or environment
+DIVERGED = 3
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 _LONGEST_CODE = 80  # letters of a value in a message
 
 
@@ -133,7 +138,7 @@ def exit_code(program: Callable[[], int | None]) -> int:
             return code
         if not isinstance(error, BrokenPipeError):
             warn(f"stdout: {reason_of(error)}")
-        return 1
+        return FAILED
 
 
 def say(text: str) -> None:

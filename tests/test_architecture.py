@@ -142,19 +142,7 @@ def test_a_problem_knows_no_other_but_the_other_boats_the_boats_and_those_on_gym
 
 
 def test_the_data_knows_the_environments_and_nobody_below_knows_the_data():
-    allowed = (
-        "cards",
-        "data",
-        "devices",
-        "env",
-        "exit_codes",
-        "files",
-        "json_lines",
-        "keys",
-        "messages",
-        "settings",
-        "specs",
-    )
+    allowed = ("cards", "data", "devices", "env", "files", "json_lines", "keys", "messages", "settings", "specs")
     known = {name for module in FILES if is_in(module, "hpamdp.data") for name in imports(module)}
     assert not [n for n in known if is_in(n, "hpamdp") and not any(is_in(n, f"hpamdp.{room}") for room in allowed)]
     assert not importers("hpamdp.data", inside="hpamdp.env") | importers("hpamdp.data", inside="hpamdp.policies")

@@ -15,7 +15,7 @@ from toy_components import OneStep, random_steps
 from hpamdp import keys
 from hpamdp.api.export import GreedyStep
 from hpamdp.components import Components
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.row_checks import check_actions
 from hpamdp.env.base import ProblemError
 from hpamdp.env.decisions import with_decisions

@@ -20,9 +20,8 @@ from torchrl.data import Binary, Unbounded
 
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
-from hpamdp.data import export, memmap, minari
+from hpamdp.data import DataError, export, memmap, minari
 from hpamdp.data.demonstrations import TRAJECTORY, Demonstrations, with_option_sums
-from hpamdp.data.errors import DataError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.policies.low_level.iql import IQL

@@ -16,7 +16,7 @@ import pytest
 import synthetic_human
 from tensordict import TensorDict
 
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.human import cli
 from hpamdp.data.human.dataset import HumanExperienceReplay
 from hpamdp.data.human.demonstrations import HumanDemonstrations

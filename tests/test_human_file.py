@@ -11,7 +11,7 @@ import scipy.io
 import synthetic_human
 import torch
 
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.human import released_file
 from hpamdp.data.human.released_file import read
 from hpamdp.env.boatdock import harbour, physics

@@ -17,8 +17,8 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
+from hpamdp.data import DataError
 from hpamdp.data.demonstrations import TRAJECTORY
-from hpamdp.data.errors import DataError
 from hpamdp.data.human import minari
 from hpamdp.data.human.dataset import HumanExperienceReplay, slices, whole_episodes
 from hpamdp.data.human.episodes import keep, scores_by_person, select

@@ -11,7 +11,7 @@ from conftest import compose_config
 from play_players import docked, events_of, played
 
 from hpamdp import keys
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.human import played_file
 from hpamdp.data.human.cli import main
 from hpamdp.data.human.demonstrations import PlayedDemonstrations

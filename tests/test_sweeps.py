@@ -15,7 +15,7 @@ from conftest import CONF, choices, compose_config
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from hpamdp import exit_codes
+from hpamdp import messages
 from hpamdp.config.command_line import completed, parse
 from hpamdp.config.components import component
 from hpamdp.config.compose import read
@@ -53,7 +53,7 @@ def jobs(monkeypatch):
             raise ZeroDivisionError("a bug")
         if cfg.seed == 6:
             tell("reward is nan at frame 7: training stopped")
-            return exit_codes.DIVERGED
+            return messages.DIVERGED
         frames = 5 if cfg.seed == 5 or (cfg.seed == 3 and stopped_at is None) else cfg.total_frames
         (folder / "checkpoint.zip").touch()
         summary = {"score": float(cfg.seed), "frames": frames, "finished": cfg.seed == 5 or frames > 5}
@@ -462,7 +462,7 @@ def test_a_search_with_a_storage_goes_on_when_it_is_started_again(command, monke
         (folder / "config.yaml").write_text(choose_selector(read(cfg)).to_yaml())
         (folder / "checkpoint.zip").touch()
         if len(tried) == 3:
-            return exit_codes.INTERRUPTED
+            return messages.INTERRUPTED
         if len(tried) == 5:
             raise ZeroDivisionError("a bug")
         summary = {"score": cfg.low.clip, "frames": cfg.total_frames, "finished": True}

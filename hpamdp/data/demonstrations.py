@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.row_checks import (
     TRAJECTORY,
     check_actions,

@@ -13,7 +13,7 @@ import numpy as np
 from tensordict import TensorDict
 from torch import Tensor
 
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.messages import first_line, reason_of
 
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, NonNegativeInt, TypeAdapter, Validat
 from pydantic_core import from_json
 from tensordict import TensorDict
 
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.files import read_regular, regular_size
 from hpamdp.messages import reason_of
 

@@ -21,7 +21,7 @@ from gymnasium import spaces
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.export import check_room
 from hpamdp.data.row_checks import TRAJECTORY, check_transitions
 from hpamdp.files import read_regular, regular_size

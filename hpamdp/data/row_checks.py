@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.specs import PAMDPSpecs
 
 TRAJECTORY = ("collector", "traj_ids")  # the number of a row's episode, where TorchRL's collectors write it

@@ -16,8 +16,8 @@ from hpamdp import keys
 from hpamdp.config.components import Component, constructor_arguments
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
+from hpamdp.data import DataError
 from hpamdp.data.demonstrations import Demonstrations
-from hpamdp.data.errors import DataError
 from hpamdp.data.row_checks import DURATION, missing_masks
 from hpamdp.env.base import PAMDPEnv, checked_option_names
 from hpamdp.env.decisions import OptionLength, with_decisions

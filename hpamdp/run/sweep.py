@@ -26,9 +26,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO
-from hpamdp.exit_codes import DIVERGED, FAILED, INTERRUPTED, MISTAKE
 from hpamdp.files import read_regular, remove_link, replacing
-from hpamdp.messages import one_line, reason_of, say, warn
+from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, MISTAKE, one_line, reason_of, say, warn
 from hpamdp.run.folder import check_no_link, has_foreign_error, is_about_folder, locked, remove_error, write_error
 from hpamdp.run.search import first_job_of_search
 from hpamdp.run.stopping import exits_explained, pass_on_signal

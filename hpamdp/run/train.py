@@ -15,8 +15,7 @@ from hpamdp.config.saved import needs_trust
 from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError, fault_of
-from hpamdp.exit_codes import DIVERGED, FAILED, INTERRUPTED
-from hpamdp.messages import first_line, say, warn
+from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble, facts_about
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, raised_by

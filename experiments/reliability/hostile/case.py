@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from hpamdp.config.errors import ConfigError
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.env.base import ProblemError
 
 REFUSED, ACCEPTED = "refused in one line", "accepted"

@@ -12,8 +12,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
-from hpamdp.data import export
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError, export
 from hpamdp.data.human import minari, played_file, statistics, validation
 from hpamdp.data.human.download import download
 from hpamdp.data.human.episodes import scores_by_person, select
@@ -30,8 +29,7 @@ from hpamdp.data.human.released_file import (
 from hpamdp.data.human.transitions import NO_PRESS, transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
-from hpamdp.exit_codes import INTERRUPTED, MISTAKE
-from hpamdp.messages import exit_code, one_line, say, warn
+from hpamdp.messages import INTERRUPTED, MISTAKE, exit_code, one_line, say, warn
 
 _TABLE_FORMATS = ("csv", "npz")
 _TRANSITION_FORMATS = ("memmap", "minari")

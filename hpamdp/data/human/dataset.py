@@ -14,8 +14,7 @@ from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers import Sampler
 
-from hpamdp.data import memmap
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError, memmap
 from hpamdp.data.export import write_memmap
 from hpamdp.data.human.episodes import check_conditions, select
 from hpamdp.data.human.options import SHA256

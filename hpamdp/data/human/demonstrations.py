@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from hpamdp.data import DataError
 from hpamdp.data.demonstrations import Demonstrations
-from hpamdp.data.errors import DataError
 from hpamdp.data.human import played_file
 from hpamdp.data.human.episodes import select
 from hpamdp.data.human.options import CARDS, HumanOptions, PeoplesOptions, PlayedOptions

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pooch
 
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.human.options import SHA256
 from hpamdp.data.human.released_file import check_sum, default_path, load_bytes
 from hpamdp.messages import reason_of

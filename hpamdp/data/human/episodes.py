@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.human.released_file import FULL_TANK, HumanData
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.messages import as_code

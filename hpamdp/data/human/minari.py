@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from tensordict import TensorDict
 
 from hpamdp import keys
+from hpamdp.data import DataError
 from hpamdp.data import minari as generic
-from hpamdp.data.errors import DataError
 from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.registration import BOAT_DOCK_ID
 from hpamdp.env.boatdock.task import SCALED_NAMES

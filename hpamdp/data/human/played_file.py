@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.human.released_file import EPISODES_PER_BLOCK, TICKS_PER_SECOND, HumanData, table
 from hpamdp.data.human.schema import GAS_SECONDS
 from hpamdp.env.boatdock import harbour, physics

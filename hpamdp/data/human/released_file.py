@@ -17,7 +17,7 @@ import torch
 from platformdirs import user_cache_path
 from tensordict import TensorDict
 
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.human import schema
 from hpamdp.data.human.options import SHA256
 from hpamdp.env.boatdock import harbour, physics

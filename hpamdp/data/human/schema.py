@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.messages import first_line
 
 SPEED_UNIT = 10.0  # px/s of the column `velocity`

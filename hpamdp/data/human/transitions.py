@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.data.errors import DataError
+from hpamdp.data import DataError
 from hpamdp.data.human.released_file import TICKS_PER_SECOND, HumanData
 from hpamdp.data.row_checks import TRAJECTORY
 from hpamdp.env.boatdock import episode, harbour, physics
