@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn, TypeVar
@@ -256,7 +256,7 @@ class WorkerCollection(Collection):
             return self._last_known()
         state: dict[str, Any] = {"generators": [each["generator"] for each in states]}
         for name in states[0].keys() & {"env", "root"}:
-            state[name] = _side_by_side([each[name] for each in states])
+            state[name] = TensorDict.cat([_rows(each[name]) for each in states]).to_dict()
         if not self._keeps_episodes:
             state["env"] = self._problem.env_state()
         if self._coming:
@@ -283,16 +283,17 @@ class WorkerCollection(Collection):
 
         def send(number: int) -> None:
             first = number * self._size
+            own = slice(first, first + self._size)
 
             def send_to(worker: Any) -> None:
                 if saved.env and self._keeps_episodes:
-                    call_worker(worker, "env.set_env_state", _sliced(saved.env, first, self._size))
+                    call_worker(worker, "env.set_env_state", _rows(saved.env)[own].cpu().to_dict())
                 elif saved.env:
                     call_worker(worker, "begin_episodes", saved.env)
                 elif self._keeps_episodes and self._frames > 0:  # not the run's first episodes again
                     call_worker(worker, "begin_seeded", random_seeds(self._config.run.seed, first, self._frames)[1])
                 if saved.root is not None and self._keeps_episodes:
-                    call_worker(worker, "_carrier.update", _sliced(saved.root, first, self._size))
+                    call_worker(worker, "_carrier.update", _rows(saved.root)[own].cpu().to_dict())
                 if len(saved.generators) == len(self.workers):
                     call_worker(worker, "policy.set_generator_state", saved.generators[number])
 
@@ -355,21 +356,9 @@ def modules_here_last() -> Iterator[None]:
         unprotect_children()
 
 
-def _side_by_side(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Concatenate the rows of nested columns."""
-    columns: dict[str, Any] = {}
-    for name, value in states[0].items():
-        parts = [state[name] for state in states]
-        columns[name] = _side_by_side(parts) if isinstance(value, Mapping) else torch.cat(parts)
-    return columns
-
-
-def _sliced(values: Mapping[str, Any], first: int, size: int) -> dict[str, Any]:
-    """Return `size` rows of nested columns, starting at row `first`, on the CPU."""
-    return {
-        name: _sliced(value, first, size) if isinstance(value, Mapping) else value[first : first + size].cpu()
-        for name, value in values.items()
-    }
+def _rows(columns: Mapping[str, Any]) -> TensorDict:
+    """Return nested columns, all with the same first dimension, as rows."""
+    return TensorDict(columns).auto_batch_size_(1)
 
 
 def _without_ids(root: Mapping[str, Any]) -> dict[str, Any]:
