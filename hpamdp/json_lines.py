@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import codecs
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from pydantic_core import from_json  # refuses deep nesting, at which `json` meets Python's recursion limit
-
-from hpamdp.messages import one_line
+from hpamdp.messages import first_line, one_line
 
 MAX_LINE_BYTES = 1 << 20
 _NUM_SHOWN = 3
@@ -20,44 +17,33 @@ class LineError(ValueError):
     """Raised for a line without a value; the message is one line."""
 
 
-def read_json(line: bytes) -> Any:
-    """Return the value of a line.
+def read_json(data: bytes) -> Any:
+    """Return the value of a line, or of a small file.
 
     Raises:
-        LineError: the line holds no JSON value, or is too long.
+        LineError: the data hold no JSON value, are too long, or give a key of an object twice.
     """
-    if len(line) > MAX_LINE_BYTES:
+    if len(data) > MAX_LINE_BYTES:
         raise LineError(f"longer than {MAX_LINE_BYTES} bytes")
-    if line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raise LineError("UTF-16, but must be UTF-8")
-    plain = line.removeprefix(codecs.BOM_UTF8)
     try:
-        value = from_json(plain, allow_inf_nan=False)
-    except ValueError as error:
-        raise LineError("no JSON") from error
-    twice = key_given_twice(plain)
-    if twice is not None:
+        return json.loads(data.decode("utf-8-sig"), object_pairs_hook=_once, parse_constant=_refused)
+    except LineError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise LineError(f"no JSON: {first_line(error)}") from error
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object. Of a key that is given twice, readers would take the last value."""
+    names = dict(pairs)
+    if len(names) < len(pairs):
+        twice = next(name for name, number in Counter(name for name, _ in pairs).items() if number > 1)
         raise LineError(f"{one_line(twice)[:40]} is given twice")
-    return value
+    return names
 
 
-def key_given_twice(data: bytes) -> str | None:
-    """Return a key that some object of a JSON text has twice, or None. Readers would take its last value.
-
-    Args:
-        data: a text that `from_json` has read, so that it is not nested deeply.
-    """
-    found: list[str] = []
-
-    def check(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        names = dict(pairs)
-        if len(names) < len(pairs):
-            counted = Counter(name for name, _ in pairs)
-            found.append(next(name for name, number in counted.items() if number > 1))
-        return names
-
-    json.loads(data, object_pairs_hook=check)
-    return found[0] if found else None
+def _refused(constant: str) -> None:
+    raise ValueError(f"{constant} is no number of JSON")
 
 
 def lines_of(data: bytes) -> Iterator[tuple[int, bytes]]:

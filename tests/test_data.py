@@ -576,7 +576,7 @@ def light(**_):
 SPOILS = {
     "its metadata have no action_space": spec_that_runs,
     "its format is arrow, but must be hdf5": lambda folder: with_metadata(folder, data_format="arrow"),
-    "cannot be read as transitions (no JSON)": lambda folder: (folder / "metadata.json").write_text("[" * 9999),
+    "cannot be read as transitions (no JSON": lambda folder: (folder / "metadata.json").write_text("[" * 9999),
     "cannot be read as transitions ('list' object": lambda folder: (folder / "metadata.json").write_text("[]"),
     "is a named pipe": lambda folder: ((folder / "metadata.json").unlink(), os.mkfifo(folder / "metadata.json")),
     "No such file": lambda folder: (folder / "main_data.hdf5").unlink(),

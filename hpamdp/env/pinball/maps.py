@@ -24,12 +24,11 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import from_json  # refuses deep nesting, at which `json` meets Python's recursion limit
 
 from hpamdp.env.pinball.options import SOURCE_MAPS
 from hpamdp.files import read_regular
-from hpamdp.json_lines import key_given_twice
-from hpamdp.messages import one_line, reason_of
+from hpamdp.json_lines import LineError, read_json
+from hpamdp.messages import reason_of
 
 _FOLDER = Path(__file__).resolve().parent / "maps"
 _MAX_BYTES = 2**20
@@ -115,12 +114,9 @@ def read(name: str) -> PinballMap:
     except OSError as error:
         raise MapError(reason_of(error)) from error
     try:
-        from_json(data, allow_inf_nan=False)
-    except ValueError as error:
-        raise MapError(f"is no JSON: {reason_of(error)}") from error
-    twice = key_given_twice(data)
-    if twice is not None:
-        raise MapError(f"{one_line(twice)[:80]}: is given twice")
+        read_json(data)
+    except LineError as error:
+        raise MapError(str(error)) from error
     try:
         found = PinballMap.model_validate_json(data)
     except ValidationError as error:
