@@ -9,7 +9,11 @@ float32 always goes step by step, since small differences grow.
 The exit code is 1 if a number differs by more than the tolerance, or if an outcome, termination or truncation differs.
 It is 2 if the file is no such recording.
 
-`README.md` beside this file describes the files and how to add a domain.
+A file has `schema` (1), `domain`, `state_names` and `episodes`; for Hard Move also `num_actuators` and `motions`. An
+episode has `initial` (`state`, `observation`) and `steps`. Each step has `action`, `parameters` (of the chosen action),
+`observation`, `state` (after it), `reward`, `terminated`, `truncated` and `outcome` (empty while the episode
+continues). The steps of Platform and Goal also have `ticks` and the random numbers: `draws` for each tick, and on
+Platform `jump`. Another domain needs a module in `adapters/`, see the docstrings there.
 """
 
 from __future__ import annotations

@@ -60,7 +60,6 @@ ENVIRONMENTS = [*dict.fromkeys("hard_move" if name.startswith("hard_move") else 
 # Random steps before HyAR learns, which its published number of steps leaves out.
 UNCOUNTED_STEPS = {("platform", "hyar_published"): 11_000}
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
-MIN_SEEDS_MIDDLE = 5  # least seeds for an interquartile mean beside the mean
 FIRST_STEPS = 700  # start of the curves' axes, before any evaluation
 PLANNERS = ("dlpa", "pets")
 AUGMENTED = "_augment"  # follows a learner's name if it learns from steps mapped by the problem's symmetries
@@ -182,12 +181,8 @@ def _values(rows: Rows) -> list[float]:
 
 
 def _cell(rows: Rows) -> str:
-    """Return mean ± deviation, the number of seeds and, with `MIN_SEEDS_MIDDLE` seeds, the interquartile mean."""
-    values = _values(rows)
-    if not values:
-        return ""
-    middle = f", IQM {interquartile_mean(values)[0]:.3f}" if len(values) >= MIN_SEEDS_MIDDLE else ""
-    return f"{spread(values)} ({_num_seeds(rows)}){middle}"
+    """Return mean ± deviation and the number of seeds."""
+    return f"{spread(_values(rows))} ({_num_seeds(rows)})" if rows else ""
 
 
 def _num_seeds(rows: Rows) -> str:
@@ -213,11 +208,12 @@ def best_table(results: Rows, published: Rows) -> str:
         second = f"{others[0]} ({_num_seeds(cells[(others[0],)])})" if others else ""
         improvement = f"{difference(values[best], values[others[0]]).improvement:.2f}" if others else ""
         top = best_published(published, name)
+        unit = "return" if what == "score" else "success"
         columns = [
             name,
             best,
             len(values),
-            f"{_cell(cells[(best,)])} {'return' if what == 'score' else 'success'}",
+            f"{_cell(cells[(best,)])}, IQM {interquartile_mean(values[best])[0]:.3f} {unit}",
             interval_text(values[best]),
             second,
             improvement,
@@ -232,17 +228,6 @@ def best_table(results: Rows, published: Rows) -> str:
 def _not_clearly_lower(values: dict[str, list[float]], best: str, others: Sequence[str]) -> str:
     """Return the learners whose difference to the best one has an interval with 0."""
     return ", ".join(low for low in others if not difference(values[best], values[low]).is_clear)
-
-
-def cost_table(results: Rows) -> str:
-    """Return a line for each learner and domain with steps, CPU and wall time of a run, and a line for all of them."""
-    lines = ["| domain | learner | seeds | steps | CPU | wall |", "|---|---|---|---|---|---|"]
-    for (name, low, frames), rows in groups(results, "domain", "learner", "frames").items():
-        cpu_s, wall_s = (np.mean([row[column] for row in rows]) for column in ("cpu_s", "wall_s"))
-        lines.append(f"| {name} | {low} | {len(rows)} | {frames:,.0f} | {cpu_s:.0f} s | {wall_s:.0f} s |")
-    cpu_h, wall_h = (sum(row[column] for row in results) / 3600.0 for column in ("cpu_s", "wall_s"))
-    lines.append(f"| all runs above | | {len(results)} | | {cpu_h:.1f} h | {wall_h:.1f} h |")
-    return "\n".join(lines)
 
 
 def given_table(results: Rows) -> str:
@@ -326,7 +311,6 @@ def main(folders: Sequence[str]) -> None:
         best_table(at_published_steps(results), published),
         table(at_published_steps(results), published, references),
         given_table(at_published_steps(results)),
-        cost_table(results),
         sep="\n\n",
     )
 
