@@ -24,7 +24,7 @@ Differs from the source:
   or so updates. The source compares it with the error after the last update (`correction_error=latest`);
 - with `parameter_tolerance` the correction asks whether z still decodes to the executed parameters, which are stored.
   The source asks whether the change of the state that z predicts is the one that followed. Where changes are hard to
-  predict, the two hardly agree: see `experiments/domains`;
+  predict, the two hardly agree;
 - with `layer_norm` the critics' layers are normalised, which bounds the values of latent actions far from all that were
   tried (Ball et al. 2023, arXiv 2302.02948);
 - with `greedy_samples` the greedy policy also values variations of z and takes the best of them;
