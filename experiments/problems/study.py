@@ -25,7 +25,6 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
-    interval_text,
     read_csv,
     spread,
     with_enough_seeds,
@@ -202,9 +201,9 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
 def table(results: Rows, curves: Rows) -> str:
     """Return a line for each cell with enough seeds: scores, how many runs reach the bar, and after how many steps."""
     lines = [
-        "| problem | learner | exploration | steps | n | return | 95 % | success | better option | lowest return "
-        "| return to reach | runs that reach it | first reached after | CPU |",
-        "|---" * 14 + "|",
+        "| problem | learner | steps | n | return | success | lowest return | return to reach | runs that reach it "
+        "| first reached after | CPU |",
+        "|---" * 11 + "|",
     ]
     evaluations = groups(curves, *RUN)
     for (problem, learner, exploration, frames), rows in groups(with_enough_seeds(results, *CELL), *CELL).items():
@@ -219,14 +218,11 @@ def table(results: Rows, curves: Rows) -> str:
         reached = [first["frames"] for first in firsts if first]
         columns = [
             problem,
-            learner,
-            exploration,
+            learner if exploration == "none" else f"{learner}, {exploration}",
             f"{frames:,}",
             len(rows),
             spread(scores, digits),
-            interval_text(scores, f".{digits}f"),
-            percent([row["success"] for row in rows]),
-            percent([row["better_option"] for row in rows if row["better_option"] != ""]),
+            f"{100.0 * np.mean([row['success'] for row in rows]):.1f} %",
             f"{min(scores):.{digits}f}",
             f"{bar:,.{digits}f} ({whose})",
             f"{sum(score >= bar for score in scores)} of {len(rows)}",
@@ -235,11 +231,6 @@ def table(results: Rows, curves: Rows) -> str:
         ]
         lines.append("| " + " | ".join(map(str, columns)) + " |")
     return "\n".join(lines)
-
-
-def percent(fractions: Sequence[float]) -> str:
-    """Return the mean of fractions in percent; an empty text if there are none."""
-    return f"{100.0 * np.mean(fractions):.1f} %" if fractions else ""
 
 
 def traffic_table(rows: Rows) -> str:

@@ -42,7 +42,7 @@ def of_cases(cases: Rows) -> str:
     """Return a line for each case: option 0 alone, the best split and its final value."""
     lines = ["| case | decisions | option 0 alone | best split | its final value |", "|---|---|---|---|---|"]
     for case in cases:
-        shares = " : ".join(f"{100 * case[f'split_{i}']:.0f}" for i in range(3) if case[f"split_{i}"] != "")
+        shares = ":".join(f"{100 * case[f'split_{i}']:.0f}" for i in range(3) if case[f"split_{i}"] != "")
         lines.append(
             f"| {case['case']} | {case['decisions']:,} | {case['alone']:.3f} | {shares} | {case['best']:.3f} |"
         )
@@ -63,7 +63,7 @@ def table(rows: Rows, cases: Rows, column: str) -> str:
 def cell(row: dict, column: str) -> str:
     """Return a share, or the practice of all options in percent."""
     if column == "practice":
-        return " : ".join(f"{100 * row[f'practice_{i}']:.0f}" for i in range(3) if row[f"practice_{i}"] != "")
+        return ":".join(f"{100 * row[f'practice_{i}']:.0f}" for i in range(3) if row[f"practice_{i}"] != "")
     if row[column] == "":
         return ""
     return f"{round(row[column], 2) + 0.0:.2f}"  # no minus before a zero
