@@ -73,7 +73,7 @@ wheel: $(SLOW)/.installed
 lowest: $(LOWEST)/.installed
 	$(LOWEST)/bin/python -m pytest -n auto --dist worksteal $(ARGS)
 
-# Figures, tables and pages of all studies, from their csv files: report/report.html
+# Figures of all studies, tables and numbers of all pages, from the csv files
 report: $(VENV)/.installed-dev
 	$(PYTHON) experiments/report.py
 

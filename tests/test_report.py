@@ -1,4 +1,4 @@
-"""The report of all studies: renewed tables, one page that needs no other file, failures that stop nothing else."""
+"""Pages with the tables of all studies, and failures that stop nothing else."""
 
 import sys
 from pathlib import Path
@@ -20,8 +20,6 @@ def main(folders):
     print("| c |\\n|---|\\n| 3 |\\n\\ndone")
 """
 PAGE = """# Fine
-
-See [the other](../sad/README.md) and [a part of it](../sad/README.md#part).
 
 before
 <!-- table -->
@@ -54,47 +52,40 @@ def module():
 
 @pytest.fixture
 def experiments(tmp_path):
-    """Make a folder of studies: one that works, one without a page, one that fails, and a page without a study."""
+    """Make a folder of studies: one that works, one that fails, and a page without a study."""
     pages = {
         "fine": PAGE,
         "sad": "# Sad\n\n<!-- table -->\n| kept |\n<!-- /table -->\n",
         "no_study": "# No study\n",
     }
-    scripts = {
-        "fine": STUDY,
-        "pageless": STUDY.replace("0.5", "0.7"),
-        "sad": "def main(folders):\n    open('nowhere.csv')\n",
-    }
+    scripts = {"fine": STUDY, "sad": "def main(folders):\n    open('nowhere.csv')\n"}
     root = tmp_path / "experiments"
-    for name in (*pages, "pageless"):
-        (root / name).mkdir(parents=True)
     for name, page in pages.items():
+        (root / name).mkdir(parents=True)
         (root / name / "README.md").write_text(page)
     for name, script in scripts.items():
         (root / name / "study.py").write_text(script)
     return root
 
 
-def test_a_failing_study_is_named_and_stops_neither_the_others_nor_its_own_page(module, experiments, tmp_path):
-    (failure,) = module.report(experiments, tmp_path / "report")
+def test_a_failing_study_is_named_and_stops_neither_the_others_nor_its_own_page(module, experiments):
+    (failure,) = module.report(experiments)
     assert failure.startswith("sad: FileNotFoundError") and "nowhere.csv" in failure
     assert "| kept |" in (experiments / "sad/README.md").read_text()
-    text = (tmp_path / "report/report.html").read_text()
-    assert all(f'<section id="{name}">' in text for name in ("fine", "pageless", "sad", "no_study"))
-    assert "<td>0.7</td>" in text and "No study</h1>" in text
+    assert (experiments / "fine/line.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_all_tables_are_renewed_between_the_markers_and_nothing_else_of_the_page(module, experiments, tmp_path):
-    module.report(experiments, tmp_path / "report")
+def test_all_tables_are_renewed_between_the_markers_and_nothing_else_of_the_page(module, experiments):
+    module.report(experiments)
     renewed = f"<!-- table -->\n{FIRST_TABLE}\n\n{SECOND_TABLE}\n<!-- /table -->"
     old = "<!-- table -->\n| old |\n<!-- /table -->"
     assert (experiments / "fine/README.md").read_text() == PAGE.replace(old, renewed)
 
 
-def test_a_page_in_which_nothing_changes_is_not_written(module, experiments, tmp_path):
-    module.report(experiments, tmp_path / "report")
+def test_a_page_in_which_nothing_changes_is_not_written(module, experiments):
+    module.report(experiments)
     before = (experiments / "fine/README.md").stat().st_mtime_ns
-    module.report(experiments, tmp_path / "report")
+    module.report(experiments)
     assert (experiments / "fine/README.md").stat().st_mtime_ns == before
 
 
@@ -106,7 +97,7 @@ def test_the_front_page_and_the_documentation_get_the_tables_that_they_number(mo
     second = "<!-- table 2 of fine -->\n| older |\n<!-- /table -->\n\n"
     of_failed_study = "<!-- table 1 of sad -->\n| kept |\n<!-- /table -->\n"
     page.write_text(first + second + of_failed_study)
-    module.report(experiments, tmp_path / "report")
+    module.report(experiments)
     renewed = first.replace("| old |", FIRST_TABLE) + second.replace("| older |", SECOND_TABLE)
     assert page.read_text() == renewed + of_failed_study
 
@@ -116,27 +107,8 @@ def test_a_table_that_a_study_does_not_have_is_named_and_what_is_there_stays(mod
     front = tmp_path / "README.md"
     text = f"<!-- table {number} of fine -->\n| kept |\n<!-- /table -->\n"
     front.write_text(text)
-    assert f"README.md: no table {number} of fine" in module.report(experiments, tmp_path / "report")
+    assert f"README.md: no table {number} of fine" in module.report(experiments)
     assert front.read_text() == text
-
-
-def test_every_figure_is_there_as_png_beside_its_page_and_as_svg_in_the_report(module, experiments, tmp_path):
-    module.report(experiments, tmp_path / "report")
-    assert (experiments / "fine/line.png").read_bytes().startswith(b"\x89PNG")
-    assert "<svg" in (tmp_path / "report/fine/line.svg").read_text()
-    assert not list(experiments.rglob("*.svg"))
-
-
-def test_the_report_refers_to_no_other_file(module, experiments, tmp_path):
-    module.report(experiments, tmp_path / "report")
-    text = (tmp_path / "report/report.html").read_text()
-    assert text.count("<img") == text.count('src="data:image/png;base64,') == 2
-    assert 'href="#sad"' in text and "README.md" not in text
-
-
-def test_a_missing_image_is_named(module, experiments, tmp_path):
-    (experiments / "no_study/README.md").write_text("# No study\n\n![x](gone.png)\n")
-    assert "no_study: no image gone.png" in module.report(experiments, tmp_path / "report")
 
 
 def test_the_exit_code_says_whether_all_studies_worked(module, experiments, monkeypatch, capsys):
@@ -148,12 +120,12 @@ def test_the_exit_code_says_whether_all_studies_worked(module, experiments, monk
     assert capsys.readouterr().err == "" and "fine_study" not in sys.modules
 
 
-def test_a_study_may_have_each_table_at_a_place_of_its_own(module, experiments, tmp_path):
+def test_a_study_may_have_each_table_at_a_place_of_its_own(module, experiments):
     page = experiments / "fine" / "README.md"
     page.write_text(
         "# Fine\n\n<!-- table 2 of fine -->\n| old |\n<!-- /table -->\n\n<!-- table 9 of fine -->\n<!-- /table -->\n"
     )
-    failures = module.report(experiments, tmp_path / "report")
+    failures = module.report(experiments)
     assert f"<!-- table 2 of fine -->\n{SECOND_TABLE}\n<!-- /table -->" in page.read_text()
     assert "README.md: no table 9 of fine" in failures
 
