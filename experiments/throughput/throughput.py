@@ -7,8 +7,7 @@ processes. The environments to compare with are measured in the same run:
 - boats, one: `gymnasium.make`, beside Gymnasium's own CartPole;
 - boats, many: Gymnasium's vector environment, `BoatDockEnv.step_and_maybe_reset` by the kernel and by the tensor
   functions (as they are and, with --compiled, compiled), beside Gymnasium's vectorised NumPy CartPole;
-- the field's domains: the TorchRL and the Gymnasium environments, beside one environment in plain Python
-  (`originals.py`).
+- the field's domains: the TorchRL and the Gymnasium environments.
 
 Actions are random, from a pool of eight samples. A new episode starts when one ends.
 """
@@ -22,11 +21,9 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from random import Random
 
 import gymnasium
 import torch
-from originals import ORIGINALS
 
 import hpamdp  # also registers the Gymnasium ids
 from hpamdp import keys
@@ -151,8 +148,6 @@ def main() -> None:
         for what, make in boats(num_envs, arguments.device, arguments.compiled).items():
             measure(what, num_envs, make(), num_envs)
     for name, problem in DOMAINS.items():
-        original = ORIGINALS[name](Random(0))
-        measure(f"{name}, plain Python", 1, lambda played=original: next(played), 1)
         for num_envs in DOMAIN_SIZES:
             measure(f"{name}, TorchRL", num_envs, env_stepper(problem(num_envs)), num_envs)
             measure(f"{name}, Gymnasium vector", num_envs, vector_stepper(f"hpamdp/{name}-v0", num_envs), num_envs)
