@@ -93,20 +93,6 @@ def test_a_score_at_a_time_is_the_last_one_within_it_and_the_end_of_the_time_com
     assert [study.at(run, cpu_s)["cpu_s"] for cpu_s in (60.0, 120.0, 599.0, 600.0)] == [50.0, 110.0, 110.0, 601.0]
 
 
-def test_the_tables_have_a_line_for_each_learner_with_means_over_seeds_and_steps_after_the_warm_up():
-    study = module("study")
-    rows = [
-        row(seed, cpu_s, steps, score)
-        for seed, best in ((300, 0.9), (301, 1.0))
-        for cpu_s, steps, score in ((0.0, 0, 0.0), (10.0, 5000, 0.5), (110.0, 15000, best))
-    ]
-    _, _, line = study.scores_table(rows).splitlines()
-    scores = "0.500 ± 0.000 | 0.950 ± 0.071 | 0.950 ± 0.071 | 0.950 ± 0.071"
-    assert line.startswith(f"| Platform | hpamdp 1 | pdqn | greedy | 2 | {scores} |")
-    assert line.endswith("| 110 s | 15,000 |")
-    assert study.speed_table(rows).splitlines()[-1] == "| hpamdp 1 | pdqn | 100, 100 | 100 |"
-
-
 def test_a_folder_with_trainings_of_different_lengths_or_with_a_run_twice_is_refused(tmp_path):
     study = module("study")
     run = row(300, 0.0, 0, 0.0)

@@ -2,15 +2,11 @@
 
 import json
 import math
-import os
-import runpy
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import forked
 from scripts import load_script
 
 from hpamdp.analysis.study import (
@@ -80,12 +76,6 @@ def test_an_empty_path_is_not_the_working_directory(tmp_path, monkeypatch):
         finished(["a", ""])
 
 
-@pytest.mark.parametrize("name", ["peers", "pearl"])
-def test_studies_of_curves_take_no_empty_path_for_the_working_directory(name):
-    with pytest.raises(SystemExit, match="an empty path; name the folder of the curves"):
-        study(name).main([""])
-
-
 def test_finished_runs_are_found_at_any_depth_and_unfinished_ones_left_out(tmp_path):
     leave_run(tmp_path / "b/deep/er", seed=1)
     leave_run(tmp_path / "a", seed=2)
@@ -135,22 +125,11 @@ def test_linked_folders_count_once_and_unreadable_runs_are_named(tmp_path, capsy
     (study / "gone").symlink_to(tmp_path / "nowhere")
     leave_run(study / "cut")
     (study / "cut/summary.json").write_text('{"score": 1.')
-    leave_run(study / "nested")
-    (study / "nested/config.yaml").write_text("[" * 9_999)
-    leave_run(study / "aliases")
-    lists = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9))
-    (study / "aliases/config.yaml").write_text(f"a0: &a0 [1]\n{lists}")
-    leave_run(study / "pipe")
-    (study / "pipe/summary.json").unlink()
-    os.mkfifo(study / "pipe/summary.json")
     runs = finished([study, study / "a"])
     assert sorted(run.summary["seed"] for run in runs) == [0, 1, 2]
     assert sorted(capsys.readouterr().err.splitlines()) == [
-        f"{study / 'aliases'}: config.yaml is missing or damaged, left out",
         f"{study / 'cut'}: summary.json is missing or damaged, left out",
         f"{study / 'gone'}: is a broken link, left out",
-        f"{study / 'nested'}: config.yaml is missing or damaged, left out",
-        f"{study / 'pipe'}: summary.json is missing or damaged, left out",
     ]
 
 
@@ -301,12 +280,6 @@ def test_few_steps_keeps_runs_that_were_left_running_apart(tmp_path):
     assert last == "| congruent | 1 | 1.500 | 2.500 | 1 s |"
 
 
-def test_the_hierarchy_is_tabulated_from_its_stored_runs():
-    hierarchy = study("hierarchy")
-    lines = hierarchy.table(standing_rows(EXPERIMENTS / "hierarchy/results.csv")).splitlines()
-    assert any(line.startswith("| actor | hppo | 4,000,000, 1,000,000 | 10 | 3.558 ± 0.011 |") for line in lines)
-
-
 def test_the_hierarchy_ranks_selectors_by_their_distances_to_the_ceilings_of_their_own_layouts():
     hierarchy = study("hierarchy")
     cell = {"low": "hppo", "total": 100, "uniform_option_steps": 0} | dict.fromkeys(hierarchy.COLUMNS, 0.5)
@@ -344,16 +317,10 @@ def test_offline_compares_data_sets_after_the_same_number_of_updates():
         ]
 
     curves = runs("rest-to-rest", _1000=0.2, _2000=0.5, _5000=0.9) + runs("recorded", _1000=0.1, _2000=0.3)
-    line = offline.comparison(
-        "bc: a less b", ("bc", "offline", "rest-to-rest", "all"), ("bc", "offline", "recorded", "all"), curves
-    )
-    assert line.startswith("| bc: a less b | 2,000 updates | +0.200 (")
-    assert (
-        offline.comparison(
-            "no runs", ("iql", "offline", "recorded", "all"), ("bc", "offline", "recorded", "all"), curves
-        )
-        is None
-    )
+    better, other = ("bc", "offline", "rest-to-rest", "all"), ("bc", "offline", "recorded", "all")
+    title, after, found, _ = offline.comparison("bc: a less b", better, other, curves)
+    assert (title, after) == ("bc: a less b", "2,000 updates") and str(found).startswith("+0.200 (")
+    assert offline.comparison("no runs", ("iql", *other[1:]), other, curves) is None
 
 
 def test_domains_scores_each_learner_by_its_longest_runs_within_the_published_steps():
@@ -547,31 +514,6 @@ def test_a_study_of_evaluations_takes_them_without_metrics(tmp_path, capsys):
     assert "mode=eval, but runs of this study have train; left out" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["learners", "table1", "few_steps", "robustness"])
-def test_studies_of_boats_leave_out_runs_with_another_keymap(name, tmp_path, monkeypatch, capsys):
-    module, folder = study(name), tmp_path / "runs/keymap"
-    monkeypatch.setattr(module, "HERE", tmp_path)
-    leave_run(folder)
-    config = (folder / "config.yaml").read_text()
-    noises = "slip: 0.0, motor_noise: 0.0, sensor_noise: 0.0"
-    low = "augment: auto, num_members: 5, posterior_sampling: auto, updates_per_step: 10.0, horizon: 2"
-    (folder / "config.yaml").write_text(
-        config.replace("env: {", f"env: {{keymap: 0, {noises}, ").replace("low: {", f"low: {{{low}, ")
-    )
-    with pytest.raises(SystemExit, match=r"no finished runs of this study; nothing was written"):
-        module.main([str(tmp_path / "runs")])
-    assert capsys.readouterr().err == f"{folder}: env.keymap=0, but runs of this study have 1; left out\n"
-
-
-def test_robustness_leaves_out_a_run_without_a_boat(tmp_path, monkeypatch, capsys):
-    robustness, folder = study("robustness"), tmp_path / "runs/foreign"
-    monkeypatch.setattr(robustness, "HERE", tmp_path)
-    leave_run(folder)
-    with pytest.raises(SystemExit, match=r"no finished runs of this study; nothing was written"):
-        robustness.main([str(tmp_path / "runs")])
-    assert capsys.readouterr().err == f"{folder}: has no motor_noise, as runs of this study have; left out\n"
-
-
 def test_a_run_on_another_problem_of_gymnasium_does_not_join_those_on_hybrid_shoot(tmp_path, capsys):
     leave_run(tmp_path / "other")
     change_summary(tmp_path / "other", env="gymnasium")
@@ -649,10 +591,6 @@ GATHERING = [
 ]
 
 
-def test_at_least_twelve_studies_gather_runs():
-    assert len(GATHERING) >= 12
-
-
 @pytest.mark.parametrize("name", GATHERING)
 def test_a_study_that_is_given_a_run_of_no_study_changes_no_csv_file(name, tmp_path, monkeypatch):
     module, copy = study(name), tmp_path / "study"
@@ -680,25 +618,6 @@ def test_a_folder_with_one_curve_leaves_pearls_other_curves_as_they_are(tmp_path
     is_same = lambda row: all(row[name] == stored[0][name] for name in (*pearl.LEARNER, "seed"))  # noqa: E731
     assert [row["score"] for row in rows if is_same(row)] == [-5.0]
     assert [row for row in rows if not is_same(row)] == [row for row in stored if not is_same(row)]
-
-
-CURVE = "problem,library,version,learner,seed,episodes,steps,cpu_s,score,success\r\n"
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "x,y\r\n1,2\r\n",
-        "problem,library,version,learner,seed\r\npinball,a,b,c,1\r\n",
-        f"{CURVE}foo,a,b,c,1,1,1,1,1,1\r\n",
-        f"{CURVE}pinball,a,b,c,a,1,1,1,1,1\r\n",
-        f"{CURVE}pinball,a,b,c,1,1,1,1,nan,1\r\n",
-    ],
-)
-def test_pearls_study_refuses_a_file_that_is_no_curve_of_it(tmp_path, text):
-    (tmp_path / "other.csv").write_text(text)
-    with pytest.raises(SystemExit, match=r"other\.csv: is no curve of this study; nothing was written"):
-        study("pearl").gather(tmp_path)
 
 
 def test_runs_are_added_to_a_csv_file_in_the_place_of_repeated_ones(tmp_path):
@@ -788,36 +707,6 @@ def test_a_run_of_another_sharing_replaces_no_stored_run_with_unknown_boats(tmp_
         assert len(read_csv(tmp_path / "results.csv")) == num
 
 
-def test_the_table_of_unknown_boats_has_a_column_for_each_head():
-    study_of = study("generalisation")
-    numbers = {f"{name}_{trip}": 2.0 for name in ("score", "presses") for trip in range(1, 9)}
-    row = dict.fromkeys(study_of.SETTINGS, "x") | {"boats": 2, "sharing": "per_option", "ceiling": 3.0, "cpu_s": 1.0}
-    lines = study_of.table([row | numbers | {"seed": seed} for seed in range(3)]).splitlines()
-    assert len({line.count("|") for line in lines}) == 1 and "x, x, per option" in lines[-1]
-
-
-def _listed_to(folder: Path, out, err, words):
-    """Print the list of the runs that are planned in this folder to this stdout, in a process of its own."""
-    os.dup2(err, 2)
-    sys.stdout, sys.stderr = open(out, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
-    sys.argv = ["cells.py", *words]
-    runpy.run_path(str(folder / "cells.py"), run_name="__main__")
-
-
-@pytest.mark.parametrize("words", [["--list"], ["--help"]])
-def test_the_list_of_runs_ends_quietly_when_its_reader_has_seen_enough(tmp_path, words):
-    for name in ("cells.py", "cells.csv"):
-        shutil.copy(EXPERIMENTS / "domains" / name, tmp_path)
-    (tmp_path / "results.csv").write_text("domain,learner,seed\n")
-    reader, writer = os.pipe()
-    os.close(reader)
-    with (tmp_path / "err.txt").open("w+") as err:
-        assert forked(_listed_to, tmp_path, writer, err.fileno(), words) == 1
-        err.seek(0)
-        assert err.read() == ""
-    os.close(writer)
-
-
 def test_all_scripts_of_studies_print_to_streams_that_may_close():
     """Those that run other libraries print nothing."""
     scripts = {script: script.read_text() for script in sorted(EXPERIMENTS.rglob("*.py"))}
@@ -827,45 +716,51 @@ def test_all_scripts_of_studies_print_to_streams_that_may_close():
         assert "exit_code(" in text.rpartition('if __name__ == "__main__":')[2], script
 
 
-ARM = {
-    "task": "assembly",
-    "reward": "sparse",
-    "actions": "primitives",
-    "reach": 0.4,
-    "negative_distances": False,
-    "decisions": 5,
-}
-ALL_STEERING = "primitives assembly, sparse, actions=all, reach=1.0, negative_distances=True"
+PINBALL = {"map": "hard", "start": "map", "training_start": "both"}
+ARM = {"task": "assembly", "reward": "sparse", "actions": "primitives", "reach": 0.4, "negative_distances": False}
+CIRCUIT = {"task": "ghz", "gate_set": "published", "target_number": None, "begin": "empty"}
 
 
 @pytest.mark.parametrize(
     ("env", "settings", "name"),
     [
-        ("traffic", {"demand": "rush", "network": "crossing", "strategies": False}, "traffic rush"),
-        (
-            "traffic",
-            {"demand": "rush", "network": "corridor", "strategies": True},
-            "traffic rush, corridor, strategies",
-        ),
-        ("office", {"chooses_goal": True}, "office, chooses goal"),
-        ("pinball", {"map": "hard", "start": "anywhere"}, "pinball hard, from anywhere"),
+        ("traffic", {"demand": "rush", "network": "corridor", "strategies": True}, "rush, corridor, strategies"),
+        ("pinball", PINBALL, "hard, training_start=both"),
         (
             "pinball",
-            {"map": "hard", "start": "map", "training_start": "both"},
-            "pinball hard, training_start=both",
+            PINBALL | {"map": "simple", "grouping": {"a": [0], "b": [1]}},
+            "simple, training_start=both, 2 options",
         ),
+        ("primitives", ARM | {"decisions": 5}, "assembly, sparse"),
         (
-            "pinball",
-            {"map": "simple", "start": "map", "grouping": {"a": [0, 1], "b": [0, 1]}},
-            "pinball simple, 2 options",
+            "primitives",
+            ARM | {"decisions": 5, "actions": "all", "reach": 1.0},
+            "assembly, sparse, actions=all, reach=1.0",
         ),
-        ("primitives", ARM, "primitives assembly, sparse"),
-        ("primitives", {**ARM, "reach": 1.0, "negative_distances": True, "actions": "all"}, ALL_STEERING),
-        ("platform", {}, "platform"),
+        ("circuit", CIRCUIT | {"begin": "known"}, "ghz, begin=known"),
     ],
 )
 def test_runs_on_different_problems_have_different_names(tmp_path, env, settings, name):
-    assert study("problems").problem_of(Run(tmp_path, {"env": env}, {"env": settings})) == name
+    run = Run(tmp_path, {"env": env}, {"env": settings})
+    assert study("problems").problem_of(run) == f"{env} {name}"
+
+
+@pytest.mark.parametrize(
+    ("summary", "env", "low", "name"),
+    [
+        ({"env": "office", "high": "none", "low": "pdqn"}, {}, {}, "pdqn"),
+        ({"env": "office", "high": "ucb", "low": "random"}, {}, {}, "ucb"),
+        ({"env": "circuit", "high": "meta_critic", "low": "planner"}, {}, {}, "meta_critic over planner"),
+        ({"env": "pinball"}, {"map": "hard"}, {"discrete_entropy": 0.01}, "hppo, discrete_entropy=0.01"),
+        ({"env": "pinball"}, {"map": "simple"}, {"discrete_entropy": 0.01}, "hppo"),
+        ({"env": "circuit"}, {}, {"min_scale_final": 0.003}, "hppo, noise to 0.003"),
+        ({"env": "primitives"}, {"actions": "primitives"}, {"lr": 1e-3}, "hppo, lr=0.001"),
+        ({"env": "primitives"}, {"actions": "large_steps"}, {"lr": 1e-3}, "hppo"),
+    ],
+)
+def test_a_learner_under_a_selector_or_with_earlier_settings_has_another_name(tmp_path, summary, env, low, name):
+    run = Run(tmp_path, {"high": "none", "low": "hppo", **summary}, {"env": env, "low": low})
+    assert study("problems").learner_of(run) == name
 
 
 def test_the_table_of_exploration_has_a_column_for_each_kind_even_for_options_with_a_bonus(tmp_path):
@@ -880,48 +775,9 @@ def test_the_table_of_exploration_has_a_column_for_each_kind_even_for_options_wi
 
 
 @pytest.mark.parametrize(
-    ("high", "low", "name"),
-    [("none", "pdqn", "pdqn"), ("ucb", "random", "ucb"), ("meta_critic", "planner", "meta_critic over planner")],
-)
-def test_a_learner_under_a_selector_has_another_name_than_alone(tmp_path, high, low, name):
-    assert study("problems").learner_of(Run(tmp_path, {"env": "office", "high": high, "low": low}, {"low": {}})) == name
-
-
-@pytest.mark.parametrize(
-    ("pinball_map", "weight", "name"),
-    [("hard", 0.01, "hppo, discrete_entropy=0.01"), ("hard", 0.03, "hppo"), ("simple", 0.01, "hppo")],
-)
-def test_the_smaller_entropy_bonus_is_told_apart_on_the_hard_map_alone(tmp_path, pinball_map, weight, name):
-    config = {"env": {"map": pinball_map}, "low": {"discrete_entropy": weight}}
-    run = Run(tmp_path, {"env": "pinball", "high": "none", "low": "hppo"}, config)
-
-    assert study("problems").learner_of(run) == name
-
-
-@pytest.mark.parametrize(
     ("env", "weight", "name"),
     [("office", 50.0, "counts, weight=50"), ("office", 25.0, "counts"), ("pinball", 50.0, "counts")],
 )
 def test_other_weights_of_counted_visits_are_told_apart_on_office(tmp_path, env, weight, name):
     config = {"choices": {"exploration": "counts"}, "exploration": {"weight": weight}}
     assert study("problems").exploration_of(Run(tmp_path, {"env": env}, config)) == name
-
-
-@pytest.mark.parametrize(("least", "name"), [(0.003, "hppo, noise to 0.003"), (0.015, "hppo")])
-def test_circuits_of_the_earlier_recipe_are_told_apart(tmp_path, least, name):
-    run = Run(tmp_path, {"env": "circuit", "high": "none", "low": "hppo"}, {"low": {"min_scale_final": least}})
-    assert study("problems").learner_of(run) == name
-
-
-@pytest.mark.parametrize(
-    ("rate", "actions", "name"),
-    [
-        (1e-3, "primitives", "hppo, lr=0.001"),
-        (3e-4, "primitives", "hppo"),
-        (1e-3, "large_steps", "hppo"),
-    ],
-)
-def test_primitives_of_the_earlier_recipe_are_told_apart(tmp_path, rate, actions, name):
-    summary = {"env": "primitives", "high": "none", "low": "hppo"}
-    run = Run(tmp_path, summary, {"low": {"lr": rate}, "env": {"actions": actions}})
-    assert study("problems").learner_of(run) == name

@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from hpamdp.analysis.study import Rows, groups, mean_of, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, groups, markdown_table, mean_of, read_csv, spread, write_tables
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -77,15 +77,12 @@ def run_all() -> Rows:
 
 def table(rows: Rows) -> str:
     """Return a line for each task and collector: mean ± standard deviation of the score over seeds, and other means."""
-    lines = ["| | collector | score | frames/s | wall s | CPU s | whole command, s |", "|---|---|---|---|---|---|---|"]
+    lines = []
     for (task, collector), runs in groups(rows, "task", "collector").items():
-        score = spread([run["score"] for run in runs])
-        lines.append(
-            f"| {task} | `{collector}` | {score} | {mean_of(runs, 'frames_per_s'):,.0f} | "
-            f"{mean_of(runs, 'wall_s'):.1f} | "
-            f"{mean_of(runs, 'cpu_s'):.1f} | {mean_of(runs, 'whole_s'):.1f} |"
-        )
-    return "\n".join(lines)
+        seconds = [f"{mean_of(runs, column):.1f}" for column in ("wall_s", "cpu_s", "whole_s")]
+        score, speed = spread([run["score"] for run in runs]), f"{mean_of(runs, 'frames_per_s'):,.0f}"
+        lines.append([task, f"`{collector}`", score, speed, *seconds])
+    return markdown_table("| collector | score | frames/s | wall s | CPU s | whole command, s", lines)
 
 
 def main(words: Sequence[str]) -> None:

@@ -3,7 +3,6 @@
 python experiments/domains/cells.py                      trains all, one after the other
 python experiments/domains/cells.py platform/hppo goal   trains these cells and all of a domain
 python experiments/domains/cells.py --processes 2        trains two at a time, each with one thread
-python experiments/domains/cells.py --minutes 60         begins no run after an hour
 python experiments/domains/cells.py --list               says what is left
 
 A run goes to `multirun/domains/DOMAIN/LEARNER/SEED`, and an interrupted one continues. `study.py` gathers them. Runs
@@ -17,7 +16,6 @@ import os
 import shlex
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -90,7 +88,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cells", nargs="*", help="domains, or DOMAIN/LEARNER; all if none is given")
     parser.add_argument("--processes", type=int, default=1, help="runs at a time")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no run after this time")
     parser.add_argument("--list", action="store_true", help="print the commands of the runs that are left")
     options = parser.parse_args()
     stored = stored_runs()
@@ -100,18 +97,15 @@ def main() -> int:
         for _, arguments in left:
             print(f"python run.py {shlex.join(arguments)}")
         return 0
-    start = time.monotonic()
 
-    def train_in_time(run: tuple[Path, list[str]]) -> bool:
+    def train_one(run: tuple[Path, list[str]]) -> bool:
         folder, arguments = run
-        if time.monotonic() - start > 60.0 * options.minutes:
-            return True
         is_done = train(folder, arguments)
         print(f"{'finished' if is_done else 'FAILED, see the log of'} {folder}", flush=True)
         return is_done
 
     with ThreadPoolExecutor(options.processes) as pool:
-        return 0 if all([*pool.map(train_in_time, left)]) else 1
+        return 0 if all([*pool.map(train_one, left)]) else 1
 
 
 if __name__ == "__main__":

@@ -29,6 +29,8 @@ from hpamdp.analysis.study import (
     groups,
     interquartile_mean,
     interval_text,
+    markdown_table,
+    mean_of,
     read_csv,
     refuse_repeats,
     spread,
@@ -156,24 +158,20 @@ def table(results: Rows, published: Rows, references: Rows) -> str:
     """
     names = [f"{name}{form}" for form in ("", AUGMENTED) for name in LEARNER_COLOURS]
     learners = [name for name in names if any(row["learner"] == name for row in results)]
-    lines = [
-        "| | " + " | ".join(DOMAINS) + " |",
-        "|---|" + "---|" * len(DOMAINS),
-    ]
+    lines = []
     cells = groups(results, "domain", "learner")
     for name in learners:
-        values = [_cell(cells.get((column, name), [])) for column in DOMAINS]
-        lines.append(f"| **{name}** | " + " | ".join(values) + " |")
+        lines.append([f"**{name}**", *(_cell(cells.get((column, name), [])) for column in DOMAINS)])
     for (method, source), rows in groups(published, "method", "source").items():
         lines.append(_line(f"{method} ({source})", rows))
     lines += [_line(str(player), rows) for (player,), rows in groups(references, "player").items()]
-    return "\n".join(lines)
+    return markdown_table(f"| {' | '.join(DOMAINS)}", lines)
 
 
-def _line(name: str, rows: Rows) -> str:
+def _line(name: str, rows: Rows) -> list[str]:
     """Return a line of the table with the score of each domain, if it has one."""
     scores = {row["domain"]: f"{row['score']:g}" for row in rows}
-    return f"| {name} | " + " | ".join(scores.get(domain, "") for domain in DOMAINS) + " |"
+    return [name, *(scores.get(domain, "") for domain in DOMAINS)]
 
 
 def _values(rows: Rows) -> list[float]:
@@ -194,11 +192,7 @@ def best_table(results: Rows, published: Rows) -> str:
 
     The highest mean is chosen on the scored episodes, so a column has the number of learners that it is chosen from.
     """
-    lines = [
-        "| domain | highest mean | of learners | score | 95 % interval | next (seeds) | probability of improvement "
-        "| not clearly lower | best published | CPU of a run |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for name, (_, what) in DOMAINS.items():
         cells = groups([row for row in results if row["domain"] == name], "learner")
         values = {low: _values(rows) for (low,), rows in cells.items()}
@@ -219,10 +213,14 @@ def best_table(results: Rows, published: Rows) -> str:
             improvement,
             _not_clearly_lower(values, best, others),
             f"{top['score']:g} ({top['method']})" if top else "",
-            f"{np.mean([row['cpu_s'] for row in cells[(best,)]]):.0f} s",
+            f"{mean_of(cells[(best,)], 'cpu_s'):.0f} s",
         ]
-        lines.append(f"| {' | '.join(map(str, columns))} |")
-    return "\n".join(lines)
+        lines.append(columns)
+    head = (
+        "domain | highest mean | of learners | score | 95 % interval | next (seeds) | probability of improvement "
+        "| not clearly lower | best published | CPU of a run"
+    )
+    return markdown_table(head, lines)
 
 
 def _not_clearly_lower(values: dict[str, list[float]], best: str, others: Sequence[str]) -> str:
@@ -232,17 +230,15 @@ def _not_clearly_lower(values: dict[str, list[float]], best: str, others: Sequen
 
 def given_table(results: Rows) -> str:
     """Return a line for each learner and what it was given, with the domains where it was given that."""
-    lines = [
-        "| learner | domains | initial parameters | symmetry | discount | search when scored | reward scale |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     known = [row for row in results if row.get("search")]
     columns = ("initial_parameters", "symmetry", "gamma", "search", "reward_scale")
     for (name, *values), rows in groups(known, "learner", *columns).items():
         where = ", ".join(dict.fromkeys(row["domain"] for row in rows))
         shown = [value if isinstance(value, str) else f"{value:g}" for value in values]
-        lines.append(f"| {name} | {where} | {' | '.join(shown)} |")
-    return "\n".join(lines)
+        lines.append([name, where, *shown])
+    head = "learner | domains | initial parameters | symmetry | discount | search when scored | reward scale"
+    return markdown_table(head, lines)
 
 
 def best_published(published: Rows, name: str) -> dict[str, Any] | None:

@@ -10,8 +10,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from hpamdp.analysis.study import (
     Rows,
     Run,
@@ -19,6 +17,8 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
+    markdown_table,
+    mean_of,
     read_csv,
     spread,
     with_enough_seeds,
@@ -75,12 +75,12 @@ def table(rows: Rows) -> str:
     """Return a line for each learner on each problem, with a column for each kind of exploration with enough seeds."""
     rows = with_enough_seeds(rows, "problem", "learner", "exploration")
     columns = dict.fromkeys([*KINDS, *(row["exploration"] for row in rows)])
-    lines = ["| problem | learner | steps | " + " | ".join(columns) + " |", "|---" * (3 + len(columns)) + "|"]
+    lines = []
     for (problem, learner, frames), of_pair in groups(rows, "problem", "learner", "frames").items():
         kinds = groups(of_pair, "exploration")
         cells = [cell(kinds[kind,]) if (kind,) in kinds else "" for kind in columns]
-        lines.append("| " + " | ".join([problem, learner, f"{frames:,}", *cells]) + " |")
-    return "\n".join(lines)
+        lines.append([problem, learner, f"{frames:,}", *cells])
+    return markdown_table(" | ".join(["problem", "learner", "steps", *columns]), lines)
 
 
 def cell(rows: Rows) -> str:
@@ -88,8 +88,7 @@ def cell(rows: Rows) -> str:
     scores = [row["score"] for row in rows]
     digits = 0 if max(map(abs, scores)) > 100.0 else 3
     firsts = [f"{row['solved_after'] / 1000:.0f}" if row["solved_after"] != "" else "never" for row in rows]
-    success = 100.0 * np.mean([row["success"] for row in rows])
-    seconds = np.mean([row["cpu_s"] for row in rows])
+    success, seconds = 100.0 * mean_of(rows, "success"), mean_of(rows, "cpu_s")
     return f"{spread(scores, digits)}; {success:.0f} %; {', '.join(firsts)}; {seconds:.0f} s"
 
 

@@ -21,6 +21,8 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
+    markdown_table,
+    mean_of,
     merged_tables,
     read_csv,
     spread,
@@ -58,6 +60,7 @@ VARIANTS = {
     "horizon=3": "plans of three presses",
 }
 ABLATION_SEEDS = (0, 1, 2)
+FIGURES = "seeds | presses to 1.97, median | slowest | to 3.02, median | score after 256 | after 384"
 # Columns that name a run, in each table.
 RUN = {
     "curves": ("augment", "seed", "boat", "reward", "variant"),
@@ -121,66 +124,56 @@ def runs_of(curves: Rows, augment: str, reward: str, boat: str) -> Rows:
 
 def table(curves: Rows) -> str:
     """Return a line for each setting and boat."""
-    lines = _head("| | controller |")
+    lines = []
     for (augment, reward), label in SETTINGS.items():
         for boat, task in TASKS.items():
             rows = runs_of(curves, augment, reward, boat)
             if rows:
-                lines.append(f"| {label} | {task} {_figures(rows)}")
-    return "\n".join(lines)
+                lines.append([label, task, *_figures(rows)])
+    return markdown_table(f"| controller | {FIGURES}", lines)
 
 
 def ablation_table(curves: Rows) -> str:
     """Return a line for each variant with the congruent controller, with the seeds that all variants have."""
     rows = [row for row in runs_of(curves, *DECLARED, "congruent") if row["seed"] in ABLATION_SEEDS]
     cells = {name: of_name for (name,), of_name in groups(rows, "variant").items()}
-    return "\n".join(
-        [*_head("| |"), *(f"| {label} {_figures(cells[name])}" for name, label in VARIANTS.items() if name in cells)]
-    )
+    lines = [[label, *_figures(cells[name])] for name, label in VARIANTS.items() if name in cells]
+    return markdown_table(f"| {FIGURES}", lines)
 
 
-def _head(first: str) -> list[str]:
-    columns = ("seeds", "presses to 1.97, median", "slowest", "to 3.02, median", "score after 256", "after 384")
-    return [f"{first} {' | '.join(columns)} |", "|---" * (first.count("|") - 1 + len(columns)) + "|"]
-
-
-def _figures(rows: Rows) -> str:
+def _figures(rows: Rows) -> list[object]:
     """Return the number of runs, their presses to people's scores, and their scores after 256 and 384 presses."""
     runs = list(groups(rows, "seed").values())
     human = [presses_to(HUMAN_SCORE, run) for run in runs]
     best = [presses_to(BEST_SCORE, run) for run in runs]
     after = [[row["score"] for row in rows if row["presses"] == presses] for presses in (256, 384)]
-    scores = " | ".join(spread(score) if len(score) == len(runs) else "" for score in after)
-    return (
-        f"| {len(runs)} | {_presses(human, 'median')} | {_presses(human, 'slowest')} | {_presses(best, 'median')} "
-        f"| {scores} |"
-    )
+    scores = [spread(score) if len(score) == len(runs) else "" for score in after]
+    return [len(runs), _presses(human, "median"), _presses(human, "slowest"), _presses(best, "median"), *scores]
 
 
 def long_table(long: Rows) -> str:
     """Return a line for each boat: the scores of long runs."""
     presses = sorted({row["presses"] for row in long if row["presses"] > 0})
-    columns = ("seeds", *(f"{number:,.0f} presses" for number in presses), "CPU of a run")
-    lines = [f"| controller | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
+    lines = []
     for boat, task in TASKS.items():
         rows = [row for row in long if row["boat"] == boat]
         if rows:
             scores = [spread([row["score"] for row in rows if row["presses"] == number]) for number in presses]
-            cpu = f"{np.mean([row['cpu_s'] for row in rows]):.0f} s"
-            lines.append(f"| {task} | {len(groups(rows, 'seed'))} | {' | '.join(scores)} | {cpu} |")
-    return "\n".join(lines)
+            lines.append([task, len(groups(rows, "seed")), *scores, f"{mean_of(rows, 'cpu_s'):.0f} s"])
+    lengths = " | ".join(f"{number:,.0f} presses" for number in presses)
+    return markdown_table(f"controller | seeds | {lengths} | CPU of a run", lines)
 
 
 def augment_table(augment: Rows) -> str:
     """Return a line for each learner: presses to people's score without and with mapped steps."""
-    lines = ["| | seeds | without | `low.augment=true` | CPU of a run with it |", "|---|---|---|---|---|"]
+    lines = []
     for (learner,), rows in groups(augment, "learner").items():
         cells = {name: of_name for (name,), of_name in groups(rows, "augment").items()}
         without, mapped = cells.get("False", []), cells.get("True", [])
         presses = [", ".join(f"{row['presses']:,.0f}" for row in of_name) for of_name in (without, mapped)]
-        cpu = f"{np.mean([row['cpu_s'] for row in mapped]):.0f} s" if mapped else ""
-        lines.append(f"| {learner} | {max(len(without), len(mapped))} | {' | '.join(presses)} | {cpu} |")
-    return "\n".join(lines)
+        cpu = f"{mean_of(mapped, 'cpu_s'):.0f} s" if mapped else ""
+        lines.append([learner, max(len(without), len(mapped)), *presses, cpu])
+    return markdown_table("| seeds | without | `low.augment=true` | CPU of a run with it", lines)
 
 
 def human_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:

@@ -23,6 +23,7 @@ from hpamdp.analysis.study import (
     gathered,
     groups,
     interval_text,
+    markdown_table,
     mean_of,
     read_csv,
     spread,
@@ -114,15 +115,11 @@ def later(row: dict, first: int = FIRST_LATER) -> float:
 
 def table(results: Rows) -> str:
     """Return a line for each cell: the score of the first, the second and the later trips, mean and interval."""
-    lines = [
-        "| family | boats | frame | training boats | scored on | values end | selector | learner, memory, sharing | n "
-        "| first trip | second trip | trips 3 to 8 | 95 % | trips 4 to 8 | ceiling | presses, first trip | later "
-        "| CPU |",
-        "|---" * 18 + "|",
-    ]
+    lines = []
     for settings, rows in groups(results, *SETTINGS).items():
         family, boats, frame, fleet, scored, ends, high, high_memory, low, memory, sharing = settings
-        first, second, rest = ([value(row) for row in rows] for value in (_first, _second, later))
+        first, second = ([row[f"score_{trip}"] for row in rows] for trip in (1, 2))
+        rest = [later(row) for row in rows]
         columns = [
             family,
             boats,
@@ -143,16 +140,12 @@ def table(results: Rows) -> str:
             f"{sum(mean_of(rows, f'presses_{trip}') for trip in range(3, 9)) / 6:.1f}",
             f"{mean_of(rows, 'cpu_s'):.0f} s",
         ]
-        lines.append(f"| {' | '.join(map(str, columns))} |")
-    return "\n".join(lines)
-
-
-def _first(row: dict) -> float:
-    return row["score_1"]
-
-
-def _second(row: dict) -> float:
-    return row["score_2"]
+        lines.append(columns)
+    head = (
+        "family | boats | frame | training boats | scored on | values end | selector | learner, memory, sharing | n "
+        "| first trip | second trip | trips 3 to 8 | 95 % | trips 4 to 8 | ceiling | presses, first trip | later | CPU"
+    )
+    return markdown_table(head, lines)
 
 
 def key_orders(fleet_size: int, fleet_seed: int) -> str:
@@ -186,39 +179,39 @@ def by_fleet(results: Rows) -> dict[tuple[int, str], list[dict[str, dict]]]:
 
 def fleet_table(results: Rows) -> str:
     """Return a line for each number of training boats: the scores on these boats and on new ones."""
-    lines = [
-        "| training boats | orders of their keys | n | first trip, these boats | new boats | trips 3 to 8, these boats "
-        "| new boats | difference | 95 % |",
-        "|---" * 9 + "|",
-    ]
+    lines = []
     for (size, orders), agents in by_fleet(results).items():
-        scores = [[value(rows[boats]) for rows in agents] for value in (_first, later) for boats in ("training", "new")]
+        scores = [[rows[boats]["score_1"] for rows in agents] for boats in ("training", "new")]
+        scores += [[later(rows[boats]) for rows in agents] for boats in ("training", "new")]
         lost = [own - new for own, new in zip(*scores[2:], strict=True)]
-        columns = [size, orders, len(agents), *map(spread, scores), spread(lost), interval_text(lost)]
-        lines.append(f"| {' | '.join(map(str, columns))} |")
-    return "\n".join(lines)
+        lines.append([size, orders, len(agents), *map(spread, scores), spread(lost), interval_text(lost)])
+    head = (
+        "training boats | orders of their keys | n | first trip, these boats | new boats | trips 3 to 8, these boats "
+        "| new boats | difference | 95 %"
+    )
+    return markdown_table(head, lines)
 
 
 def players_table(players: Rows) -> str:
     """Return a line for each family, number of boats and player: the score by number of the trip."""
-    heads = ("family", "boats", "player", *(f"trip {trip}" for trip in range(1, NUM_TRIPS + 1)), "trips 3 to 8")
-    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    lines = []
     for (family, boats, player), rows in groups(players, "family", "boats", "player").items():
         scores = [row["score"] for row in rows]
         rest = scores[FIRST_LATER - 1 :]
-        shown = " | ".join(f"{score:.2f}" for score in scores)
-        lines.append(f"| {family} | {boats} | {PLAYERS[player]} | {shown} | {sum(rest) / len(rest):.3f} |")
-    return "\n".join(lines)
+        shown = [f"{score:.2f}" for score in scores]
+        lines.append([family, boats, PLAYERS[player], *shown, f"{sum(rest) / len(rest):.3f}"])
+    trips = " | ".join(f"trip {trip}" for trip in range(1, NUM_TRIPS + 1))
+    return markdown_table(f"family | boats | player | {trips} | trips 3 to 8", lines)
 
 
 def transfer_table(rows: Rows) -> str:
     """Return a line for each learner and controller of the training: the scores with both controllers."""
-    lines = ["| learner | trained with | n | same controller | other controller |", "|---|---|---|---|---|"]
+    lines = []
     for (learner, trained_on), of_both in groups(rows, "learner", "trained_on").items():
         same = [row["score"] for row in of_both if row["controller"] == trained_on]
         other = [row["score"] for row in of_both if row["controller"] != trained_on]
-        lines.append(f"| {learner} | {trained_on} | {len(same)} | {spread(same)} | {spread(other)} |")
-    return "\n".join(lines)
+        lines.append([learner, trained_on, len(same), spread(same), spread(other)])
+    return markdown_table("learner | trained with | n | same controller | other controller", lines)
 
 
 def draw(results: Rows, players: Rows, people: Rows, path: Path) -> None:

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from hpamdp import keys
-from hpamdp.analysis.study import Rows, groups, read_csv, write_tables
-from hpamdp.config.compose import conf_dir, read
+from hpamdp.analysis.study import Rows, groups, markdown_table, read_csv, write_tables
+from hpamdp.config.compose import read
+from hpamdp.config.outside_jobs import composed
 from hpamdp.messages import exit_code
 from hpamdp.run.assemble import assemble, env_and_policy, make_env
 
@@ -50,10 +50,9 @@ def play(run: str, high: str, memory: str, seed: int) -> Iterator[dict[str, floa
         "eval.layouts=1",
     ]
     phases = []
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        for incongruent, congruent in NOISE:
-            noise = f"env.motor_noise=[{incongruent},{congruent}]"
-            phases.append(read(compose("config", [*overrides, noise], return_hydra_config=True)))
+    for incongruent, congruent in NOISE:
+        with composed([*overrides, f"env.motor_noise=[{incongruent},{congruent}]"]) as cfg:
+            phases.append(read(cfg))
     torch.manual_seed(seed)
     agent = assemble(phases[0]).agent
     for phase, config in enumerate(phases):
@@ -91,26 +90,21 @@ def _mean_reward(rewards: torch.Tensor) -> float | str:
 def recovery(rows: Rows) -> float:
     """Return the decisions of the second phase until a run chooses the better controller again; infinity if never."""
     fractions = [row["better"] for row in rows if row["phase"] == 1]
-    for number, fraction in enumerate(fractions, start=1):
-        if fraction >= RECOVERED:
-            return number * EVERY
-    return np.inf
+    return next((number * EVERY for number, each in enumerate(fractions, start=1) if each >= RECOVERED), np.inf)
 
 
 def table(rows: Rows) -> str:
     """Return a line for each form: how often it ends a phase with the better controller, and recovery by seed."""
-    lines = [
-        "| selector | memory | better controller before the change | at the end | decisions to recover, by seed |",
-        "|---|---|---|---|---|",
-    ]
+    lines = []
     for (high, memory), of_form in groups(rows, "high", "memory").items():
         runs = list(groups(of_form, "seed").values())
         before = np.mean([_last_fractions(run, phase=0) for run in runs])
         after = np.mean([_last_fractions(run, phase=1) for run in runs])
         times = [recovery(run) for run in runs]
         recovered = ", ".join(f"{time:,.0f}" if np.isfinite(time) else "never" for time in times)
-        lines.append(f"| {high} | {memory} | {before:.1%} | {after:.1%} | {recovered} |")
-    return "\n".join(lines)
+        lines.append([high, memory, f"{before:.1%}", f"{after:.1%}", recovered])
+    head = "selector | memory | better controller before the change | at the end | decisions to recover, by seed"
+    return markdown_table(head, lines)
 
 
 def _last_fractions(rows: Rows, phase: int) -> list[float]:

@@ -27,6 +27,8 @@ from hpamdp.analysis.study import (
     difference,
     gathered,
     groups,
+    markdown_table,
+    mean_of,
     spread,
     standing_rows,
     with_enough_seeds,
@@ -117,26 +119,22 @@ def table(results: Rows) -> str:
 
     Runs may have layouts of their own, so scores are compared by their distances to the ceiling of their layouts.
     """
-    lines = [
-        "| selector | learner | presses, uniform | n | score | below the ceiling | above the next (95 %) "
-        "| oracle's | weighted | regret | gain | success | CPU |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     cases = sorted(groups(results, *CELL).items(), key=_order)
     for place, ((low, total, uniform, high), runs) in enumerate(cases, start=1):
         above = ""
         if place < len(cases) and cases[place][0][:3] == (low, total, uniform):
             above = str(difference(_below_ceiling(cases[place][1]), _below_ceiling(runs)))
-        mean = {column: np.mean([run[column] for run in runs]) for column in COLUMNS}
-        score = spread([run["score"] for run in runs])
-        lines.append(
-            f"| {high} | {low} | {total:,.0f}, {uniform:,.0f} | {len(runs)} | {score} | "
-            f"{np.mean(_below_ceiling(runs)):.3f} | {above} | "
-            f"{mean['agreement']:.1%} | "
-            f"{mean['weighted_agreement']:.1%} | {mean['regret']:.3f} | {mean['choice_gain']:.3f} | "
-            f"{mean['success']:.1%} | {mean['cpu_s']:.0f} s |"
-        )
-    return "\n".join(lines)
+        below, score = np.mean(_below_ceiling(runs)), spread([run["score"] for run in runs])
+        cells = [high, low, f"{total:,.0f}, {uniform:,.0f}", len(runs), score, f"{below:.3f}", above]
+        cells += [f"{mean_of(runs, column):.1%}" for column in ("agreement", "weighted_agreement")]
+        cells += [f"{mean_of(runs, column):.3f}" for column in ("regret", "choice_gain")]
+        lines.append([*cells, f"{mean_of(runs, 'success'):.1%}", f"{mean_of(runs, 'cpu_s'):.0f} s"])
+    head = (
+        "selector | learner | presses, uniform | n | score | below the ceiling | above the next (95 %) "
+        "| oracle's | weighted | regret | gain | success | CPU"
+    )
+    return markdown_table(head, lines)
 
 
 def _order(case: tuple[tuple[Any, ...], Rows]) -> tuple[Any, ...]:

@@ -7,10 +7,10 @@ python experiments/human/study.py             draws and tabulates the stored csv
 
 from __future__ import annotations
 
-import csv
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from hpamdp.analysis.study import Rows, markdown_table, read_csv, write_tables
 from hpamdp.data.human import statistics, validation
 from hpamdp.data.human.episodes import score
 from hpamdp.data.human.released_file import HumanData, read
@@ -41,7 +42,6 @@ STYLE = {
 BLOCK_EPISODES = 60
 ALL_BLOCKS = -1
 BOTH_BOATS = -1
-Rows = list[dict[str, float]]
 Columns = dict[str, np.ndarray]
 
 
@@ -58,11 +58,8 @@ def measure() -> None:
     write("first_presses", rows_of(validation.first_presses(data)._asdict()))
     fit = validation.fit(singles)
     constants = ("likely_glide", "likely_speed", "agreeing_glide", "agreeing_speed")
-    rows = []
-    for constant in constants:
-        value, low, high = getattr(fit, constant)
-        rows.append({"value": value, "low": low, "high": high, "constant": constant})
-    write("fit", rows)
+    names = ("value", "low", "high", "constant")
+    write("fit", [dict(zip(names, (*getattr(fit, constant), constant), strict=True)) for constant in constants])
     glide, speed = torch.meshgrid(fit.glides, fit.speeds, indexing="ij")
     grid = {"glide": glide.flatten(), "docking_speed": speed.flatten(), "agreement": fit.agreement.flatten()}
     write("agreement", rows_of(grid))
@@ -141,27 +138,19 @@ def choices(data: HumanData, best: torch.Tensor) -> Rows:
     return rows
 
 
-def write(name: str, rows: Iterable[Mapping[str, object]]) -> None:
+def write(name: str, rows: Rows) -> None:
     """Write rows as a csv file, with four digits of each number."""
-    rounded = [
-        {column: round(value, 4) if isinstance(value, float) else value for column, value in row.items()}
-        for row in rows
-    ]
-    with (HERE / f"{name}.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rounded[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rounded)
+    write_tables(HERE, {name: [{column: _rounded(value) for column, value in row.items()} for row in rows]})
+
+
+def _rounded(value: Any) -> Any:
+    return round(value, 4) if isinstance(value, float) else value
 
 
 def load(name: str) -> Columns:
-    """Read the columns of a csv file, all numbers except the names of constants."""
-    with (HERE / f"{name}.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    columns = {}
-    for column in rows[0]:
-        values = [row[column] for row in rows]
-        columns[column] = np.array(values) if column == "constant" else np.array(values, dtype=float)
-    return columns
+    """Read the columns of a csv file."""
+    rows = read_csv(HERE / f"{name}.csv")
+    return {column: np.array([row[column] for row in rows]) for column in rows[0]}
 
 
 def draw() -> None:
@@ -324,7 +313,7 @@ def _fitted(constant: str) -> tuple[float, np.ndarray]:
     return value, np.abs(np.array([[fit["low"][row]], [fit["high"][row]]]) - value)
 
 
-def table_cells(rows: Columns, mask: np.ndarray) -> str:
+def table_cells(rows: Columns, mask: np.ndarray) -> list[str]:
     """Return the cells of a line: means over the episodes of the masked blocks."""
 
     def mean(name: str, controller: int = BOTH_BOATS) -> float:
@@ -334,20 +323,20 @@ def table_cells(rows: Columns, mask: np.ndarray) -> str:
     scores = [f"{mean('score', controller):.3f}" for controller in (BOTH_BOATS, harbour.CONGRUENT, harbour.INCONGRUENT)]
     shares = [f"{mean(name):.1%}" for name in ("success", "too_fast", "out_of_bounds", "out_of_fuel")]
     numbers = [f"{mean(name):.2f}" for name in ("presses", "press_gap", "choice_gap")]
-    return " | ".join([*scores, *shares, *numbers])
+    return [*scores, *shares, *numbers]
 
 
 def tabulate() -> None:
     """Print the table of the page, then the other figures in it."""
     rows = load("blocks")
-    outcomes = "success | too fast | out | no fuel"
-    print(f"| episodes | score | congruent | incongruent | {outcomes} | presses | keys | controller |")
-    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    lines = []
     for block in np.unique(rows["block"]):
-        first = BLOCK_EPISODES * block + 1
-        last = BLOCK_EPISODES * block + BLOCK_EPISODES
-        print(f"| {first:.0f} to {last:.0f} | {table_cells(rows, rows['block'] == block)} |")
-    print(f"| all | {table_cells(rows, np.ones_like(rows['block'], dtype=bool))} |")
+        first, last = BLOCK_EPISODES * block + 1, BLOCK_EPISODES * (block + 1)
+        lines.append([f"{first} to {last}", *table_cells(rows, rows["block"] == block)])
+    lines.append(["all", *table_cells(rows, np.ones_like(rows["block"], dtype=bool))])
+    outcomes = "success | too fast | out | no fuel"
+    head = f"episodes | score | congruent | incongruent | {outcomes} | presses | keys | controller"
+    print(markdown_table(head, lines))
     of_persons = load("persons")
     for name in ("score", "success", "better_boat", "gap", "press_gap", "choice_gap", "ceiling", "score_last_60"):
         low, middle, high = np.quantile(of_persons[name], [0, 0.5, 1])

@@ -27,6 +27,8 @@ from hpamdp.analysis.study import (
     difference,
     gathered,
     groups,
+    markdown_table,
+    mean_of,
     read_csv,
     spread,
 )
@@ -98,7 +100,7 @@ def variant(run: Run) -> str:
 
 def table(results: Rows) -> str:
     """Return a line for each problem and variant: mean and standard deviation over seeds."""
-    lines = ["| problem | H-PPO with | seeds | return | solved | steps | CPU |", "|---|---|---|---|---|---|---|"]
+    lines = []
     for problem, title in PROBLEMS.items():
         for name, label in VARIANTS.items():
             runs = [row for row in results if (row["problem"], row["variant"]) == (problem, name)]
@@ -106,22 +108,21 @@ def table(results: Rows) -> str:
                 score = spread([run["score"] for run in runs], 1)
                 success = [run["success"] for run in runs if np.isfinite(run["success"])]
                 solved = f"{np.mean(success):.0%}" if success else ""
-                frames, cpu_s = (float(np.mean([run[column] for run in runs])) for column in ("frames", "cpu_s"))
-                cells = f"{title} | {label} | {len(runs)} | {score} | {solved} | {frames:,.0f} | {cpu_s:.0f} s"
-                lines.append(f"| {cells} |")
-    return "\n".join(lines)
+                costs = f"{mean_of(runs, 'frames'):,.0f}", f"{mean_of(runs, 'cpu_s'):.0f} s"
+                lines.append([title, label, len(runs), score, solved, *costs])
+    return markdown_table("problem | H-PPO with | seeds | return | solved | steps | CPU", lines)
 
 
 def differences(results: Rows) -> str:
     """Return a line for each variant: the difference of its return from that of independent heads."""
-    lines = ["| problem | H-PPO with | difference from independent heads (95 % interval) |", "|---|---|---|"]
+    lines = []
     for (problem,), rows in groups(results, "problem").items():
         scores = {name: [row["score"] for row in of_name] for (name,), of_name in groups(rows, "variant").items()}
         plain = scores.pop("independent", [])
         for name, others in scores.items():
             if len(plain) > 1 and len(others) > 1:
-                lines.append(f"| {PROBLEMS[problem]} | {VARIANTS[name]} | {difference(others, plain)} |")
-    return "\n".join(lines)
+                lines.append([PROBLEMS[problem], VARIANTS[name], difference(others, plain)])
+    return markdown_table("problem | H-PPO with | difference from independent heads (95 % interval)", lines)
 
 
 def draw(curves: Rows, path: Path) -> None:

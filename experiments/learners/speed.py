@@ -5,18 +5,17 @@ python experiments/learners/speed.py       one thread; prints the table and writ
 
 from __future__ import annotations
 
-import csv
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from hydra import compose, initialize_config_dir
 from torchrl.collectors import Collector
 
-from hpamdp.config.compose import conf_dir, read
+from hpamdp.analysis.study import Rows, markdown_table, write_tables
+from hpamdp.config.compose import read
+from hpamdp.config.outside_jobs import composed
 from hpamdp.messages import exit_code
 from hpamdp.run.assemble import AssembledRun, assemble
 
@@ -64,8 +63,7 @@ CASES = [
 
 def run_case(case: Case) -> tuple[float, float | None]:
     """Return the presses/s of training and the ms of an update, None if the learner counts no updates."""
-    with tempfile.TemporaryDirectory() as folder:
-        parts, batch_size = build(case.overrides, Path(folder))
+    parts, batch_size = build(case.overrides)
     collector = Collector(
         parts.env, parts.policy, frames_per_batch=batch_size, total_frames=-1, auto_register_policy_transforms=False
     )
@@ -87,11 +85,10 @@ def run_case(case: Case) -> tuple[float, float | None]:
     return speed, 1_000.0 * learning_s / updates if updates else None
 
 
-def build(overrides: list[str], folder: Path) -> tuple[AssembledRun, int]:
+def build(overrides: list[str]) -> tuple[AssembledRun, int]:
     """Return the parts of a run with the congruent controller, and the presses of a batch."""
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        words = ["high=none", "env.controller=congruent", "eval.layouts=10", *overrides]
-        config = read(compose("config", words, return_hydra_config=True))
+    with composed(["high=none", "env.controller=congruent", "eval.layouts=10", *overrides]) as cfg:
+        config = read(cfg)
     torch.manual_seed(0)
     return assemble(config), config.run.num_envs * config.run.steps_per_batch
 
@@ -104,34 +101,26 @@ def _updates(parts: AssembledRun) -> int:
 def main() -> None:
     """Time every case, print a table, write the csv."""
     torch.set_num_threads(1)
-    rows = []
-    print("| case | presses/s | released | ratio | ms an update | released | ratio |\n|---|---|---|---|---|---|---|")
+    rows: Rows = []
     for case in CASES:
         speed, update_ms = run_case(case)
         row = {
             "case": case.name,
             "presses_per_s": round(speed, 1),
-            "released_presses_per_s": "-",
-            "ratio": "-",
-            "update_ms": "-",
-            "released_update_ms": "-",
-            "update_ratio": "-",
+            "released_presses_per_s": "-" if case.released_speed is None else case.released_speed,
+            "ratio": "-" if case.released_speed is None else round(speed / case.released_speed, 1),
+            "update_ms": "-" if update_ms is None else round(update_ms, 2),
+            "released_update_ms": "-" if case.released_update is None else case.released_update,
+            "update_ratio": "-"
+            if update_ms is None or not case.released_update
+            else round(case.released_update / update_ms, 1),
         }
-        if case.released_speed is not None:
-            row["released_presses_per_s"] = case.released_speed
-            row["ratio"] = round(speed / case.released_speed, 1)
-        if update_ms is not None:
-            row["update_ms"] = round(update_ms, 2)
-        if case.released_update is not None:
-            row["released_update_ms"] = case.released_update
-        if update_ms is not None and case.released_update is not None:
-            row["update_ratio"] = round(case.released_update / update_ms, 1)
         rows.append(row)
-        print("| " + " | ".join(str(value) for value in row.values()) + " |", flush=True)
-    with (HERE / "speed.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+        print(row, flush=True)
+    write_tables(HERE, {"speed": rows})
+    print(
+        markdown_table("case | presses/s | released | ratio | ms an update | released | ratio", map(dict.values, rows))
+    )
 
 
 if __name__ == "__main__":

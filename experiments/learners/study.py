@@ -25,6 +25,7 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
+    markdown_table,
     mean_of,
     read_csv,
     spread,
@@ -89,39 +90,31 @@ def _name(run: Run) -> str:
 
 def table(results: Rows) -> str:
     """Return a line for each learner, problem and reward, Platform last: mean and standard deviation over seeds."""
-    lines = [
-        "| learner | problem | reward | seeds | score | success | presses | wall | CPU | presses to 1.97 | after |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     cases = groups(results, "low", "problem", "reward").items()
     for (low, problem, reward), runs in sorted(cases, key=_order):
-        score = spread([run["score"] for run in runs])
-        success = mean_of(runs, "success")
-        presses = mean_of(runs, "presses")
-        wall_s = mean_of(runs, "wall_s")
-        cpu_s = mean_of(runs, "cpu_s")
-        presses_to_human, seconds_to_human = "-", "-"
+        to_human = ["-", "-"]
         if all(run["presses_to_human"] for run in runs):
-            presses_to_human = f"{mean_of(runs, 'presses_to_human'):,.0f}"
-            seconds_to_human = f"{mean_of(runs, 'wall_s_to_human'):.0f} s"
-        lines.append(
-            f"| {low} | {problem} | {reward} | {len(runs)} | {score} | {success:.1%} | {presses:,.0f} | "
-            f"{wall_s:.0f} s | {cpu_s:.0f} s | {presses_to_human} | {seconds_to_human} |"
-        )
-    return "\n".join(lines)
+            to_human = [f"{mean_of(runs, 'presses_to_human'):,.0f}", f"{mean_of(runs, 'wall_s_to_human'):.0f} s"]
+        cells = [low, problem, reward, len(runs), spread([run["score"] for run in runs])]
+        cells += [f"{mean_of(runs, 'success'):.1%}", f"{mean_of(runs, 'presses'):,.0f}"]
+        cells += [f"{mean_of(runs, 'wall_s'):.0f} s", f"{mean_of(runs, 'cpu_s'):.0f} s"]
+        lines.append([*cells, *to_human])
+    head = "learner | problem | reward | seeds | score | success | presses | wall | CPU | presses to 1.97 | after"
+    return markdown_table(head, lines)
 
 
 def boats_table(results: Rows) -> str:
     """Return a line with the difference of scores for each learner that was trained with both controllers."""
-    lines = ["| learner | congruent less incongruent (95 %) | probability of improvement |", "|---|---|---|"]
+    lines = []
     for (low,), runs in groups(results, "low").items():
         scores = [
             [run["score"] for run in runs if (run["problem"], run["reward"]) == (boat, "shaped")] for boat in BOATS
         ]
         if all(scores):
             found = difference(*scores)
-            lines.append(f"| {low} | {found} | {found.improvement:.2f} |")
-    return "\n".join(lines)
+            lines.append([low, found, f"{found.improvement:.2f}"])
+    return markdown_table("learner | congruent less incongruent (95 %) | probability of improvement", lines)
 
 
 def _order(case: tuple[tuple[Any, ...], Rows]) -> tuple[bool, str]:

@@ -12,10 +12,19 @@ from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from hpamdp.analysis.study import Rows, Run, add_to_tables, gathered, interval_text, read_csv, spread
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    add_to_tables,
+    gathered,
+    interval_text,
+    markdown_table,
+    mean_of,
+    read_csv,
+    spread,
+)
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -68,14 +77,9 @@ def share_on_crossing(run: Run) -> float:
     return float((played["success"] * GAMMA ** (played["steps"] - 1.0)).mean()) / best
 
 
-def tabulate(rows: Rows) -> None:
-    """Print a row for each problem and each way to end options."""
-    columns = (
-        *("problem", "`agent.termination`", "`high`", "seeds", "of the best return", "95 % interval", "worst seed"),
-        *("success", "steps", "length", "CPU"),
-    )
-    print("| " + " | ".join(columns) + " |")
-    print("|---" * len(columns) + "|")
+def table(rows: Rows) -> str:
+    """Return a line for each problem and each way to end options."""
+    lines = []
     for (env, title), (ends, how) in product(PROBLEMS.items(), ENDS.items()):
         of_ends = [row for row in rows if (row["env"], row["termination"], row["high"]) == (env, *ends)]
         if not of_ends:
@@ -91,19 +95,24 @@ def tabulate(rows: Rows) -> None:
             f"{spread(shares, 1)} %",
             interval,
             f"{min(shares):.1f} %",
-            f"{100.0 * np.mean([row['success'] for row in of_ends]):.1f} %",
-            f"{np.mean([row['steps'] for row in of_ends]):.1f}",
+            f"{100.0 * mean_of(of_ends, 'success'):.1f} %",
+            f"{mean_of(of_ends, 'steps'):.1f}",
             length,
-            f"{np.mean([row['cpu_s'] for row in of_ends]):.0f} s",
+            f"{mean_of(of_ends, 'cpu_s'):.0f} s",
         ]
-        print("| " + " | ".join(map(str, cells)) + " |")
+        lines.append(cells)
+    head = (
+        "problem | `agent.termination` | `high` | seeds | of the best return | 95 % interval | worst seed "
+        "| success | steps | length | CPU"
+    )
+    return markdown_table(head, lines)
 
 
 def main(folders: Sequence[str]) -> None:
     """Gather the runs in the folders, if any are given, and tabulate."""
     if folders:
         add_to_tables(HERE, {"results": gathered(folders, gather, env=("crossing", "rooms"))}, RUN)
-    tabulate(read_csv(HERE / "results.csv"))
+    print(table(read_csv(HERE / "results.csv")))
 
 
 if __name__ == "__main__":

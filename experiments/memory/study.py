@@ -16,10 +16,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import hpamdp
-from hpamdp.analysis.study import Rows, add_to_tables, groups, read_csv, spread, with_enough_seeds
+from hpamdp.analysis.study import (
+    Rows,
+    add_to_tables,
+    groups,
+    markdown_table,
+    mean_of,
+    read_csv,
+    spread,
+    with_enough_seeds,
+)
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -73,10 +80,7 @@ def train(name: str, memory: str, seed: int) -> dict[str, Any]:
 
 def table(rows: Rows) -> str:
     """Return a line for each learner and selector: the mean greedy return with each memory."""
-    lines = [
-        "| | " + " | ".join(f"`{memory}`" for memory in MEMORIES) + " | seeds | steps | CPU with `none`, `gru` |",
-        "|---" * (len(MEMORIES) + 4) + "|",
-    ]
+    lines = []
     by_name = groups(with_enough_seeds(rows, *RUN[:-1]), "learns")
     for name in (*LEARNERS, *SELECTORS):
         if (name,) not in by_name:
@@ -85,18 +89,12 @@ def table(rows: Rows) -> str:
         cells = groups(of_name, "memory")
         scores = [spread([row["score"] for row in cells[memory,]]) if (memory,) in cells else "" for memory in MEMORIES]
         seeds = {row["seed"] for row in of_name}
-        seconds = [
-            np.mean([row["cpu_s"] for row in cells[memory,]]) for memory in ("none", "gru") if (memory,) in cells
-        ]
-        columns = [
-            f"`{'low' if name in LEARNERS else 'high'}={name}`",
-            *scores,
-            len(seeds),
-            f"{of_name[0]['frames']:,}",
-            ", ".join(f"{mean:.0f} s" for mean in seconds),
-        ]
-        lines.append(f"| {' | '.join(map(str, columns))} |")
-    return "\n".join(lines)
+        seconds = [mean_of(cells[memory,], "cpu_s") for memory in ("none", "gru") if (memory,) in cells]
+        shown = f"`{'low' if name in LEARNERS else 'high'}={name}`"
+        costs = f"{of_name[0]['frames']:,}", ", ".join(f"{mean:.0f} s" for mean in seconds)
+        lines.append([shown, *scores, len(seeds), *costs])
+    memories = " | ".join(f"`{memory}`" for memory in MEMORIES)
+    return markdown_table(f"| {memories} | seeds | steps | CPU with `none`, `gru`", lines)
 
 
 def main(words: Sequence[str]) -> None:

@@ -24,7 +24,7 @@ from scipy import stats
 from tensordict import TensorDict
 from torch import Tensor
 
-from hpamdp.analysis.study import Rows, groups, mean_of, read_csv, write_tables
+from hpamdp.analysis.study import Rows, groups, markdown_table, mean_of, read_csv, write_tables
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.episodes import score
 from hpamdp.data.human.released_file import read
@@ -99,7 +99,7 @@ def chosen(rows: Rows) -> dict[str, float]:
 def table(rows: Rows) -> str:
     """Return a line for each discount: the rank correlation of each learner, mean and smallest to largest fold."""
     names = list(dict.fromkeys(row["learner"] for row in rows))
-    lines = [f"| discount | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
+    lines = []
     for (gamma,), same in groups(rows, "gamma").items():
         columns = []
         for name in names:
@@ -108,8 +108,8 @@ def table(rows: Rows) -> str:
             columns.append(
                 f"{mean_of(of_folds, 'rank_correlation'):.3f} ({min(found):.3f} to {max(found):.3f})" if found else ""
             )
-        lines.append(f"| {gamma:g} | {' | '.join(columns)} |")
-    return "\n".join(lines)
+        lines.append([f"{gamma:g}", *columns])
+    return markdown_table(" | ".join(["discount", *names]), lines)
 
 
 def main(words: Sequence[str]) -> None:

@@ -24,6 +24,7 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
+    markdown_table,
     mean_of,
     read_csv,
     spread,
@@ -100,35 +101,31 @@ def _data(run: Run) -> tuple[str, str]:
 
 def table(results: Rows, curves: Rows) -> str:
     """Return the offline learners' scores, then the presses that pre-training saves, then the comparisons."""
-    lines = [
-        "| learner | presses as | episodes | updates | seeds | score | success | too fast | out | no fuel "
-        "| presses | CPU |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
     updates = {case: max(row["frames"] for row in rows) for case, rows in groups(curves, *CASE).items()}
-    offline = [row for row in results if row["start"] == OFFLINE]
-    for (low, data, episodes), runs in groups(offline, "low", "data", "episodes").items():
+    fitted, online = [], []
+    for (low, start, data, episodes), runs in groups(results, *CASE).items():
         score = spread([run["score"] for run in runs])
-        shares = " | ".join(f"{mean_of(runs, outcome):.1%}" for outcome in OUTCOMES)
-        presses = mean_of(runs, "presses")
-        cpu_s = mean_of(runs, "cpu_s")
-        lines.append(
-            f"| {low} | {data} | {episodes} | {updates[low, OFFLINE, data, episodes]:,.0f} | {len(runs)} | {score} | "
-            f"{shares} | {presses:.2f} | {cpu_s:.0f} s |"
-        )
-    lines += ["", "| learner | start | presses to 1.97, by seed | score at the end |", "|---|---|---|---|"]
-    online = [row for row in results if row["start"] != OFFLINE]
-    for (low, start), runs in groups(online, "low", "start").items():
-        score = spread([run["score"] for run in runs])
-        frames = [run["frames_to_human"] for run in runs]
-        reached = ", ".join("never" if value == "" else f"{value:,.0f}" for value in frames)
-        lines.append(f"| {low} | {start} | {reached} | {score} |")
-    lines += ["", "| | after | difference (95 %) | probability of improvement |", "|---|---|---|---|"]
-    lines += [line for case in COMPARISONS if (line := comparison(*case, curves)) is not None]
-    return "\n".join(lines)
+        if start == OFFLINE:
+            shares = [f"{mean_of(runs, outcome):.1%}" for outcome in OUTCOMES]
+            costs = f"{mean_of(runs, 'presses'):.2f}", f"{mean_of(runs, 'cpu_s'):.0f} s"
+            length = f"{updates[low, start, data, episodes]:,.0f}"
+            fitted.append([low, data, episodes, length, len(runs), score, *shares, *costs])
+        else:
+            frames = [run["frames_to_human"] for run in runs]
+            online.append([low, start, ", ".join("never" if at == "" else f"{at:,.0f}" for at in frames), score])
+    compared = [line for case in COMPARISONS if (line := comparison(*case, curves)) is not None]
+    head = (
+        "learner | presses as | episodes | updates | seeds | score | success | too fast | out | no fuel | presses | CPU"
+    )
+    tables = [
+        markdown_table(head, fitted),
+        markdown_table("learner | start | presses to 1.97, by seed | score at the end", online),
+        markdown_table("| after | difference (95 %) | probability of improvement", compared),
+    ]
+    return "\n\n".join(tables)
 
 
-def comparison(title: str, better: Case, other: Case, curves: Rows) -> str | None:
+def comparison(title: str, better: Case, other: Case, curves: Rows) -> list[object] | None:
     """Return a line with the difference of two cases; None if one has no runs.
 
     They are compared at the last evaluation that all their runs have, after as many updates or presses of their own.
@@ -141,7 +138,7 @@ def comparison(title: str, better: Case, other: Case, curves: Rows) -> str | Non
     scores = ([row["score"] for row in of_case[case] if row["frames"] == end] for case in (better, other))
     found = difference(*scores)
     unit = "updates" if better[1] == OFFLINE else "presses"
-    return f"| {title} | {end:,.0f} {unit} | {found} | {found.improvement:.2f} |"
+    return [title, f"{end:,.0f} {unit}", found, f"{found.improvement:.2f}"]
 
 
 def draw(curves: Rows, path: Path) -> None:

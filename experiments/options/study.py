@@ -25,6 +25,7 @@ from hpamdp.analysis.study import (
     gathered,
     groups,
     interval_text,
+    markdown_table,
     mean_of,
     read_csv,
     spread,
@@ -117,11 +118,7 @@ def by_pair(name: str) -> dict[tuple[str, str], Rows]:
 
 def boats_table(compares_changes: bool) -> str:
     """Return a line for each selector over three boats, or for agents that change boats and agents that keep them."""
-    head = (
-        "| {} | seeds | score | ceiling | of the ceiling | changes per episode | planner's choice | weighted | success "
-        "| presses | CPU |"
-    )
-    lines = [head.format("" if compares_changes else "selector"), "|---" * 11 + "|"]
+    lines = []
     for (boats_word, name), rows in boats().items():
         if bool(boats_word) == compares_changes:
             continue
@@ -139,50 +136,42 @@ def boats_table(compares_changes: bool) -> str:
             f"{mean_of(rows, 'frames'):,.0f}",
             f"{mean_of(rows, 'cpu_s'):.0f} s",
         ]
-        lines.append(_line(cells))
-    return "\n".join(lines)
+        lines.append(cells)
+    head = (
+        f"{'' if compares_changes else 'selector'} | seeds | score | ceiling | of the ceiling | changes per episode "
+        "| planner's choice | weighted | success | presses | CPU"
+    )
+    return markdown_table(head, lines)
 
 
 def goal_table() -> str:
     """Return a line for each selector on each domain, and for the learner without one."""
-    lines = ["| domain | learner | selector | seeds | goals | 95 % | steps | CPU |", "|---" * 8 + "|"]
+    lines = []
     for (domain, low, high), rows in sorted(on_goal().items(), key=lambda item: (item[0][:2], item[0][2] == ALONE)):
         scores = _column(rows, "success")
-        cells = [
-            domain.replace("_", " "),
-            low,
-            high,
-            len(rows),
-            spread(scores),
-            interval_text(scores),
-            f"{mean_of(rows, 'frames'):,.0f}",
-            f"{mean_of(rows, 'cpu_s'):.0f} s",
-        ]
-        lines.append(_line(cells))
-    return "\n".join(lines)
+        cells = [domain.replace("_", " "), low, high, len(rows), spread(scores), interval_text(scores)]
+        lines.append([*cells, f"{mean_of(rows, 'frames'):,.0f}", f"{mean_of(rows, 'cpu_s'):.0f} s"])
+    return markdown_table("domain | learner | selector | seeds | goals | 95 % | steps | CPU", lines)
 
 
 def pairs_table(name: str) -> str:
     """Return a line for each learner under each selector on Crossing or Rooms."""
-    head = (
-        "| learner | selector | seeds | steps | share | lowest seed | success | value error | error everywhere | CPU |"
-    )
-    lines = [head, "|---" * 10 + "|"]
+    lines = []
     for (low, high), rows in by_pair(name).items():
         cells = [
             low,
             high,
-            f"{min(_column(rows, 'seed'))} to {max(_column(rows, 'seed'))}",
+            len(rows),
             f"{mean_of(rows, 'steps'):,.0f}",
             spread(_column(rows, "share")),
             f"{min(_column(rows, 'share')):.3f}",
             _percent(rows, "success"),
             _percent(rows, "value_error"),
-            _percent(rows, "value_error_everywhere"),
             f"{mean_of(rows, 'cpu_s'):.0f} s",
         ]
-        lines.append(_line(cells))
-    return "\n".join(lines)
+        lines.append(cells)
+    head = "learner | selector | seeds | steps | share | lowest seed | success | value error | CPU"
+    return markdown_table(head, lines)
 
 
 def _column(rows: Rows, name: str) -> list[float]:
@@ -191,10 +180,6 @@ def _column(rows: Rows, name: str) -> list[float]:
 
 def _percent(rows: Rows, name: str) -> str:
     return f"{100.0 * mean_of(rows, name):.1f} %"
-
-
-def _line(cells: Sequence[object]) -> str:
-    return "| " + " | ".join(map(str, cells)) + " |"
 
 
 def main(folders: Sequence[str]) -> None:

@@ -7,7 +7,6 @@ python experiments/pearl/study.py           draws and tabulates the stored curve
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ from hpamdp.analysis.study import (
     first_at,
     groups,
     interval_text,
+    markdown_table,
     mean_of,
     read_csv,
     refuse_repeats,
@@ -36,7 +36,6 @@ PROBLEMS = {"pinball": "Pinball, simple map", "office": "Office"}
 AXES = {"episodes": "episodes of training", "cpu_s": "CPU seconds of training"}
 REACHED = 0.95  # success of a greedy evaluation
 LEARNER = ("problem", "library", "version", "learner")
-NUMBERS = ("seed", "episodes", "steps", "cpu_s", "score", "success")
 
 
 def gather(folder: Path) -> Rows:
@@ -47,27 +46,13 @@ def gather(folder: Path) -> Rows:
     """
     rows: Rows = []
     for file in sorted(folder.glob("*.csv")):
-        if not is_curve(file):
-            raise SystemExit(f"{file}: is no curve of this study; nothing was written")
         rows += read_csv(file)
+        if not rows or any(row.get("problem") not in PROBLEMS for row in rows):
+            raise SystemExit(f"{file}: is no curve of this study; nothing was written")
     if not rows:
         raise SystemExit(f"{folder}: has no curves; nothing was written")
     refuse_repeats(rows, (*LEARNER, "seed", "steps"), (*LEARNER, "seed"))
     return rows
-
-
-def is_curve(file: Path) -> bool:
-    """Return whether a file has the columns of a curve, with numbers where curves have them."""
-    try:
-        rows = read_csv(file)
-    except (OSError, UnicodeDecodeError):
-        return False
-    return all(
-        {*LEARNER, *NUMBERS} == row.keys()
-        and row["problem"] in PROBLEMS
-        and all(isinstance(row[name], int | float) and math.isfinite(row[name]) for name in NUMBERS)
-        for row in rows
-    )
 
 
 def merged(stored: Rows, new: Rows) -> Rows:
@@ -79,25 +64,24 @@ def merged(stored: Rows, new: Rows) -> Rows:
 
 def table(curves: Rows) -> str:
     """Return a line for each learner: its last returns, and when its runs first succeeded."""
-    head = ["problem", "library", "learner", "seeds", "episodes", "steps", "CPU of a run", "return", "95 %", "success"]
-    head += ["seeds that reached 95 %", "after episodes", "after steps", "after CPU"]
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    lines = []
     for (problem, library, version, learner), rows in groups(curves, *LEARNER).items():
         runs = list(groups(rows, "seed").values())
         ends = [run[-1] for run in runs]
         firsts = [first for run in runs if (first := first_at(run, "success", REACHED))]
         scores = [end["score"] for end in ends]
-        cells = [PROBLEMS[problem], f"{library} {version}", learner, str(len(runs))]
-        cells += [
-            f"{mean_of(ends, 'episodes'):,.0f}",
-            f"{mean_of(ends, 'steps'):,.0f}",
-            f"{mean_of(ends, 'cpu_s'):,.0f} s",
-        ]
+        cells = [PROBLEMS[problem], f"{library} {version}", learner, len(runs)]
+        cells += [f"{mean_of(ends, column):,.0f}" for column in ("episodes", "steps")]
+        cells += [f"{mean_of(ends, 'cpu_s'):,.0f} s"]
         cells += [spread(scores, 0), interval_text(scores, ",.0f")]
         cells += [f"{100.0 * mean_of(ends, 'success'):.1f} %", f"{len(firsts)} of {len(runs)}"]
         cells += [_range(firsts, "episodes"), _range(firsts, "steps"), _range(firsts, "cpu_s", " s")]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append(cells)
+    head = (
+        "problem | library | learner | seeds | episodes | steps | CPU of a run | return | 95 % | success "
+        "| seeds that reached 95 % | after episodes | after steps | after CPU"
+    )
+    return markdown_table(head, lines)
 
 
 def _range(rows: Rows, name: str, unit: str = "") -> str:
@@ -137,8 +121,6 @@ def main(arguments: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if len(arguments) > 1:
         raise SystemExit(f"give one folder with all curves, not {len(arguments)}")
-    if "" in arguments:
-        raise SystemExit("an empty path; name the folder of the curves")
     if arguments:
         write_tables(HERE, {"curves": merged(read_csv(HERE / "curves.csv"), gather(Path(arguments[0])))})
     curves = read_csv(HERE / "curves.csv")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 from tensordict import TensorDictBase
 
 import hpamdp
+from hpamdp.analysis.study import write_tables
 from hpamdp.env.decisions import with_decisions
 from hpamdp.run.evaluate import Evaluation
 
@@ -78,7 +78,8 @@ class Curve:
         """Score a learner that ends before its time is over, and write the file."""
         if not self.is_over:
             self._score(steps, cpu_seconds() - self._began)
-        self._write()
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        write_tables(self.file.parent, {self.file.stem: self.rows})
 
     def _score(self, steps: int, cpu_s: float) -> None:
         for acts, policy in self.policies.items():
@@ -86,10 +87,3 @@ class Curve:
             means = {name: round(float(played[name].mean()), 4) for name in ("score", "success")}
             self.rows.append({**self.name, "acts": acts, "steps": steps, "cpu_s": round(cpu_s, 1), **means})
             print(self.rows[-1], flush=True)
-
-    def _write(self) -> None:
-        self.file.parent.mkdir(parents=True, exist_ok=True)
-        with self.file.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self.rows[0])
-            writer.writeheader()
-            writer.writerows(self.rows)

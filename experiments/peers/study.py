@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from hpamdp.analysis.study import Rows, groups, mean_of, read_csv, refuse_repeats, spread, write_tables
+from hpamdp.analysis.study import Rows, groups, markdown_table, mean_of, read_csv, refuse_repeats, spread, write_tables
 from hpamdp.figure_style import FAINT, INK, LEARNER_COLOURS, STYLE
 from hpamdp.messages import exit_code
 
@@ -75,18 +75,17 @@ def at(run: Rows, cpu_s: float) -> dict[str, float]:
 def scores_table(curves: Rows) -> str:
     """Return a line for each learner with its scores after some CPU time, over seeds."""
     times = [part * limit_of(curves) for part in TIMES]
-    head = ["problem", "library", "learner", "acts", "seeds", *(f"{cpu_s:g} s CPU" for cpu_s in times)]
-    head += ["success at the end", "CPU of a run", "steps"]
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    lines = []
     for (problem, library, version, learner, acts), rows in groups(curves, *NAME).items():
         runs = list(groups(rows, "seed").values())
         ends = [run[-1] for run in runs]
-        cells = [PROBLEMS[problem], f"{library} {version}", learner, acts, str(len(runs))]
+        cells = [PROBLEMS[problem], f"{library} {version}", learner, acts, len(runs)]
         cells += [spread([at(run, cpu_s)["score"] for run in runs]) for cpu_s in times]
         cells += [spread([end["success"] for end in ends]), f"{mean_of(ends, 'cpu_s'):.0f} s"]
-        cells += [f"{mean_of(ends, 'steps'):,.0f}"]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append([*cells, f"{mean_of(ends, 'steps'):,.0f}"])
+    after = " | ".join(f"{cpu_s:g} s CPU" for cpu_s in times)
+    head = f"problem | library | learner | acts | seeds | {after} | success at the end | CPU of a run | steps"
+    return markdown_table(head, lines)
 
 
 def steps_a_second(run: Rows) -> float:
@@ -100,12 +99,12 @@ def steps_a_second(run: Rows) -> float:
 
 def speed_table(speed: Rows) -> str:
     """Return a line for each learner with the steps in a CPU second."""
-    lines = ["| library | learner | steps in a CPU second, each repeat | mean |", "|---|---|---|---|"]
+    lines = []
     for (_, library, version, learner, _), rows in groups([r for r in speed if r["acts"] in SHOWN], *NAME).items():
         speeds = [steps_a_second(run) for run in groups(rows, "seed").values()]
         each = ", ".join(f"{value:,.0f}" for value in speeds)
-        lines.append(f"| {library} {version} | {learner} | {each} | {sum(speeds) / len(speeds):,.0f} |")
-    return "\n".join(lines)
+        lines.append([f"{library} {version}", learner, each, f"{sum(speeds) / len(speeds):,.0f}"])
+    return markdown_table("library | learner | steps in a CPU second, each repeat | mean", lines)
 
 
 def draw(curves: Rows, path: Path) -> None:
@@ -140,8 +139,6 @@ def _draw_problem(axes: Axes, curves: Rows) -> None:
 
 def main(arguments: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
-    if "" in arguments:
-        raise SystemExit("an empty path; name the folder of the curves")
     if arguments:
         write_tables(HERE, gather(Path(arguments[0])))
     curves = read_csv(HERE / "curves.csv")

@@ -25,6 +25,8 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
+    markdown_table,
+    mean_of,
     read_csv,
     spread,
     with_enough_seeds,
@@ -200,11 +202,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
 
 def table(results: Rows, curves: Rows) -> str:
     """Return a line for each cell with enough seeds: scores, how many runs reach the bar, and after how many steps."""
-    lines = [
-        "| problem | learner | steps | n | return | success | lowest return | return to reach | runs that reach it "
-        "| first reached after | CPU |",
-        "|---" * 11 + "|",
-    ]
+    lines = []
     evaluations = groups(curves, *RUN)
     for (problem, learner, exploration, frames), rows in groups(with_enough_seeds(results, *CELL), *CELL).items():
         if problem.startswith("traffic"):  # `traffic_table` compares its results
@@ -222,23 +220,24 @@ def table(results: Rows, curves: Rows) -> str:
             f"{frames:,}",
             len(rows),
             spread(scores, digits),
-            f"{100.0 * np.mean([row['success'] for row in rows]):.1f} %",
+            f"{100.0 * mean_of(rows, 'success'):.1f} %",
             f"{min(scores):.{digits}f}",
             f"{bar:,.{digits}f} ({whose})",
             f"{sum(score >= bar for score in scores)} of {len(rows)}",
             f"{min(reached):,} to {max(reached):,}" if reached else "",
-            f"{np.mean([row['cpu_s'] for row in rows]):.0f} s",
+            f"{mean_of(rows, 'cpu_s'):.0f} s",
         ]
-        lines.append("| " + " | ".join(map(str, columns)) + " |")
-    return "\n".join(lines)
+        lines.append(columns)
+    head = (
+        "problem | learner | steps | n | return | success | lowest return | return to reach | runs that reach it "
+        "| first reached after | CPU"
+    )
+    return markdown_table(head, lines)
 
 
 def traffic_table(rows: Rows) -> str:
     """Return a line for each player of a cell, and by how much the agent's delay is lower."""
-    lines = [
-        "| problem | learner | steps | n | player | delay, s | the agent's is lower by | queue | stops | throughput |",
-        "|---" * 10 + "|",
-    ]
+    lines = []
     for (problem, learner, _, frames), cell in groups(rows, *CELL).items():
         players = groups(cell, "player")
         agent = np.array([row["delay"] for row in players[AGENT,]])
@@ -247,9 +246,9 @@ def traffic_table(rows: Rows) -> str:
             lower = "" if player == AGENT else f"{np.mean(1.0 - agent / delays):.1%}".replace("%", " %")
             columns = [problem, learner, f"{frames:,}", len(agent), player.replace("_", " "), spread(delays, 1), lower]
             columns += [spread([row[name] for row in of_player], 1) for name in ("queue", "stops")]
-            columns.append(spread([row["throughput"] for row in of_player], 0))
-            lines.append("| " + " | ".join(map(str, columns)) + " |")
-    return "\n".join(lines)
+            lines.append([*columns, spread([row["throughput"] for row in of_player], 0)])
+    head = "problem | learner | steps | n | player | delay, s | the agent's is lower by | queue | stops | throughput"
+    return markdown_table(head, lines)
 
 
 def draw(curves: Rows, path: Path) -> None:
@@ -281,10 +280,8 @@ def main(folders: Sequence[str]) -> None:
     curves = read_csv(HERE / "curves.csv")
     draw(curves, HERE / "primitives.png")
     print(table(read_csv(HERE / "results.csv"), curves))
-    traffic = with_enough_seeds(read_csv(HERE / "traffic.csv"), *CELL)
-    if traffic:
-        print()
-        print(traffic_table(traffic))
+    print()
+    print(traffic_table(with_enough_seeds(read_csv(HERE / "traffic.csv"), *CELL)))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.analysis.study import Rows, Run, add_to_tables, curve, gathered, groups, read_csv
+from hpamdp.analysis.study import Rows, Run, add_to_tables, curve, gathered, groups, markdown_table, read_csv
 from hpamdp.figure_style import LEARNER_COLOURS
 from hpamdp.messages import exit_code
 
@@ -54,17 +54,13 @@ def _order(row: dict[str, Any]) -> tuple[int, str]:
 
 def table(rows: Rows) -> str:
     """Return a line for each learner and boat, with single seeds, which differ too much for a mean."""
-    lines = [
-        "| learner | controller | trained | return, by seed | docks in | idles to the limit in | presses an episode |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for (low, boat), runs in groups(rows, "low", "boat").items():
-        returns = ", ".join(f"{run['score']:.1f}" for run in runs)
-        docked = ", ".join(f"{run['success']:.0%}" for run in runs)
-        idled = ", ".join(f"{run['time_limit']:.0%}" for run in runs)
-        presses = ", ".join(f"{run['presses']:.0f}" for run in runs)
-        lines.append(f"| {low} | {boat} | {runs[0]['frames']:,.0f} | {returns} | {docked} | {idled} | {presses} |")
-    return "\n".join(lines)
+        formats = {"score": ".1f", "success": ".0%", "time_limit": ".0%", "presses": ".0f"}
+        cells = [", ".join(f"{run[column]:{style}}" for run in runs) for column, style in formats.items()]
+        lines.append([low, boat, f"{runs[0]['frames']:,.0f}", *cells])
+    head = "learner | controller | trained | return, by seed | docks in | idles to the limit in | presses an episode"
+    return markdown_table(head, lines)
 
 
 def draw(curves: Rows, path: Path) -> None:

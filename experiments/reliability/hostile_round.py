@@ -14,12 +14,12 @@ from pathlib import Path
 import command_line  # noqa: F401  # the imports of every run, before cases are forked
 
 sys.path.insert(0, str(Path(__file__).parent))
-from hostile import data_sets, environments, page_requests, saved_files
+from hostile import data_sets, environments, saved_files
 from hostile.case import ACCEPTED, BAD, REFUSED, Case, play
 
 from hpamdp.messages import exit_code
 
-KINDS = ("files", "environments", "data", "requests")
+KINDS = ("files", "environments", "data")
 
 
 def cases(kinds: list[str], agents: Path, contents: int, seed: int) -> Iterator[Case]:
@@ -30,8 +30,6 @@ def cases(kinds: list[str], agents: Path, contents: int, seed: int) -> Iterator[
         yield from environments.cases(seed)
     if "data" in kinds:
         yield from data_sets.cases(contents // 6, seed)
-    if "requests" in kinds:
-        yield from page_requests.cases(contents // 6, seed)
 
 
 def main() -> None:

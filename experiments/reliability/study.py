@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hpamdp.analysis.study import read_csv
+from hpamdp.analysis.study import markdown_table, read_csv
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -20,11 +20,12 @@ def main(words: Sequence[str]) -> None:
     """Print a line for each kind of input."""
     if words:
         raise SystemExit(f"takes no words, but was given {' '.join(words)}")
-    print("| kind | cases | before: traceback | wrong in silence | harm | after: traceback | wrong in silence | harm |")
-    print("|---|---|---|---|---|---|---|---|")
+    lines = []
     for row in read_csv(HERE / "hostile.csv"):
         counts = [row[f"{outcome}_{when}"] for when in ("before", "after") for outcome in OUTCOMES]
-        print(f"| {row['kind']} | {row['cases']:,} | {' | '.join(map(str, counts))} |")
+        lines.append([row["kind"], f"{row['cases']:,}", *counts])
+    outcomes = "traceback | wrong in silence | harm"
+    print(markdown_table(f"kind | cases | before: {outcomes} | after: {outcomes}", lines))
 
 
 if __name__ == "__main__":

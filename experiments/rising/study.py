@@ -11,14 +11,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hpamdp.analysis.study import Rows, groups, read_csv, write_tables
+from hpamdp.analysis.study import Rows, groups, markdown_table, read_csv, write_tables
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
-TABLES = {
-    "by_context_share": "Share of the best split's gain over option 0 alone, if the final choice sees the context",
-    "practice": "Practice of each option in percent of the decisions",
-}
+SHARE = "Share of the best split's gain over option 0 alone, if the final choice sees the context"
+PRACTICE = "Practice of each option in percent of the decisions; results.csv has the other cases"
+OF_PRACTICE = ("50 and 150", "200 and 800", "crossing", "fruitless third", "hyar")  # cases of that table
 
 
 def play(names: Sequence[str]) -> None:
@@ -40,24 +39,21 @@ def play(names: Sequence[str]) -> None:
 
 def of_cases(cases: Rows) -> str:
     """Return a line for each case: option 0 alone, the best split and its final value."""
-    lines = ["| case | decisions | option 0 alone | best split | its final value |", "|---|---|---|---|---|"]
+    lines = []
     for case in cases:
         shares = ":".join(f"{100 * case[f'split_{i}']:.0f}" for i in range(3) if case[f"split_{i}"] != "")
-        lines.append(
-            f"| {case['case']} | {case['decisions']:,} | {case['alone']:.3f} | {shares} | {case['best']:.3f} |"
-        )
-    return "\n".join(lines)
+        lines.append([case["case"], f"{case['decisions']:,}", f"{case['alone']:.3f}", shares, f"{case['best']:.3f}"])
+    return markdown_table("case | decisions | option 0 alone | best split | its final value", lines)
 
 
 def table(rows: Rows, cases: Rows, column: str) -> str:
     """Return a line for each policy, with a cell for each case."""
     names = [case["case"] for case in cases]
-    lines = ["| policy | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    lines = []
     for (policy,), own in groups(rows, "policy").items():
         of_case = {row["case"]: row for row in own}
-        cells = [cell(of_case[name], column) if name in of_case else "" for name in names]
-        lines.append(f"| {policy} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append([policy, *(cell(of_case[name], column) if name in of_case else "" for name in names)])
+    return markdown_table(" | ".join(["policy", *names]), lines)
 
 
 def cell(row: dict, column: str) -> str:
@@ -77,8 +73,9 @@ def main(arguments: Sequence[str]) -> None:
     if (HERE / "peers.csv").exists():
         rows += read_csv(HERE / "peers.csv")
     print(of_cases(cases))
-    for column, title in TABLES.items():
-        print(f"\n{title}\n\n{table(rows, cases, column)}")
+    print(f"\n{SHARE}\n\n{table(rows, cases, 'by_context_share')}")
+    shown = [case for case in cases if case["case"] in OF_PRACTICE]
+    print(f"\n{PRACTICE}\n\n{table(rows, shown, 'practice')}")
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from hpamdp.analysis.study import (
     difference,
     gathered,
     groups,
+    markdown_table,
     read_csv,
     refuse_repeats,
     spread,
@@ -122,19 +123,19 @@ def add(runs: Sequence[tuple[Run, dict[str, Any]]]) -> None:
 
 def table(rows: Rows) -> str:
     """Return a line for each agent and noise: mean and standard deviation of the score over seeds at each level."""
-    lines = ["| agent | controller | trained with | noise | level: score |", "|---|---|---|---|---|"]
+    lines = []
     cases = groups(rows, "agent", "boat", "trained_with", "noise").items()
     for (agent, boat, trained_with, noise), of_case in cases:
         scores = []
         for (level,), of_level in groups(of_case, "level").items():
             scores.append(f"{level:g}: {spread([row['score'] for row in of_level], digits=2)}")
-        lines.append(f"| {agent} | {boat} | {trained_with} | {noise} | {', '.join(scores)} |")
-    return "\n".join(lines)
+        lines.append([agent, boat, trained_with, noise, ", ".join(scores)])
+    return markdown_table("agent | controller | trained with | noise | level: score", lines)
 
 
 def gains_table(rows: Rows) -> str:
     """Return a line for each single noise of H-PPO's training: the gain in score with this noise and without it."""
-    lines = ["| H-PPO trained with | gain at that noise (95 %) | without noise (95 %) |", "|---|---|---|"]
+    lines = []
     rows = [row for row in rows if row["agent"] == "hppo"]
     for (trained_with,), of_training in groups(rows, "trained_with").items():
         if trained_with == NO_NOISE or PLUS in trained_with:
@@ -144,8 +145,8 @@ def gains_table(rows: Rows) -> str:
             difference(_scores(of_training, noise, at), _scores(_trained_without(rows), noise, at))
             for at in (float(level), 0.0)
         ]
-        lines.append(f"| {trained_with} | {gains[0]} | {gains[1]} |")
-    return "\n".join(lines)
+        lines.append([trained_with, *gains])
+    return markdown_table("H-PPO trained with | gain at that noise (95 %) | without noise (95 %)", lines)
 
 
 def _trained_without(rows: Rows) -> Rows:

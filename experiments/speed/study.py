@@ -12,20 +12,19 @@ leaves out other processes. The fastest turn of each counts.
 from __future__ import annotations
 
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.collectors import Collector
 
-from hpamdp.analysis.study import Rows, read_csv, write_tables
-from hpamdp.config.compose import conf_dir, read
+from hpamdp.analysis.study import Rows, markdown_table, read_csv, write_tables
+from hpamdp.config.compose import read
+from hpamdp.config.outside_jobs import composed
 from hpamdp.messages import exit_code
 from hpamdp.policies.base import Learner
 from hpamdp.run.assemble import AssembledRun, assemble
@@ -66,24 +65,20 @@ class Products(TorchDispatchMode):
         return self._same[place]
 
 
-def make(name: str, folder: Path) -> tuple[AssembledRun, Learner, int]:
+def make(name: str) -> tuple[AssembledRun, Learner, int]:
     """Return the parts of a run with the congruent controller and defaults, the learner, and the steps of a batch."""
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        words = ["high=none", f"low={name}", "env.controller=congruent", "eval.layouts=10"]
-        config = read(compose("config", [*words, *_of(name)], return_hydra_config=True))
+    # The codec's first updates only delay those that are timed.
+    shortened = ["low.codec_pretrain_updates=10"] if name == "hyar" else []
+    with composed(["high=none", f"low={name}", "env.controller=congruent", "eval.layouts=10", *shortened]) as cfg:
+        config = read(cfg)
     torch.manual_seed(0)
     parts = assemble(config)
     return parts, parts.agent.learners[0], config.run.num_envs * config.run.steps_per_batch
 
 
-def _of(name: str) -> list[str]:
-    """Return settings that shorten the time before the first update without changing an update."""
-    return ["low.codec_pretrain_updates=10"] if name == "hyar" else []
-
-
-def updates_of(name: str, folder: Path) -> tuple[Callable[[], object], int, Learner]:
+def updates_of(name: str) -> tuple[Callable[[], object], int, Learner]:
     """Return a function that makes updates, their number (for H-PPO, optimisation steps), and the learner."""
-    parts, learner, batch_size = make(name, folder)
+    parts, learner, batch_size = make(name)
     collector = Collector(
         parts.env, parts.policy, frames_per_batch=batch_size, total_frames=-1, auto_register_policy_transforms=False
     )
@@ -102,8 +97,7 @@ def updates_of(name: str, folder: Path) -> tuple[Callable[[], object], int, Lear
 
 def measure(name: str) -> dict[str, Any]:
     """Return a row of the table: CPU ms of an update (plain, compiled and with bfloat16) and of its products."""
-    with tempfile.TemporaryDirectory() as folder:
-        update, num_updates, learner = updates_of(name, Path(folder))
+    update, num_updates, learner = updates_of(name)
     update()
     with Products() as products:
         update()
@@ -147,17 +141,11 @@ def in_turns(update: Callable[[], object], floor: Callable[[], object], num_upda
 
 def table(rows: Rows) -> str:
     """Return a line for each learner."""
-    lines = [
-        "| learner | ms an update | ms of products | ratio | ms compiled | ratio | and bfloat16 | ratio | products |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        lines.append(
-            f"| {row['learner']} | {row['update_ms']:.2f} | {row['products_ms']:.2f} | {row['ratio']:.2f} | "
-            f"{row['compiled_ms']:.2f} | {row['compiled_ratio']:.2f} | "
-            f"{row['bfloat16_ms']:.2f} | {row['bfloat16_ratio']:.2f} | {row['products']:.1f} |"
-        )
-    return "\n".join(lines)
+    head = "learner | ms an update | ms of products | ratio | ms compiled | ratio | and bfloat16 | ratio | products"
+    columns = ("update_ms", "products_ms", "ratio", "compiled_ms", "compiled_ratio", "bfloat16_ms", "bfloat16_ratio")
+    return markdown_table(
+        head, ([row["learner"], *(f"{row[name]:.2f}" for name in columns), f"{row['products']:.1f}"] for row in rows)
+    )
 
 
 def main(words: Sequence[str]) -> None:

@@ -29,6 +29,7 @@ from hpamdp.analysis.study import (
     difference,
     gathered,
     groups,
+    markdown_table,
     middle_half,
     read_csv,
     spread,
@@ -111,24 +112,6 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
             }
         )
     return {"results": results, "curves": curves, "efficiency": efficiency}
-
-
-def missing_runs(tables: dict[str, Rows]) -> list[str]:
-    """Return a line for each experiment, learner and boat with missing runs."""
-    experiments = {
-        "table1": [row for row in tables["results"] if row["reward"] == "shaped"],
-        "sparse": [row for row in tables["results"] if row["reward"] == "sparse"],
-        "sample_efficiency": [row for row in tables["efficiency"] if row["reward"] == "shaped"],
-    }
-    lines = []
-    for experiment, rows in experiments.items():
-        for low in LEARNERS:
-            for boat in BOATS:
-                found = {row["seed"] for row in _of(rows, low, boat)}
-                lacking = [str(seed) for seed in EARLIER_SEEDS if seed not in found]
-                if lacking:
-                    lines.append(f"{experiment}: no run of {low}, {boat}, seed {', '.join(lacking)}")
-    return lines
 
 
 def _of(rows: Rows, low: str, boat: str) -> Rows:
@@ -248,7 +231,7 @@ def reward_table(results: Rows) -> str:
     """
     results = [row for row in results if row["seed"] in EARLIER_SEEDS]
     columns = [f"{boat}, {what}" for boat in BOATS for what in (*REWARDS, "sparse less shaped (95 %)")]
-    lines = [f"| learner | {' | '.join(columns)} |", "|---|---|---|---|---|---|---|"]
+    lines = []
     for low in LEARNERS:
         if not any(row["low"] == low and row["reward"] == "sparse" for row in results):
             continue
@@ -259,17 +242,13 @@ def reward_table(results: Rows) -> str:
             )
             cells += [spread(scores) if scores else "" for scores in (shaped, sparse)]
             cells.append(str(difference(sparse, shaped)) if shaped and sparse else "")
-        lines.append(f"| {low} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append([low, *cells])
+    return markdown_table(f"learner | {' | '.join(columns)}", lines)
 
 
 def efficiency_table(efficiency: Rows, results: Rows) -> str:
     """Return a line for each learner: presses to the human score, and full-length scores over both controllers."""
-    lines = [
-        "| learner | presses to 1.97, congruent | incongruent | wall seconds, both "
-        "| human-normalised score: full-length runs, both controllers |",
-        "|---|---|---|---|---|",
-    ]
+    lines = []
     for low in LEARNERS:
         of_learner = [row for row in efficiency if row["low"] == low]
         if not of_learner:
@@ -282,8 +261,12 @@ def efficiency_table(efficiency: Rows, results: Rows) -> str:
         cells.append(_range([_first_at_human_score(rows) for rows in runs], "wall_s"))
         by_seed = groups([row for row in results if row["low"] == low], "seed").values()
         normalised = [np.mean([human_normalised(row["score"], row["boat"]) for row in rows]) for rows in by_seed]
-        lines.append(f"| {low} | {' | '.join(cells)} | {spread(normalised)} |")
-    return "\n".join(lines)
+        lines.append([low, *cells, spread(normalised)])
+    head = (
+        "learner | presses to 1.97, congruent | incongruent | wall seconds, both "
+        "| human-normalised score: full-length runs, both controllers"
+    )
+    return markdown_table(head, lines)
 
 
 def budget_table(curves: Rows) -> str:
@@ -291,16 +274,13 @@ def budget_table(curves: Rows) -> str:
 
     A cell is empty if some run has no evaluation near the number of presses, or has ended before.
     """
-    lines = [
-        f"| score after | controller | {' | '.join(f'{budget:,} presses' for budget in BUDGETS)} |",
-        f"|---|---|{'---|' * len(BUDGETS)}",
-    ]
+    lines = []
     for low, boat in itertools.product(LEARNERS, BOATS):
         runs = groups(_of(curves, low, boat), "seed").values()
         cells = [[_score_after(run, budget) for run in runs] for budget in BUDGETS]
         texts = ["" if None in scores else spread(scores) for scores in cells]
-        lines.append(f"| {low} | {boat} | {' | '.join(texts)} |")
-    return "\n".join(lines)
+        lines.append([low, boat, *texts])
+    return markdown_table(f"score after | controller | {' | '.join(f'{each:,} presses' for each in BUDGETS)}", lines)
 
 
 def _score_after(run: Rows, budget: int) -> float | None:
@@ -421,8 +401,6 @@ def main(folders: Sequence[str]) -> None:
         add_to_tables(HERE, new, (*CELL, "seed"), steps="presses")
     tables = {name: standing_rows(HERE / f"{name}.csv") for name in TABLES}
     stored = read_csv(HERE / "results.csv")
-    for line in missing_runs({**tables, "results": stored}):
-        print(line, file=sys.stderr)
     shaped, curves = ([row for row in tables[name] if row["reward"] == "shaped"] for name in ("results", "curves"))
     rows = summarise(shaped)
     write_tables(HERE, {"table1": rows})

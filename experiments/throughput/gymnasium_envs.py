@@ -18,7 +18,6 @@ Actions come from a pool of eight samples, except where they are random.
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import math
 import statistics
@@ -38,6 +37,7 @@ from torchrl.collectors import Collector
 
 import hpamdp
 from hpamdp import keys
+from hpamdp.analysis.study import Rows, write_tables
 from hpamdp.env.decisions import with_decisions
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.messages import exit_code
@@ -242,7 +242,7 @@ def main() -> None:
     torch.set_num_threads(1)
     copies = arguments.copies
     print(f"hpamdp {hpamdp.__version__}, torch {torch.__version__}, gymnasium {gymnasium.__version__}, {copies} copies")
-    rows: list[dict[str, object]] = []
+    rows: Rows = []
     for cls in (Trivial, Quick, Light, Medium):
         steppers = {
             "loop": (loop(cls, copies), copies),
@@ -260,10 +260,7 @@ def main() -> None:
             named = {"env": cls.__name__, "what": what, "steps_per_s": round(rate)}
             rows.append({**named, "ratio": ratio, "ratio_low": low, "ratio_high": high})
             print(f"{cls.__name__:<8} {what:<21} {rate:>10,.0f} steps/s  {ratio} ({low} to {high}) x SyncVectorEnv")
-    with (Path(__file__).parent / "gymnasium_envs.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_tables(Path(__file__).parent, {"gymnasium_envs": rows})
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """Measure the environments' steps per second on one core, write results.csv and print the figures.
 
-Run: python experiments/throughput/throughput.py [--seconds 1] [--device cpu]
+Run: python experiments/throughput/throughput.py [--seconds 1]
 
 Each figure is the fastest of many short trials of one process on one core. CPU time leaves out the turns of other
 processes. The environments to compare with are measured in the same run:
 - boats, one: `gymnasium.make`, beside Gymnasium's own CartPole;
 - boats, many: Gymnasium's vector environment, `BoatDockEnv.step_and_maybe_reset` by the kernel and by the tensor
-  functions (as they are and, with --compiled, compiled), beside Gymnasium's vectorised NumPy CartPole;
+  functions, beside Gymnasium's vectorised NumPy CartPole;
 - the field's domains: the TorchRL and the Gymnasium environments.
 
 Actions are random, from a pool of eight samples. A new episode starts when one ends.
@@ -15,7 +15,6 @@ Actions are random, from a pool of eight samples. A new episode starts when one 
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import sys
 import time
@@ -27,6 +26,7 @@ import torch
 
 import hpamdp  # also registers the Gymnasium ids
 from hpamdp import keys
+from hpamdp.analysis.study import Rows, write_tables
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
@@ -113,29 +113,24 @@ def vector_stepper(env_id: str, num_envs: int) -> Callable[[], object]:
     return lambda: env.step(next(actions))
 
 
-def boats(num_envs: int, device: str, is_compiled: bool) -> dict[str, Callable[[], Callable[[], object]]]:
+def boats(num_envs: int) -> dict[str, Callable[[], Callable[[], object]]]:
     """Return factories of the functions to time, by their names in the table."""
-    makers = {
+    return {
         "CartPole-v1, Gymnasium vector": lambda: vector_stepper("CartPole-v1", num_envs),
         "boats, Gymnasium vector": lambda: vector_stepper("hpamdp/BoatDock-v0", num_envs),
-        "boats, TorchRL": lambda: env_stepper(BoatDockEnv(num_envs, device=device)),
+        "boats, TorchRL": lambda: env_stepper(BoatDockEnv(num_envs)),
         "boats, TorchRL, tensor functions": lambda: env_stepper(by_tensor_functions(num_envs)),
     }
-    if is_compiled:
-        makers["boats, TorchRL, compiled"] = lambda: env_stepper(BoatDockEnv(num_envs, compile_rules=True))
-    return makers
 
 
 def main() -> None:
     """Measure everything and write the csv file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=1.0, help="for each figure")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--compiled", action="store_true", help="also time the compiled tensor functions")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    print(f"hpamdp {hpamdp.__version__}, torch {torch.__version__}, one thread, {arguments.device}")
-    rows: list[dict[str, object]] = []
+    print(f"hpamdp {hpamdp.__version__}, torch {torch.__version__}, one thread")
+    rows: Rows = []
 
     def measure(what: str, num_envs: int, step: Callable[[], object], steps_per_call: int) -> None:
         per_second = rate(step, steps_per_call, arguments.seconds)
@@ -145,17 +140,13 @@ def main() -> None:
     for env_id in ("CartPole-v1", "hpamdp/BoatDock-v0", *(f"hpamdp/{name}-v0" for name in DOMAINS)):
         measure(f"{env_id.removeprefix('hpamdp/')}, Gymnasium", 1, one_stepper(env_id), 64)
     for num_envs in SIZES:
-        for what, make in boats(num_envs, arguments.device, arguments.compiled).items():
+        for what, make in boats(num_envs).items():
             measure(what, num_envs, make(), num_envs)
     for name, problem in DOMAINS.items():
         for num_envs in DOMAIN_SIZES:
             measure(f"{name}, TorchRL", num_envs, env_stepper(problem(num_envs)), num_envs)
             measure(f"{name}, Gymnasium vector", num_envs, vector_stepper(f"hpamdp/{name}-v0", num_envs), num_envs)
-    name = "results.csv" if arguments.device == "cpu" else f"results_{arguments.device}.csv"
-    with (Path(__file__).parent / name).open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_tables(Path(__file__).parent, {"results": rows})
 
 
 if __name__ == "__main__":

@@ -483,6 +483,17 @@ def mean_of(rows: Rows, column: str) -> float:
     return float(np.mean([row[column] for row in rows]))
 
 
+def markdown_table(head: str, rows: Iterable[Iterable[object]]) -> str:
+    """Return a table in Markdown.
+
+    Args:
+        head: names of the columns, separated by `|`.
+        rows: the cells of each line.
+    """
+    lines = [f"| {' | '.join(map(str, cells))} |" for cells in rows]
+    return "\n".join([f"| {head} |", "|---" * (head.count("|") + 1) + "|", *lines])
+
+
 def spread(values: Sequence[float], digits: int = 3) -> str:
     """Return a text: mean ± standard deviation (of a sample, n - 1) over seeds, or a single value."""
     mean = f"{np.mean(values):.{digits}f}"
