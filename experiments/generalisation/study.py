@@ -117,15 +117,13 @@ def table(results: Rows) -> str:
     """Return a line for each cell: the score of the first, the second and the later trips, mean and interval."""
     lines = []
     for settings, rows in groups(results, *SETTINGS).items():
-        family, boats, frame, fleet, scored, ends, high, high_memory, low, memory, sharing = settings
+        family, boats, frame, _, _, ends, high, high_memory, low, memory, sharing = settings
         first, second = ([row[f"score_{trip}"] for row in rows] for trip in (1, 2))
         rest = [later(row) for row in rows]
         columns = [
             family,
             boats,
             frame.replace("_", " "),
-            fleet,
-            scored,
             ends,
             f"{high} {high_memory}".strip(),
             f"{low}, {memory}" + (f", {sharing.replace('_', ' ')}" if boats > 1 else ""),
@@ -142,7 +140,7 @@ def table(results: Rows) -> str:
         ]
         lines.append(columns)
     head = (
-        "family | boats | frame | training boats | scored on | values end | selector | learner, memory, sharing | n "
+        "family | boats | frame | values end | selector | learner, memory, sharing | n "
         "| first trip | second trip | trips 3 to 8 | 95 % | trips 4 to 8 | ceiling | presses, first trip | later | CPU"
     )
     return markdown_table(head, lines)
@@ -193,15 +191,14 @@ def fleet_table(results: Rows) -> str:
 
 
 def players_table(players: Rows) -> str:
-    """Return a line for each family, number of boats and player: the score by number of the trip."""
+    """Return a line for each family, number of boats and player: the scores of the first and of the later trips."""
     lines = []
     for (family, boats, player), rows in groups(players, "family", "boats", "player").items():
         scores = [row["score"] for row in rows]
         rest = scores[FIRST_LATER - 1 :]
-        shown = [f"{score:.2f}" for score in scores]
+        shown = [f"{score:.2f}" for score in scores[:FIRST_LATER]]
         lines.append([family, boats, PLAYERS[player], *shown, f"{sum(rest) / len(rest):.3f}"])
-    trips = " | ".join(f"trip {trip}" for trip in range(1, NUM_TRIPS + 1))
-    return markdown_table(f"family | boats | player | {trips} | trips 3 to 8", lines)
+    return markdown_table("family | boats | player | trip 1 | trip 2 | trip 3 | trips 3 to 8", lines)
 
 
 def transfer_table(rows: Rows) -> str:
