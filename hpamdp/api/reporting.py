@@ -25,8 +25,8 @@ def report(*folders: str | Path, metric: str = DEFAULT_METRIC, to: str | Path | 
         A row for each configuration:
         - `configuration`: its name, made of the settings that distinguish it, and `settings`: the same as a dict;
         - `seeds`: number of finished runs with a finite value;
-        - `mean`, `std` (of a sample), `min`, `max` of the metric, and `interval`: the bounds of the mean's 95 %
-          interval (Student's t), from five seeds on;
+        - `mean`, `std` (of a sample), `min`, `max` of the metric;
+        - `interval`: the bounds of the mean's 95 % interval (Student's t), from five seeds on;
         - `frames`, `cpu_s`: means over these runs;
         - `unfinished`, `failed`: numbers of other runs.
 

@@ -31,11 +31,9 @@ _PICTURES_PER_SECOND = 4.0
 
 @dataclass(frozen=True)
 class Reading:
-    """How an environment's spaces are read.
+    """How an environment's spaces are read: settings of `env=gymnasium`.
 
     Attributes:
-        max_steps, action_form, parameter_dims, option_key, action_mask, pair_mask, parameter_bounds, observation_keys,
-            out_of_bounds: see the settings.
         flattens_pictures: whether pictures are part of the vectors.
     """
 
