@@ -498,6 +498,12 @@ def on_config(config):
     return config
 
 
+def on_page_markdown(markdown, *, page, **others):
+    """Leave out what stands beside the wide tables of results: navigation and table of contents."""
+    if page.file.src_uri == "results.md" or page.file.src_uri.startswith("studies/"):
+        page.meta["hide"] = ["navigation", "toc"]
+
+
 def on_files(files, config):
     """Replace the pages of docs/ by their converted text, and add those from elsewhere."""
     from mkdocs.structure.files import File
