@@ -211,33 +211,31 @@ def all_finite(values: Any) -> Any:
 
 
 @part
-def invalid_row(
-    option: Any, discrete: Any, parameters: Any, places: Any, integers: Any, settings: Any, mode: Any
-) -> Any:
+def invalid_row(option: Any, discrete: Any, parameters: Any, integers: Any, settings: Any, mode: Any) -> Any:
     """Return the first row with an unknown option, an unknown action or a parameter that is not finite, or -1.
 
     Args:
         option: options, int64 `[N]`, read only if the agent chooses among options.
         discrete: discrete actions, int64 `[N]`.
-        parameters: parameters of all actions side by side, float32 `[N, P]`.
-        places: int64 `[K + 1]`. The parameters of action k lie from `places[k]` to before `places[k + 1]`.
+        parameters: parameters of all actions, their places and their bounds; see `hpamdp.env.kernel_rows`.
         integers: integer columns of the state.
         settings: settings of the problem.
         mode: with ACT_OR_RESTART, rows that start an episode may have any action. With RESTART, all rows may.
     """
     if mode == RESTART:
         return -1
+    given, places, _ = parameters
     # First check all rows at once: a branch on each row's action took a sixth of Catch Point's step. The loop below
     # finds the row.
     num_options = settings[NUM_OPTIONS]
     are_known = all_below(discrete, len(places) - 1) and (num_options == 0 or all_below(option, num_options))
-    if parameters.shape[1] <= _FEW and are_known and all_finite(parameters):
+    if given.shape[1] <= _FEW and are_known and all_finite(given):
         return -1
     for row in range(len(discrete)):
         is_valid = (discrete[row] >= 0) & (discrete[row] < len(places) - 1)
         if is_valid:
             for place in range(places[discrete[row]], places[discrete[row] + 1]):
-                is_valid &= math.isfinite(parameters[row, place])
+                is_valid &= math.isfinite(given[row, place])
         is_valid &= (num_options == 0) | ((option[row] >= 0) & (option[row] < num_options))
         if not is_valid and not (mode == ACT_OR_RESTART and integers[OUTCOME_ROW, row] != 0):
             return row
@@ -245,12 +243,13 @@ def invalid_row(
 
 
 @inlined
-def parameter(parameters: Any, row: Any, number: Any, action: Any, places: Any, bounds: Any) -> Any:
-    """Return a parameter of the chosen action, clipped to its bounds `[2, P]`, or 0 if it has no such parameter."""
+def parameter(parameters: Any, row: Any, number: Any, action: Any) -> Any:
+    """Return a parameter of the chosen action, clipped to its bounds, or 0 if it has no such parameter."""
+    given, places, bounds = parameters
     place = places[action] + number
     if place >= places[action + 1]:
         return ZERO
-    return min(max(parameters[row, place], bounds[0, place]), bounds[1, place])
+    return min(max(given[row, place], bounds[0, place]), bounds[1, place])
 
 
 @inlined

@@ -487,27 +487,12 @@ def _report(first: Any, count: Any, scratch: Any, numbers: Any, outcomes: Any, f
 
 @kernel
 def advance(
-    floats: Any,
-    integers: Any,
-    option: Any,
-    discrete: Any,
-    parameters: Any,
-    places: Any,
-    bounds: Any,
-    mask: Any,
-    settings: Any,
-    mode: Any,
-    observations: Any,
-    outcomes: Any,
-    extras: Any,
-    flags: Any,
-    rewards: Any,
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
 ) -> int:
-    """Press or restart in every row, in place.
-
-    `hpamdp.env.kernel_rows` explains the arguments. The only entry is the fraction of fuel.
-    """
-    invalid = invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    """Press or restart in every row, in place; see `hpamdp.env.kernel_rows`. The only extra is the fraction of fuel."""
+    floats, integers = state
+    observations, outcomes, extras, flags, rewards = results
+    invalid = invalid_row(option, discrete, parameters, integers, settings, mode)
     if invalid >= 0:
         return invalid
     scratch = np.empty(_NUM_FLOATS * _BLOCK, np.float32)
@@ -519,7 +504,7 @@ def advance(
         if mode == ACT_OR_RESTART:
             _mark_over(count, numbers)
         if mode != RESTART:
-            _load_actions(option, discrete, parameters, first, count, scratch, numbers, settings)
+            _load_actions(option, discrete, parameters[0], first, count, scratch, numbers, settings)
             if settings[SWITCH_COST] >= 0.0:
                 _switch(count, scratch, numbers, settings)
             if has_noise:

@@ -292,31 +292,19 @@ def _observe(floats: Any, integers: Any, row: Any, settings: Any, observation: A
 
 @kernel
 def advance(
-    floats: Any,
-    integers: Any,
-    option: Any,
-    discrete: Any,
-    parameters: Any,
-    places: Any,
-    bounds: Any,
-    mask: Any,
-    settings: Any,
-    mode: Any,
-    observations: Any,
-    outcomes: Any,
-    extras: Any,
-    flags: Any,
-    rewards: Any,
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    floats, integers = state
+    observations, outcomes, extras, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
     if invalid >= 0:
         return invalid
     trips = _F(settings[TRIPS])
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
         if mode != kernels.RESTART and mask[row] and not was_over:
-            duration = kernels.parameter(parameters, row, 0, discrete[row], places, bounds)
+            duration = kernels.parameter(parameters, row, 0, discrete[row])
             rewards[row] = _act(floats, integers, row, option[row], discrete[row], duration, settings)
         for reading in range(len(observations)):
             if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):

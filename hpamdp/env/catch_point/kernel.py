@@ -43,31 +43,19 @@ def _act(floats: Any, integers: Any, row: Any, action: Any, given: Any, settings
 
 @kernel
 def advance(
-    floats: Any,
-    integers: Any,
-    option: Any,
-    discrete: Any,
-    parameters: Any,
-    places: Any,
-    bounds: Any,
-    mask: Any,
-    settings: Any,
-    mode: Any,
-    observations: Any,
-    outcomes: Any,
-    extras: Any,
-    flags: Any,
-    rewards: Any,
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    floats, integers = state
+    observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
     if invalid >= 0:
         return invalid
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
         if mode != kernels.RESTART and mask[row] and not was_over:
             action = discrete[row]
-            given = kernels.parameter(parameters, row, 0, action, places, bounds)
+            given = kernels.parameter(parameters, row, 0, action)
             outcome, rewards[row] = _act(floats, integers, row, action, given, settings)
             kernels.end_step(integers, row, outcome, len(rules.OUTCOMES), settings)
         for reading in range(len(observations)):

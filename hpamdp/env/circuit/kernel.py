@@ -290,24 +290,12 @@ def _observe(entries: Any, integers: Any, row: Any, settings: Any, observation: 
 
 @kernel
 def advance(
-    floats: Any,
-    integers: Any,
-    option: Any,
-    discrete: Any,
-    parameters: Any,
-    places: Any,
-    bounds: Any,
-    mask: Any,
-    settings: Any,
-    mode: Any,
-    observations: Any,
-    outcomes: Any,
-    extras: Any,
-    flags: Any,
-    rewards: Any,
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    floats, integers = state
+    observations, outcomes, extras, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
     if invalid >= 0:
         return invalid
     of_similarity = 4 * (1 << int(settings[WIRES])) * int(settings[COLUMNS])
@@ -323,7 +311,7 @@ def advance(
             was_over = integers[OUTCOME_ROW, row] != rules.BUILDING
             if mode != kernels.RESTART and mask[row] and not was_over:
                 action = discrete[row]
-                given = kernels.parameter(parameters, row, 0, action, places, bounds)
+                given = kernels.parameter(parameters, row, 0, action)
                 outcome, rewards[row] = _act(entries, integers, row, option[row], action, given, settings)
                 kernels.end_step(integers, row, outcome, len(rules.OUTCOMES), settings)
             for reading in range(len(observations)):

@@ -338,9 +338,7 @@ def _observe(body: Any, settings: Any, observation: Any) -> None:
 
 
 @part
-def _begin(
-    integers: Any, discrete: Any, parameters: Any, places: Any, bounds: Any, mask: Any, settings: Any, aims: Any
-) -> Any:
+def _begin(integers: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, aims: Any) -> Any:
     """Count the steps of the rows that act, write where they aim, `[2, N]`, and return those whose action is played."""
     rows = np.empty(len(mask), np.int64)
     num_rows = 0
@@ -349,8 +347,8 @@ def _begin(
             integers[STEPS_ROW, row] += 1
             if integers[STEPS_ROW, row] < settings[kernels.MAX_STEPS]:
                 action = discrete[row]
-                first = kernels.parameter(parameters, row, 0, action, places, bounds)
-                second = kernels.parameter(parameters, row, 1, action, places, bounds)
+                first = kernels.parameter(parameters, row, 0, action)
+                second = kernels.parameter(parameters, row, 1, action)
                 aims[0, row], aims[1, row] = _aim(action, first, second, settings)
                 rows[num_rows] = row
                 num_rows += 1
@@ -397,30 +395,18 @@ def _act(floats: Any, integers: Any, discrete: Any, rows: Any, aims: Any, settin
 
 @kernel
 def advance(
-    floats: Any,
-    integers: Any,
-    option: Any,
-    discrete: Any,
-    parameters: Any,
-    places: Any,
-    bounds: Any,
-    mask: Any,
-    settings: Any,
-    mode: Any,
-    observations: Any,
-    outcomes: Any,
-    extras: Any,
-    flags: Any,
-    rewards: Any,
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    floats, integers = state
+    observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
     if invalid >= 0:
         return invalid
     before = integers[OUTCOME_ROW].copy()
     if mode != kernels.RESTART:
         aims = np.empty((2, len(mask)), np.float32)
-        rows = _begin(integers, discrete, parameters, places, bounds, mask, settings, aims)
+        rows = _begin(integers, discrete, parameters, mask, settings, aims)
         _act(floats, integers, discrete, rows, aims, settings)
     body = np.empty(_NUM_COLUMNS, np.float32)
     for row in range(len(mask)):

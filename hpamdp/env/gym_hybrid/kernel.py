@@ -154,7 +154,6 @@ def _load(
     integers: Any,
     discrete: Any,
     parameters: Any,
-    bounds: Any,
     mask: Any,
     mode: Any,
 ) -> None:
@@ -170,12 +169,13 @@ def _load(
         was_over = numbers[_OUTCOME * _LANES + j] != rules.GOING_ON
         numbers[_WAS_OVER * _LANES + j] = was_over
         numbers[_MOVES * _LANES + j] = (mode != kernels.RESTART) & mask[unsigned(first + j)] & (not was_over)
+    given, _, bounds = parameters
     least_push, least_turn, most_push, most_turn = bounds[0, 0], bounds[0, 1], bounds[1, 0], bounds[1, 1]
     for j in range(width):
         row = unsigned(first + j)
         action = int32(discrete[row])
-        push = min(max(parameters[row, 0], least_push), most_push)
-        turn = min(max(parameters[row, 1], least_turn), most_turn)
+        push = min(max(given[row, 0], least_push), most_push)
+        turn = min(max(given[row, 1], least_turn), most_turn)
         numbers[_ACTION * _LANES + j] = action
         lanes[_GIVEN * _LANES + j] = turn if action == rules.TURN else push
 
@@ -194,24 +194,12 @@ def _store(lanes: Any, numbers: Any, first: Any, width: Any, floats: Any, intege
 
 @kernel
 def advance(
-    floats: Any,
-    integers: Any,
-    option: Any,
-    discrete: Any,
-    parameters: Any,
-    places: Any,
-    bounds: Any,
-    mask: Any,
-    settings: Any,
-    mode: Any,
-    observations: Any,
-    outcomes: Any,
-    extras: Any,
-    flags: Any,
-    rewards: Any,
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    floats, integers = state
+    observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
     if invalid >= 0:
         return invalid
     max_steps, slides = int32(min(settings[kernels.MAX_STEPS], _MOST_STEPS)), settings[SLIDES] != 0.0
@@ -221,7 +209,7 @@ def advance(
     numbers_seen = observations.reshape(len(observations), -1)
     for first in range(0, len(mask), _LANES):
         width = min(_LANES, len(mask) - first)
-        _load(lanes, numbers, first, width, floats, integers, discrete, parameters, bounds, mask, mode)
+        _load(lanes, numbers, first, width, floats, integers, discrete, parameters, mask, mode)
         # Two versions: where sliding is a variable, its arc tangent is computed for Moving, too.
         if slides:
             _act(lanes, numbers, max_steps, True)

@@ -21,31 +21,19 @@ _FORCE = _F(rules._FORCE)
 
 @kernel
 def advance(
-    floats: Any,
-    integers: Any,
-    option: Any,
-    discrete: Any,
-    parameters: Any,
-    places: Any,
-    bounds: Any,
-    mask: Any,
-    settings: Any,
-    mode: Any,
-    observations: Any,
-    outcomes: Any,
-    extras: Any,
-    flags: Any,
-    rewards: Any,
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    floats, integers = state
+    observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
     if invalid >= 0:
         return invalid
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
         if mode != kernels.RESTART and mask[row] and not was_over:
             action = discrete[row]
-            given = kernels.parameter(parameters, row, 0, action, places, bounds)
+            given = kernels.parameter(parameters, row, 0, action)
             push = _FORCE * given
             motion_x, motion_y = _F(settings[MOTIONS + 2 * action]), _F(settings[MOTIONS + 2 * action + 1])
             squared = point_kernel.move(floats, row, push * motion_x, push * motion_y)

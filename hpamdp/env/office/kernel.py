@@ -104,24 +104,12 @@ def _observe(floats: Any, integers: Any, row: Any, tiles: Any, observation: Any)
 
 @kernel
 def advance(
-    floats: Any,
-    integers: Any,
-    option: Any,
-    discrete: Any,
-    parameters: Any,
-    places: Any,
-    bounds: Any,
-    mask: Any,
-    settings: Any,
-    mode: Any,
-    observations: Any,
-    outcomes: Any,
-    extras: Any,
-    flags: Any,
-    rewards: Any,
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    floats, integers = state
+    observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
     if invalid >= 0:
         return invalid
     slip = _F(settings[SLIP])
@@ -130,7 +118,7 @@ def advance(
         was_over = integers[OUTCOME_ROW, row] != rules.ON_THE_WAY
         if mode != kernels.RESTART and mask[row] and not was_over:
             action = discrete[row]
-            length = kernels.parameter(parameters, row, 0, action, places, bounds)
+            length = kernels.parameter(parameters, row, 0, action)
             bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
             slips = kernels.uniform(bits, step, integers[STEPS_ROW, row]) < slip
             goal = _ANY

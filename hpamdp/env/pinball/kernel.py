@@ -146,24 +146,12 @@ def _start(floats: Any, row: Any, places: Any, bits: Any, step: Any) -> None:
 
 @kernel
 def advance(
-    floats: Any,
-    integers: Any,
-    option: Any,
-    discrete: Any,
-    parameters: Any,
-    places: Any,
-    bounds: Any,
-    mask: Any,
-    settings: Any,
-    mode: Any,
-    observations: Any,
-    outcomes: Any,
-    extras: Any,
-    flags: Any,
-    rewards: Any,
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    floats, integers = state
+    observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
     if invalid >= 0:
         return invalid
     end_polygons = _FIRST + 6 * int(settings[NUM_POLYGONS])
@@ -181,7 +169,7 @@ def advance(
         was_over = integers[OUTCOME_ROW, row] != rules.ROLLING
         if mode != kernels.RESTART and mask[row] and not was_over:
             action = discrete[row]
-            push = _PUSH * kernels.parameter(parameters, row, 0, action, places, bounds)
+            push = _PUSH * kernels.parameter(parameters, row, 0, action)
             if action == rules.RIGHT or action == rules.LEFT:
                 floats[_VX, row] += push
             elif action != rules.NONE:

@@ -142,24 +142,12 @@ def _observe(floats: Any, row: Any, observation: Any) -> None:
 
 @kernel
 def advance(
-    floats: Any,
-    integers: Any,
-    option: Any,
-    discrete: Any,
-    parameters: Any,
-    places: Any,
-    bounds: Any,
-    mask: Any,
-    settings: Any,
-    mode: Any,
-    observations: Any,
-    outcomes: Any,
-    extras: Any,
-    flags: Any,
-    rewards: Any,
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    floats, integers = state
+    observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
     if invalid >= 0:
         return invalid
     noise = _F(settings[NOISE])
@@ -167,7 +155,7 @@ def advance(
         was_over = integers[OUTCOME_ROW, row] != rules.ON_THE_WAY
         if mode != kernels.RESTART and mask[row] and not was_over:
             action, steps, before = discrete[row], integers[STEPS_ROW, row], floats[_X, row]
-            given = kernels.parameter(parameters, row, 0, action, places, bounds)
+            given = kernels.parameter(parameters, row, 0, action)
             bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
             outcome = _act(floats, row, action, given, steps * rules._NUMBERS_PER_ACTION, bits, step, noise)
             kernels.end_step(integers, row, outcome, len(rules.OUTCOMES), settings)
