@@ -107,7 +107,8 @@ def test_imports_through_other_modules_are_found():
     assert any(is_in(name, "numba") for name in loaded_with("hpamdp.env.boatdock.gymnasium_adapter"))
 
 
-GENERIC = [module for module in FILES if not any(is_in(module, room) for room in BOATS)]
+# The table of Gymnasium ids names all problems.
+GENERIC = [module for module in FILES if not any(is_in(module, room) for room in (*BOATS, "hpamdp.env.registration"))]
 
 
 @pytest.mark.parametrize("module", GENERIC)

@@ -27,7 +27,6 @@ from hpamdp.env.batched_env import GOING_ON, BatchedEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.circuit.environment import CircuitEnv
-from hpamdp.env.circuit.registration import IDS as CIRCUIT_IDS
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
@@ -51,7 +50,7 @@ IDS = {
     "hpamdp/Sliding-v0": SlidingEnv,
     "hpamdp/PinballSimple-v0": PinballEnv,
     "hpamdp/PinballHard-v0": PinballEnv,
-    **dict.fromkeys(CIRCUIT_IDS, CircuitEnv),
+    **{env_id: CircuitEnv for env_id in gymnasium.registry if "Circuit" in env_id},
 }
 # Gymnasium recommends actions scaled to [-1, 1]; the field's own bounds are others.
 RECOMMENDATION = "we recommend using a symmetric and normalized space"

@@ -55,7 +55,9 @@ def test_an_episode_is_that_of_the_continuous_form_with_the_same_engines(seed):
 
 def test_every_chosen_engine_fires_even_at_its_lowest_throttle():
     generator = np.random.default_rng(0)
-    space = gymnasium.make("hpamdp/LunarLander-v0").action_space
+    env = gymnasium.make("hpamdp/LunarLander-v0")
+    assert env.spec.max_episode_steps == LunarLanderEnv.Options().max_steps
+    space = env.action_space
     space.seed(0)
     for _ in range(100):
         action = space.sample()

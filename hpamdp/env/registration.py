@@ -1,42 +1,65 @@
-"""Registration of the problems' Gymnasium ids."""
+"""The Gymnasium ids of all problems, in one table."""
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import pkgutil
 from typing import Any
 
 import gymnasium
 
-import hpamdp.env
+# Every import of the package reads this table, so classes are texts: Gymnasium imports them when it makes them.
+#
+# For each id `hpamdp/NAME-v0` of a `BatchedEnv`, its class and the settings that the id fixes.
+_BATCHED: dict[str, tuple[str, dict[str, Any]]] = {
+    "BoatDockUnseen": ("boatdock_unseen.environment:UnseenBoatsEnv", {"family": "turned"}),
+    "BoatDockUnseenAny": ("boatdock_unseen.environment:UnseenBoatsEnv", {"family": "any"}),
+    "BoatDockUnseenStrength": ("boatdock_unseen.environment:UnseenBoatsEnv", {"family": "strength"}),
+    "CatchPoint": ("catch_point.environment:CatchPointEnv", {}),
+    "CircuitHadamard": ("circuit.environment:CircuitEnv", {"task": "hadamard"}),
+    "CircuitRandomState": ("circuit.environment:CircuitEnv", {"task": "random_state"}),
+    "CircuitBell": ("circuit.environment:CircuitEnv", {"task": "bell"}),
+    "CircuitGHZ": ("circuit.environment:CircuitEnv", {"task": "ghz"}),
+    "CircuitRandomUnitary": ("circuit.environment:CircuitEnv", {"task": "random_unitary"}),
+    "CircuitToffoli": ("circuit.environment:CircuitEnv", {"task": "toffoli"}),
+    "Goal": ("goal.environment:GoalEnv", {}),
+    "HardGoal": ("goal.environment:HardGoalEnv", {}),
+    **{f"HardMove{n}": ("hard_move.environment:HardMoveEnv", {"n": n}) for n in (4, 6, 8, 10)},
+    "Moving": ("gym_hybrid.environment:MovingEnv", {}),
+    "Sliding": ("gym_hybrid.environment:SlidingEnv", {}),
+    "Office": ("office.environment:OfficeEnv", {}),
+    "PinballSimple": ("pinball.environment:PinballEnv", {"map": "simple"}),
+    "PinballHard": ("pinball.environment:PinballEnv", {"map": "hard"}),
+    "Platform": ("platform.environment:PlatformEnv", {}),
+}
+# For each other id, the arguments of `gymnasium.register`. Most environments end their episodes themselves, so these
+# have no `max_episode_steps`.
+_MANIPULATION, _LIGHTS = "primitives.manipulation:Manipulation", "traffic.lights:TrafficLights"
+_OTHERS: dict[str, dict[str, Any]] = {
+    "BoatDock": {
+        "entry_point": "boatdock.gymnasium_adapter:BoatDock",
+        "vector_entry_point": "hpamdp.env.boatdock.gymnasium_adapter:BoatDockVector",
+    },
+    "LunarLander": {"entry_point": "lunar_lander.lander:HybridLunarLander", "max_episode_steps": 1000},
+    "DrawerClose": {"entry_point": _MANIPULATION, "kwargs": {"task": "drawer_close"}},
+    "Soccer": {"entry_point": _MANIPULATION, "kwargs": {"task": "soccer"}},
+    "PegUnplugSide": {"entry_point": _MANIPULATION, "kwargs": {"task": "peg_unplug_side"}},
+    "SweepInto": {"entry_point": _MANIPULATION, "kwargs": {"task": "sweep_into"}},
+    "Assembly": {"entry_point": _MANIPULATION, "kwargs": {"task": "assembly"}},
+    "Disassemble": {"entry_point": _MANIPULATION, "kwargs": {"task": "disassemble"}},
+    "TrafficCrossing": {"entry_point": _LIGHTS, "kwargs": {"network": "crossing"}},
+    "TrafficCorridor": {"entry_point": _LIGHTS, "kwargs": {"network": "corridor"}},
+}
 
 
 def register() -> None:
-    """Register the Gymnasium ids of all problems; calling it again changes nothing.
-
-    A problem with a Gymnasium interface has a module `registration` in its folder, with `IDS`: the arguments of
-    `gymnasium.register` for each id. Since every import of the package loads it, it must import neither torch nor
-    TorchRL: Gymnasium takes the environment's class as text, `package.module:Class`, and imports it when it is made.
-    """
-    for problem in pkgutil.iter_modules(hpamdp.env.__path__, "hpamdp.env."):
-        name = f"{problem.name}.registration"
-        if problem.ispkg and importlib.util.find_spec(name) is not None:
-            for env_id, arguments in importlib.import_module(name).IDS.items():
-                if env_id not in gymnasium.registry:
-                    gymnasium.register(env_id, **arguments)
-
-
-def batched(problem: str, **settings: Any) -> dict[str, Any]:
-    """Return the arguments of `gymnasium.register` for a `BatchedEnv`, single and vectorised.
-
-    Args:
-        problem: the environment's class as text, `package.module:Class`.
-        settings: arguments of the constructor that the id fixes.
-    """
-    # No max_episode_steps: the environment itself truncates after its last step.
-    return {
-        "entry_point": "hpamdp.env.batched_adapter:BatchedEnvAdapter",
-        "vector_entry_point": "hpamdp.env.batched_adapter:BatchedEnvVectorAdapter",
-        "kwargs": {"problem": problem, **settings},
-    }
+    """Register the Gymnasium ids of all problems; calling it again changes nothing."""
+    adapter = "hpamdp.env.batched_adapter:BatchedEnv"
+    table = {name: {**rest, "entry_point": f"hpamdp.env.{rest['entry_point']}"} for name, rest in _OTHERS.items()}
+    for name, (problem, settings) in _BATCHED.items():
+        table[name] = {
+            "entry_point": f"{adapter}Adapter",
+            "vector_entry_point": f"{adapter}VectorAdapter",
+            "kwargs": {"problem": f"hpamdp.env.{problem}", **settings},
+        }
+    for name, arguments in table.items():
+        if f"hpamdp/{name}-v0" not in gymnasium.registry:
+            gymnasium.register(f"hpamdp/{name}-v0", **arguments)

@@ -10,7 +10,6 @@ from hpamdp import keys
 from hpamdp.data import DataError
 from hpamdp.data import minari as generic
 from hpamdp.env.boatdock import physics
-from hpamdp.env.boatdock.registration import BOAT_DOCK_ID
 from hpamdp.env.boatdock.task import SCALED_NAMES
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ def export(batch: TensorDict, dataset_id: str) -> minari.MinariDataset:
         batch,
         dataset_id,
         LAYOUT,
-        env_id=BOAT_DOCK_ID,
+        env_id="hpamdp/BoatDock-v0",
         env_kwargs={
             "controller": "choose" if keys.OPTION in batch.keys() else "random",
             "observation": "scaled" if is_scaled else "pixels",

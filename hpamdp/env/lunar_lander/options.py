@@ -8,7 +8,6 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 
 from hpamdp.cards import ProblemCard
 from hpamdp.env.facts import ProblemFacts, ProblemOptions
-from hpamdp.env.lunar_lander.registration import MAX_STEPS
 from hpamdp.settings import OnlyWith, PositiveFraction, Settings
 
 
@@ -28,7 +27,7 @@ class LanderRules(Settings):
 class LunarLanderOptions(LanderRules, ProblemOptions):
     """Settings of `LunarLanderEnv`."""
 
-    max_steps: PositiveInt = MAX_STEPS
+    max_steps: PositiveInt = 1000
     """Steps after which an episode is truncated."""
     render: bool = False
     """Draw the lander, for films; steps then take longer."""
