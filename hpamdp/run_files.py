@@ -28,6 +28,8 @@ DIVERGED_NAME = "checkpoint.diverged.zip"
 EVALUATION_NAME = "evaluation.npz"
 FILM_NAME = "episodes.gif"
 ERROR_NAME = "error.txt"
+# The entry of a saved agent's metadata that holds its JSON.
+METADATA_KEY = "hpamdp"
 # The largest config or summary that is read.
 MAX_TEXT_BYTES = 1 << 24
 # Settings of problems that change no result, or only its rounding.

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ from hpamdp.data.human.released_file import HumanData
 from hpamdp.env.boatdock import harbour, planner
 from hpamdp.run import assemble
 from hpamdp.run.assemble import choose_selector
+from hpamdp.run.state_file import StateFile
 
 # Tests that are started in the background or under nohup inherit ignored signals, and so would what they start.
 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU):
@@ -54,6 +56,34 @@ sys.path.insert(0, str(CROSSING))
 # The folders of the tests' own yaml files and of that of the example, and the word that adds them.
 OWN_FOLDERS = (Path(__file__).resolve().parent / "conf", CROSSING / "conf")
 OWN = f"hydra.searchpath=[{','.join(f'file://{folder}' for folder in OWN_FOLDERS)}]"
+
+
+def assert_same(one: object, other: object, where: str = "") -> None:
+    """Compare nested values of the same types to the last bit."""
+    assert type(one) is type(other), where
+    if isinstance(one, dict):
+        assert one.keys() == other.keys(), where
+        for key, value in one.items():
+            assert_same(value, other[key], f"{where}/{key}")
+    elif isinstance(one, list | tuple):
+        assert len(one) == len(other), where
+        for index, (mine, theirs) in enumerate(zip(one, other, strict=True)):
+            assert_same(mine, theirs, f"{where}/{index}")
+    elif torch.is_tensor(one):
+        assert one.dtype == other.dtype and one.shape == other.shape, where
+        assert bytes_of(one) == bytes_of(other), where
+    else:
+        assert repr(one) == repr(other), where  # NaN, too
+
+
+def bytes_of(tensor: torch.Tensor) -> bytes:
+    return tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
+
+
+def parts_of(file: Path) -> dict[str, Any]:
+    """Return the parts of a saved agent."""
+    opened = StateFile(file)
+    return {name: opened.read(name) for name in opened.names}
 
 
 @pytest.fixture(scope="module", autouse=True)
