@@ -9,13 +9,12 @@ from typing import Any
 
 import yaml
 
-from hpamdp.files import read_regular
+from hpamdp.files import read_regular, regular_size
 
 # Files of a run that others read.
-CHECKPOINT_NAME = "checkpoint.zip"
-MANIFEST_NAME = "manifest.json"  # inside the checkpoint
-POLICY_NAME = "policy.pt"
-BEST_NAME = "best.pt"
+CHECKPOINT_NAME = "checkpoint.safetensors"
+POLICY_NAME = "policy.safetensors"
+BEST_NAME = "best.safetensors"
 SUMMARY_NAME = "summary.json"
 CONFIG_NAME = "config.yaml"
 METRICS_NAME = "metrics.csv"
@@ -23,8 +22,10 @@ METRICS_NAME = "metrics.csv"
 TENSORBOARD_NAME, WANDB_NAME = "tensorboard", "wandb"
 # Lists the names of the pictures in the folder, which the environment chooses.
 FIGURES_NAME = ".figures"
+# The files of saved agents of version 0.3, which are no longer read.
+OLD_NAMES = ("checkpoint.zip", "policy.pt", "best.pt")
 # All other files that a run writes.
-DIVERGED_NAME = "checkpoint.diverged.zip"
+DIVERGED_NAME = "checkpoint.diverged.safetensors"
 EVALUATION_NAME = "evaluation.npz"
 FILM_NAME = "episodes.gif"
 ERROR_NAME = "error.txt"
@@ -55,6 +56,18 @@ class _WithoutAliases(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("an alias")
         return super().compose_node(parent, index)
+
+
+def is_saved_agent(path: Path) -> bool:
+    """Return whether a file begins like the checkpoints and policies of this version.
+
+    Raises:
+        OSError: the file is missing, not regular or unreadable.
+    """
+    regular_size(path)
+    beginning = f'{{"__metadata__":{{"{METADATA_KEY}":'.encode()
+    with path.open("rb") as file:
+        return file.read(8 + len(beginning))[8:] == beginning
 
 
 def saved_config(folder: Path) -> dict[str, Any]:

@@ -38,8 +38,8 @@ def test_there_is_an_agent_for_each_problem_each_boat_and_the_whole_task():
 
 @pytest.mark.parametrize("name", AGENTS)
 def test_an_agent_is_small_complete_and_listed(name):
-    assert {"policy.pt", "config.yaml", "summary.json"} <= {file.name for file in (FOLDER / name).iterdir()}
-    assert (FOLDER / name / "policy.pt").stat().st_size < 300_000
+    assert {"policy.safetensors", "config.yaml", "summary.json"} <= {file.name for file in (FOLDER / name).iterdir()}
+    assert (FOLDER / name / "policy.safetensors").stat().st_size < 300_000
     assert f"`{name}`" in (FOLDER / "README.md").read_text()
 
 
@@ -91,7 +91,7 @@ def test_the_networks_of_an_agent_start_a_run(tmp_path):
 
 @pytest.mark.parametrize("name", AGENTS)
 def test_the_file_of_an_agent_has_todays_form_which_loads_without_further_compositions(name, monkeypatch):
-    progress = checkpoint.progress_of(FOLDER / name / "policy.pt")
+    progress = checkpoint.progress_of(FOLDER / name / "policy.safetensors")
     assert progress["config"] == config_of(name) == upgraded(progress["config"])
     skip_without_simulator(name)
     composing: list[object] = []
@@ -103,19 +103,19 @@ def test_the_file_of_an_agent_has_todays_form_which_loads_without_further_compos
 
 def test_networks_alone_are_scored_but_not_resumed():
     folder = str(FOLDER / "linucb_hppo")
-    assert checkpoint.find(folder, "checkpoint").name == "policy.pt"
-    assert checkpoint.find(folder, "low.checkpoint").name == "policy.pt"
+    assert checkpoint.find(folder, "checkpoint").name == "policy.safetensors"
+    assert checkpoint.find(folder, "low.checkpoint").name == "policy.safetensors"
     with pytest.raises(ConfigError, match="networks alone, which cannot be resumed"):
         checkpoint.find(folder, "resume")
-    with pytest.raises(ConfigError, match=r"policy\.pt: networks alone, which cannot be resumed; give a run's output"):
-        hpamdp.train(resume=f"{folder}/policy.pt", progress=False)
+    with pytest.raises(ConfigError, match=r"policy\.safetensors: networks alone, which cannot be resumed; give a"):
+        hpamdp.train(resume=f"{folder}/policy.safetensors", progress=False)
 
 
 def test_the_words_of_eval_take_the_agent_from_its_folder():
     words = ["mode=eval", f"checkpoint={FOLDER / 'linucb_hppo'}", "eval.layouts=7"]
     config, file = resolve(compose_config(words), words)
     assert (config.high.name, config.low.name, config.run.eval.layouts) == ("linucb", "hppo", 7)
-    assert file == FOLDER / "linucb_hppo" / "policy.pt"
+    assert file == FOLDER / "linucb_hppo" / "policy.safetensors"
 
 
 def test_an_agent_is_found_by_its_name_by_every_command(command, tmp_path):
@@ -125,15 +125,15 @@ def test_an_agent_is_found_by_its_name_by_every_command(command, tmp_path):
     assert code == 0, err
     assert '"name":"hppo_congruent","title":"hppo","score":3.257' in (tmp_path / "site/data.js").read_text()
     file = checkpoint.find("pdqn_goal", "low.checkpoint")
-    assert file == FOLDER / "pdqn_goal/policy.pt"
+    assert file == FOLDER / "pdqn_goal/policy.safetensors"
 
 
 def test_an_existing_folder_precedes_the_agent_of_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pdqn_goal").mkdir()
-    shutil.copy(FOLDER / "hppo_platform/policy.pt", "pdqn_goal")
+    shutil.copy(FOLDER / "hppo_platform/policy.safetensors", "pdqn_goal")
     assert hpamdp.load("pdqn_goal").specs.num_discrete == 3
-    assert checkpoint.find("pdqn_goal", "checkpoint") == Path("pdqn_goal/policy.pt")
+    assert checkpoint.find("pdqn_goal", "checkpoint") == Path("pdqn_goal/policy.safetensors")
 
 
 @pytest.mark.parametrize(

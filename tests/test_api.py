@@ -303,8 +303,8 @@ def test_training_gives_torch_its_threads_back():
 
 
 def test_a_saved_agent_acts_as_before(platform_agent, tmp_path):
-    platform_agent.save(tmp_path / "a.pt")
-    loaded = hpamdp.load(tmp_path / "a.pt")
+    platform_agent.save(tmp_path / "a.safetensors")
+    loaded = hpamdp.load(tmp_path / "a.safetensors")
     observation = np.linspace(-0.5, 0.5, 9, dtype=np.float32)
     before, after = platform_agent.act(observation), loaded.act(observation)
     assert before[0] == after[0]
@@ -314,8 +314,8 @@ def test_a_saved_agent_acts_as_before(platform_agent, tmp_path):
 
 def test_a_saved_agent_keeps_the_learned_scale_of_its_observations(tmp_path):
     agent = hpamdp.train(Reach, **{**OWN, "env.observation_scaling": "running"})
-    agent.save(tmp_path / "a.pt")
-    loaded = hpamdp.load(tmp_path / "a.pt", env=Reach, **{"env.max_steps": 5})
+    agent.save(tmp_path / "a.safetensors")
+    loaded = hpamdp.load(tmp_path / "a.safetensors", env=Reach, **{"env.max_steps": 5})
     observation = np.array([0.9, -0.9, 0.3], np.float32)
     np.testing.assert_array_equal(agent.act(observation)[1][0], loaded.act(observation)[1][0])
 
@@ -480,7 +480,7 @@ def test_an_agent_whose_selector_alone_was_trained_comes_back_whole(tmp_path):
     observation = agent.observation_space.sample()
     assert agent.action_space.contains(agent.act(observation))
     scores = agent.evaluate(episodes=3, seed=1, per_episode=True)["score"]
-    agent.save(tmp_path / "policy.pt")
+    agent.save(tmp_path / "policy.safetensors")
     assert np.array_equal(hpamdp.load(tmp_path).evaluate(episodes=3, seed=1, per_episode=True)["score"], scores)
 
 
@@ -607,8 +607,8 @@ def test_a_batch_of_no_boxes_is_refused():
 
 
 def test_load_takes_the_problem_as_its_second_argument(platform_agent, tmp_path):
-    platform_agent.save(tmp_path / "a.pt")
-    assert hpamdp.load(tmp_path / "a.pt", "platform").specs == platform_agent.specs
+    platform_agent.save(tmp_path / "a.safetensors")
+    assert hpamdp.load(tmp_path / "a.safetensors", "platform").specs == platform_agent.specs
 
 
 # Mistakes that a hostile user found: each is one line, or has the effect that one would expect.
@@ -802,10 +802,10 @@ def test_a_source_that_is_no_path_is_refused(source):
 
 def test_home_directories_are_written_and_read_by_the_same_rule(tmp_path, monkeypatch, platform_agent):
     monkeypatch.setenv("HOME", str(tmp_path))
-    platform_agent.save("~/a.pt")
+    platform_agent.save("~/a.safetensors")
     hpamdp.train("platform", low="hppo", folder="~/run", **TINY)
-    assert {"a.pt", "run"} == {path.name for path in tmp_path.iterdir()}
-    assert hpamdp.load("~/a.pt").specs == hpamdp.load("~/run").specs
+    assert {"a.safetensors", "run"} == {path.name for path in tmp_path.iterdir()}
+    assert hpamdp.load("~/a.safetensors").specs == hpamdp.load("~/run").specs
 
 
 def test_an_object_takes_the_place_of_the_environment_of_a_saved_run(tmp_path):
@@ -825,7 +825,7 @@ def test_an_object_takes_the_place_of_the_environment_of_a_saved_run(tmp_path):
 
 def test_a_file_whose_name_begins_with_a_tilde_is_no_home_directory(tmp_path, monkeypatch, platform_agent):
     monkeypatch.chdir(tmp_path)
-    for path in ("./~a.pt", Path("~nobody.pt"), "./~/b.pt"):
+    for path in ("./~a.safetensors", Path("~nobody.safetensors"), "./~/b.safetensors"):
         Path("./~").mkdir(exist_ok=True)
         platform_agent.save(path)
         assert (tmp_path / path).is_file()

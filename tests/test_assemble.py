@@ -102,7 +102,7 @@ def test_a_ceiling_with_changes_that_options_never_make_is_told_in_one_line(caps
         ),
         (
             "low.checkpoint=/nowhere",
-            "low.checkpoint=/nowhere: no checkpoint there; give a run's output folder or its checkpoint.zip",
+            "low.checkpoint=/nowhere: no checkpoint there; give a run's output folder or its checkpoint.safetensors",
         ),
     ],
 )
@@ -154,7 +154,7 @@ def test_learners_of_another_kind_or_size_are_refused_in_one_line(words, trained
     with pytest.raises(ConfigError) as error:
         make(make_config([*SMALL, "total_frames=20000", *words.split(), f"low.checkpoint={trained}"]), tmp_path)
     line = str(error.value)
-    assert line.startswith(f"low.checkpoint={trained / 'checkpoint.zip'}: ")
+    assert line.startswith(f"low.checkpoint={trained / 'checkpoint.safetensors'}: ")
     assert "it holds 2 learners, but this agent has 1" in line or "of another class or size than low (" in line
     assert "\n" not in str(error.value)
 

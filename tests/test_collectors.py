@@ -563,7 +563,7 @@ def test_when_a_worker_dies_the_run_names_it_and_saves_its_agent_and_leaves_no_p
     death = r"collector=multi: worker [01] of 2 died \(signal 9, SIGKILL\) at frame (\d+); to go on: .* resume=(\S+)"
     (told,) = filter(None, (re.fullmatch(death, line) for line in capsys.readouterr().err.splitlines()))
     assert int(told.group(1)) in frames and told.group(2) == str(tmp_path)
-    assert (tmp_path / "checkpoint.zip").is_file()
+    assert (tmp_path / "checkpoint.safetensors").is_file()
     assert not set(multiprocessing.active_children()) - set(others)
 
 
@@ -617,7 +617,7 @@ def test_a_run_goes_on_after_its_workers_deaths_if_it_may(collector, way, mortal
     err = capsys.readouterr().err
     line = rf"collector={collector}: worker [01] of 2 died \(.+\) at frame 544; to go on: .* resume=.*"
     assert [text for text in err.splitlines() if re.fullmatch(line, text)] and "Traceback" not in err
-    assert checkpoint.progress_of(tmp_path / "ends/checkpoint.zip")["frames"] == 544
+    assert checkpoint.progress_of(tmp_path / "ends/checkpoint.safetensors")["frames"] == 544
 
     assert run(compose_config([*words, "collector.max_restarts=2"]), tmp_path / "goes_on") == 0
     assert len(re.findall(r"it was replaced \(restart [12] of 2\)", capsys.readouterr().err)) == 2
@@ -633,7 +633,7 @@ def test_a_run_goes_on_after_its_workers_deaths_if_it_may(collector, way, mortal
 def test_a_problem_in_a_worker_is_reported_in_one_line_and_what_was_learned_is_saved(collector, mortal, tmp_path):
     with pytest.raises(ConfigError, match=r"^env: GymnasiumEnv: mortal:Mortal: environment \d: gave an observation"):
         run(compose_config([*mortal("problem"), f"collector={collector}", "total_frames=6400"]), tmp_path / "run")
-    assert checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"] == 544
+    assert checkpoint.progress_of(tmp_path / "run/checkpoint.safetensors")["frames"] == 544
 
 
 @pytest.mark.slow
@@ -654,7 +654,7 @@ def test_a_terminals_ctrl_c_stops_all_processes_and_the_run_goes_on_in_one(colle
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
     frames = len(metrics.read_text().splitlines())
-    more = checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"] + 32
+    more = checkpoint.progress_of(tmp_path / "run/checkpoint.safetensors")["frames"] + 32
     overrides = [f"resume={tmp_path / 'run'}", "collector=single", f"total_frames={more}"]
     assert run(compose_config(overrides), tmp_path / "resumed", overrides) == 0 and frames > 3
 
@@ -695,7 +695,7 @@ def test_a_sigterm_to_a_run_with_ray_saves_and_ends_it_as_with_other_collectors(
         wait_until(lambda: metrics.is_file() and len(metrics.read_text().splitlines()) > 3, seconds=240)
         process.terminate()
         assert process.wait(120) == 130
-        assert (tmp_path / "run/checkpoint.zip").is_file()
+        assert (tmp_path / "run/checkpoint.safetensors").is_file()
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)

@@ -64,7 +64,7 @@ def words_of(way: str, home: Path, to: str) -> list[str]:
 
 
 def test_a_run_remembers_its_folders_in_both_of_its_files(home):
-    for name in ("checkpoint.zip", "policy.pt"):
+    for name in ("checkpoint.safetensors", "policy.safetensors"):
         assert checkpoint.progress_of(home / "run" / name)["config_dirs"] == [str(home / "own")]
 
 
@@ -98,7 +98,7 @@ def test_without_trust_one_line_names_the_folders_of_a_run_and_nothing_in_them_i
     assert str(home / "own") in err and "trust=true" in err
 
 
-@pytest.mark.parametrize("file", ["run", "run/policy.pt", "run/checkpoint.zip"])
+@pytest.mark.parametrize("file", ["run", "run/policy.safetensors", "run/checkpoint.safetensors"])
 def test_python_reads_no_folder_of_a_file_without_trust(file, home, unread):
     with pytest.raises(hpamdp.ConfigError, match="trust=true") as raised:
         hpamdp.load(home / file)

@@ -548,13 +548,13 @@ def test_a_table_of_counts_is_saved_for_training_alone(tmp_path, monkeypatch):
     words = [*PLATFORM, "low=hppo", "exploration=counts", *SHORT.get("hppo", []), *SMALL, "film=false"]
     assert run(compose_config(words), tmp_path, words) == 0
     table = 8 * CountsOptions().table_size
-    policy, checkpoint = tmp_path / "policy.pt", tmp_path / "checkpoint.zip"
+    policy, checkpoint = tmp_path / "policy.safetensors", tmp_path / "checkpoint.safetensors"
     assert policy.stat().st_size < 0.5 * table < table < checkpoint.stat().st_size
     agent = hpamdp.load(policy)
     monkeypatch.setattr(HierarchicalAgent, "acting_state", HierarchicalAgent.state_dict)
-    agent.save(tmp_path / "old.pt")  # as earlier versions wrote it
-    assert table < (tmp_path / "old.pt").stat().st_size
-    scores = [hpamdp.load(file).evaluate(episodes=4) for file in (policy, checkpoint, tmp_path / "old.pt")]
+    agent.save(tmp_path / "whole")
+    assert table < (tmp_path / "whole").stat().st_size
+    scores = [hpamdp.load(file).evaluate(episodes=4) for file in (policy, checkpoint, tmp_path / "whole")]
     assert scores[0] == scores[1] == scores[2]
 
 

@@ -48,7 +48,14 @@ def test_a_run_never_writes_through_a_link_in_its_folder(tmp_path, with_figures)
     words = [*TINY, "total_frames=16", "film=true"]
     assert run(compose_config(words), folder, words) == 0
     names = {path.name for path in folder.iterdir()}
-    assert {"checkpoint.zip", "policy.pt", "config.yaml", "metrics.csv", "summary.json", "evaluation.npz"} < names
+    assert {
+        "checkpoint.safetensors",
+        "policy.safetensors",
+        "config.yaml",
+        "metrics.csv",
+        "summary.json",
+        "evaluation.npz",
+    } < names
     assert {"episodes.gif", "learning_curves.png"} < names
     contents = outside_copies(folder, tmp_path / "outside")
     os.link(tmp_path / "outside/summary.json", folder / ".lock")
@@ -156,7 +163,7 @@ def test_metrics_that_are_no_file_are_neither_read_nor_replaced(tmp_path):
 
 
 def test_a_named_pipe_and_a_socket_are_never_replaced_by_a_file(tmp_path):
-    pipe, listening = tmp_path / "pipe.pt", tmp_path / "socket.pt"
+    pipe, listening = tmp_path / "pipe.safetensors", tmp_path / "socket.safetensors"
     os.mkfifo(pipe)
     agent = hpamdp.load("hppo_platform")
     with socket.socket(socket.AF_UNIX) as server:
@@ -171,12 +178,14 @@ def test_a_named_pipe_and_a_socket_are_never_replaced_by_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("path", "reason"),
     [
-        ("nowhere/x.pt", "No such file or directory"),
-        ("file/x.pt", "Not a directory"),
+        ("nowhere/x.safetensors", "No such file or directory"),
+        ("file/x.safetensors", "Not a directory"),
         (".", "is a folder, but must be a regular file"),
         ("x" * 300, "File name too long"),
         pytest.param(
-            "closed/x.pt", "Permission denied", marks=pytest.mark.skipif(os.geteuid() == 0, reason="root may write")
+            "closed/x.safetensors",
+            "Permission denied",
+            marks=pytest.mark.skipif(os.geteuid() == 0, reason="root may write"),
         ),
     ],
 )
@@ -189,7 +198,7 @@ def test_a_path_that_cannot_be_written_is_named_with_the_reason(path, reason, tm
 
 
 def test_an_error_inside_the_block_about_the_new_file_names_the_path(tmp_path):
-    with pytest.raises(FileNotFoundError) as error, replacing(tmp_path / "x.pt") as partial:
+    with pytest.raises(FileNotFoundError) as error, replacing(tmp_path / "x.safetensors") as partial:
         partial.unlink()
         partial.read_bytes()
-    assert error.value.filename == str(tmp_path / "x.pt")
+    assert error.value.filename == str(tmp_path / "x.safetensors")

@@ -91,7 +91,7 @@ def test_a_run_that_is_refused_destroys_nothing(tmp_path, monkeypatch, without_l
 
 
 def test_a_move_that_fails_halfway_brings_the_earlier_run_back(tmp_path, monkeypatch):
-    for name in ("summary.json", "checkpoint.zip", "config.yaml", "metrics.csv"):
+    for name in ("summary.json", "checkpoint.safetensors", "config.yaml", "metrics.csv"):
         (tmp_path / name).write_text(name)
     before, rename = contents(tmp_path), Path.rename
 
@@ -138,9 +138,9 @@ def test_files_that_no_run_has_written_are_never_replaced(tmp_path):
 @pytest.mark.parametrize(
     "own",
     [
-        {"best.pt": "my networks", "trajectories.png": "", "learning_curves.png": ""},
-        {"checkpoint.zip": "my backup"},
-        {"policy.pt": "my networks", CONFIG_NAME: "title: my site\n"},
+        {"best.safetensors": "my networks", "trajectories.png": "", "learning_curves.png": ""},
+        {"checkpoint.safetensors": "my backup"},
+        {"policy.safetensors": "my networks", CONFIG_NAME: "title: my site\n"},
         {"summary.json": '{"of": "my thesis"}'},
     ],
 )
@@ -155,11 +155,11 @@ def test_a_file_of_a_users_own_with_the_name_of_a_result_is_never_deleted(own, t
         assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("kept", [CONFIG_NAME, "checkpoint.zip", "summary.json"])
+@pytest.mark.parametrize("kept", [CONFIG_NAME, "checkpoint.safetensors", "summary.json"])
 def test_a_run_that_has_lost_most_of_its_files_may_be_overwritten(kept, tmp_path):
     start(tmp_path)
     for path in tmp_path.iterdir():
-        if path.name not in (kept, "policy.pt"):
+        if path.name not in (kept, "policy.safetensors"):
             path.unlink()
     with pytest.raises(ConfigError, match="holds the results of a run"):
         start(tmp_path)
@@ -392,7 +392,7 @@ def test_the_same_command_after_a_requeue_goes_on_with_its_run(tmp_path, command
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemError):
         kill_at(patch, 128)
         command(*words)
-    assert checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"] == 96
+    assert checkpoint.progress_of(tmp_path / "run/checkpoint.safetensors")["frames"] == 96
     code, out, _ = command(*words)
     assert code == 0 and "Going on from" in out
     start(tmp_path / "whole", "checkpoint_every=96")
@@ -504,7 +504,7 @@ def test_a_job_that_a_signal_stops_is_saved_before_its_launcher_gets_the_signal(
     found = []
 
     def requeue(number, frame):
-        found.append(checkpoint.progress_of(tmp_path / "sweep/0/checkpoint.zip")["frames"])
+        found.append(checkpoint.progress_of(tmp_path / "sweep/0/checkpoint.safetensors")["frames"])
         raise SystemExit(7)
 
     before = signal.signal(signal.SIGUSR2, requeue)

@@ -232,7 +232,7 @@ def test_the_python_of_a_front_page_runs(name, tmp_path):
             exec(compile(code, name, "exec"), names)
         if name == "README.md":
             assert names["info"]["score"] > 0.0
-            assert hpamdp.load("platform.pt").evaluate(episodes=100)["score"] > 0.9
+            assert hpamdp.load("platform.safetensors").evaluate(episodes=100)["score"] > 0.9
 
     assert forked(follow) == 0
 

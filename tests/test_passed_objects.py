@@ -217,7 +217,7 @@ def test_resume_auto_loads_no_finished_agent_of_another_config(tmp_path):
     given = {**TINY, "low": "hppo", "high": None}
     hpamdp.train("platform", folder=tmp_path / "run", **given)
     hpamdp.train(own_class(), folder=tmp_path / "other", **{**OWN, "high": None})
-    for name in ("checkpoint.zip", "policy.pt"):
+    for name in ("checkpoint.safetensors", "policy.safetensors"):
         (tmp_path / "other" / name).replace(tmp_path / "run" / name)
     line = 'has the results of another config, with env="gymnasium" for "platform"'
     with pytest.raises(hpamdp.ConfigError, match=line) as raised:

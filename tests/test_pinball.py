@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from batched_players import action, play
-from conftest import compose_config, make_config
+from conftest import compose_config, make_config, parts_of
 from torchrl.envs.utils import check_env_specs
 
 import hpamdp
@@ -21,6 +21,7 @@ from hpamdp.env.pinball import maps
 from hpamdp.env.pinball.environment import PinballEnv
 from hpamdp.env.pinball.options import SOURCE_MAPS
 from hpamdp.run.assemble import assemble
+from hpamdp.run.state_file import write
 from hpamdp.run.train import run
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -271,7 +272,7 @@ def test_an_evaluation_on_a_map_that_was_edited_since_says_so(grouping, tmp_path
     line = "the agent was trained with another file of env.map, or it was edited since"
     for table, is_other in ((TABLE, False), (TABLE | {"start": [0.2, 0.6]}, True)):
         written(tmp_path, table)
-        for saved in ("policy.pt", "checkpoint.zip"):
+        for saved in ("policy.safetensors", "checkpoint.safetensors"):
             capfd.readouterr()
             evaluate = ["mode=eval", f"checkpoint={folder / saved}", "trust=true", "eval.layouts=2", "film=false"]
             assert run(compose_config(evaluate), tmp_path / f"{saved}_{is_other}", evaluate) == 0
@@ -285,10 +286,10 @@ def test_a_saved_agent_whose_checksum_is_damaged_is_refused_in_one_line(env_part
     file, folder = written(tmp_path, TABLE), tmp_path / "run"
     words = ["env=pinball", "high=none", "low=random", f"env.map={file}", *SMALL, "total_frames=64"]
     assert run(compose_config(words), folder, words) == 0
-    saved = torch.load(folder / "policy.pt")
-    torch.save(saved | {"collection": {"env": env_part}}, folder / "policy.pt")
-    with pytest.raises(ConfigError, match=r"policy\.pt: does not fit env"):
-        hpamdp.load(folder / "policy.pt", trust=True)
+    saved = parts_of(folder / "policy.safetensors")
+    write(folder / "policy.safetensors", saved | {"collection": {"env": env_part}})
+    with pytest.raises(ConfigError, match=r"policy\.safetensors: does not fit env"):
+        hpamdp.load(folder / "policy.safetensors", trust=True)
 
 
 def test_a_run_names_the_setting_and_the_file(tmp_path):

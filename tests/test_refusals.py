@@ -255,7 +255,7 @@ def test_a_resumed_run_may_repeat_its_problem_and_seed_and_change_its_evaluation
 def test_an_agent_is_told_when_its_options_are_others(tmp_path, capsys):
     first = "env.boats=[congruent,incongruent1]"
     assert run(config_of(f"{first} high=uniform low=random film=false"), tmp_path / "saved") == 0
-    assert progress_of(tmp_path / "saved/policy.pt")["option_names"] == ["congruent", "incongruent1"]
+    assert progress_of(tmp_path / "saved/policy.safetensors")["option_names"] == ["congruent", "incongruent1"]
 
     def check(words, setting="low.checkpoint"):
         config = read(config_of(f"{words} high=uniform low=random {setting}={tmp_path / 'saved'}"))

@@ -18,7 +18,7 @@ from typing import IO, Any
 
 import pytest
 import torch
-from conftest import CONF, compose_config
+from conftest import CONF, compose_config, parts_of
 from test_grid import SHORT
 
 from hpamdp import cli, keys
@@ -36,7 +36,7 @@ PROGRAM = ["run.py", "num_envs=8", "steps_per_batch=4", "eval.layouts=4", "low=r
 
 
 def frames_of(folder) -> int:
-    return checkpoint.progress_of(folder / "checkpoint.zip")["frames"]
+    return checkpoint.progress_of(folder / "checkpoint.safetensors")["frames"]
 
 
 def spoil_rewards(monkeypatch, value: float, after: int) -> None:
@@ -61,7 +61,7 @@ def test_a_reward_that_is_not_finite_stops_the_run_and_keeps_the_good_checkpoint
     assert run(compose_config(given), tmp_path, given) == 3
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "frame" in line and "stopped" in line]
     assert line.startswith(f"reward is {value} in environment 0 at frame ") and "last good checkpoint is" in line
-    frames = checkpoint.progress_of(tmp_path / "checkpoint.zip")["frames"]
+    frames = checkpoint.progress_of(tmp_path / "checkpoint.safetensors")["frames"]
     assert 0 < frames < 8192 and checkpoint.progress_of(tmp_path / DIVERGED_NAME)["frames"] >= frames
     assert not (tmp_path / "summary.json").exists()
 
@@ -103,8 +103,7 @@ def test_a_loss_that_is_nan_stops_the_run_before_it_is_saved(tmp_path, monkeypat
     monkeypatch.setattr(PDQN, "update_once", spoiled)
     assert run(compose_config(given), tmp_path, given) == 3
     assert "/critic is nan at frame" in capsys.readouterr().err
-    with checkpoint._Opened(tmp_path / "checkpoint.zip") as opened:
-        agent = opened.filled("agent")
+    agent = parts_of(tmp_path / "checkpoint.safetensors")["agent"]
     assert not any(value.isnan().any() for value in agent.values() if torch.is_tensor(value))
 
 
@@ -221,7 +220,7 @@ def test_a_run_in_a_thread_is_the_run_of_the_main_thread(collector, tmp_path):
 def test_a_killed_run_loses_no_more_than_the_minutes_between_two_checkpoints(tmp_path, printed):
     process = started(tmp_path / "run", "checkpoint_minutes=0.002", output=printed)
     for _ in range(600):
-        if (tmp_path / "run/checkpoint.zip").exists():
+        if (tmp_path / "run/checkpoint.safetensors").exists():
             break
         time.sleep(0.05)
     process.kill()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import TRAINED, compose_config, forked
+from conftest import TRAINED, assert_same, compose_config, forked, parts_of
 from test_grid import SHORT, SHORT_SELECTORS
 
 from hpamdp.run import checkpoint
@@ -28,25 +28,10 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
         return [{name: value for name, value in row.items() if name != "wall_s"} for row in csv.DictReader(file)]
 
 
-def members_of(folder: Path) -> dict:
-    with checkpoint._Opened(folder / checkpoint.FILE_NAME) as opened:
-        return {name: opened.filled(name) for name in opened.names}
-
-
-def assert_same(one: object, other: object, where: str = "") -> None:
-    assert type(one) is type(other), where
-    if isinstance(one, dict):
-        assert one.keys() == other.keys(), where
-        for key, value in one.items():
-            assert_same(value, other[key], f"{where}/{key}")
-    elif isinstance(one, list | tuple):
-        assert len(one) == len(other), where
-        for index, (mine, theirs) in enumerate(zip(one, other, strict=True)):
-            assert_same(mine, theirs, f"{where}/{index}")
-    elif torch.is_tensor(one):
-        torch.testing.assert_close(one, other, rtol=0.0, atol=0.0, equal_nan=True, msg=where)
-    else:
-        assert one == other, where
+def parts_of_run(folder: Path) -> dict:
+    parts = parts_of(folder / checkpoint.FILE_NAME)
+    del parts["progress"]  # which has wall times
+    return parts
 
 
 def stop_and_resume(
@@ -54,7 +39,7 @@ def stop_and_resume(
 ) -> None:
     """Run once as a whole, and for each signal once with a resumption after it; assert that all are the same."""
     assert run(compose_config(given), tmp_path / "whole", given) == 0
-    whole = members_of(tmp_path / "whole")
+    whole = parts_of_run(tmp_path / "whole")
     for number in numbers:
         stopped, resumed = tmp_path / f"stopped-{number}", tmp_path / f"resumed-{number}"
         with monkeypatch.context() as patch:
@@ -65,10 +50,10 @@ def stop_and_resume(
         torch.manual_seed(1234)  # nothing of another process's generators may matter
         assert run(compose_config(words), resumed, words) == 0
         assert rows_of(resumed) == rows_of(tmp_path / "whole")
-        members = members_of(resumed)
-        for rng in (whole["rng"], members["rng"]):
+        parts = parts_of_run(resumed)
+        for rng in (whole["rng"], parts["rng"]):
             rng.pop("python", None), rng.pop("numpy", None)  # which no part of a run uses
-        assert_same(members, whole)
+        assert_same(parts, whole)
 
 
 def signalled(number: int) -> Callable[..., None]:

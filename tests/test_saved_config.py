@@ -4,14 +4,12 @@ import importlib.util
 import json
 import os
 import re
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 import yaml
-from conftest import OWN, choices, compose_config, make_config
+from conftest import OWN, choices, compose_config, make_config, parts_of
 from test_grid import SHORT, SHORT_SELECTORS, SMALL
 
 from hpamdp.config.components import GROUPS
@@ -20,6 +18,7 @@ from hpamdp.config.saved import needs_trust, read_saved
 from hpamdp.config.schema import Config
 from hpamdp.messages import one_line
 from hpamdp.run.play import permissions
+from hpamdp.run.state_file import write
 from hpamdp.run.train import run
 
 TINY = ["num_envs=2", "steps_per_batch=2", "total_frames=8", "eval.layouts=2", "eval.every=0", "film=false"]
@@ -110,19 +109,10 @@ def forged(folder: Path, target: Path, change: Callable[[dict], None]) -> Path:
     """Copy a run's checkpoint and networks, with its config changed."""
     target.mkdir()
 
-    def changed(progress: dict) -> dict:
-        change(progress["config"])
-        return progress
-
-    with zipfile.ZipFile(folder / "checkpoint.zip") as old, zipfile.ZipFile(target / "checkpoint.zip", "w") as new:
-        for name in old.namelist():
-            data = old.read(name)
-            if name == "manifest.json":
-                manifest = json.loads(data)
-                data = json.dumps(manifest | {"progress": changed(manifest["progress"])}).encode()
-            new.writestr(name, data)
-    policy = torch.load(folder / "policy.pt", weights_only=True)
-    torch.save(policy | {"progress": json.dumps(changed(json.loads(policy["progress"])))}, target / "policy.pt")
+    for name in ("checkpoint.safetensors", "policy.safetensors"):
+        parts = parts_of(folder / name)
+        change(parts["progress"]["config"])
+        write(target / name, parts)
     return target
 
 
@@ -140,7 +130,7 @@ def bait(tmp_path, monkeypatch):
 
 WAYS_IN = {
     "eval": ["mode=eval", "checkpoint={}"],
-    "networks": ["mode=eval", "checkpoint={}/policy.pt"],
+    "networks": ["mode=eval", "checkpoint={}/policy.safetensors"],
     "resume": ["resume={}", "total_frames=16"],
     "watch": ["watch", "{}", "--episodes=1"],
     "play": ["play", "--agent={}", "--export=site"],
@@ -191,10 +181,9 @@ def test_guarded_settings_are_accepted_if_repeated_or_if_the_file_is_trusted(of_
 
 
 def test_play_accepts_a_guarded_setting_if_repeated_or_if_the_file_is_trusted(command, tmp_path):
-    policy = torch.load(AGENTS / "hppo_congruent/policy.pt", weights_only=True)
-    progress = json.loads(policy["progress"])
-    progress["config"]["env"]["recording"] = "gone.jsonl"
-    torch.save(policy | {"progress": json.dumps(progress)}, tmp_path / "policy.pt")
+    parts = parts_of(AGENTS / "hppo_congruent/policy.safetensors")
+    parts["progress"]["config"]["env"]["recording"] = "gone.jsonl"
+    write(tmp_path / "policy.safetensors", parts)
     play = ["play", f"--agent={tmp_path}", "--export=site"]
     assert 'env.recording="gone.jsonl": set by' in command(*play)[2]
     # Then the file is looked for.

@@ -115,7 +115,7 @@ def test_unfinished_and_failed_runs_are_counted_and_left_out_of_the_mean(tmp_pat
     leave_run(tmp_path / "1", seed=1, finished=False)
     leave_run(tmp_path / "2", seed=2)
     (tmp_path / "2/summary.json").unlink()  # as of a run that diverged
-    (tmp_path / "2/checkpoint.diverged.zip").touch()
+    (tmp_path / "2/checkpoint.diverged.safetensors").touch()
     leave_run(tmp_path / "3", seed=3, finished=False)
     (tmp_path / "3/error.txt").touch()
     (row,) = hpamdp.report(tmp_path)

@@ -247,16 +247,16 @@ def of_a_limited_process(folder: Path, limit: int, value: int, err: Path) -> Non
 
 def test_a_limit_of_the_size_of_files_is_a_full_disk(tmp_path, monkeypatch):
     def run(cfg, folder, *_, **__):
-        with replacing(folder / "checkpoint.zip") as partial:
+        with replacing(folder / "checkpoint.safetensors") as partial:
             partial.write_bytes(bytes(100_000))
 
     monkeypatch.setattr(train, "run", run)
     (tmp_path / "out").mkdir()
-    (tmp_path / "out/checkpoint.zip").write_text("the one before")
+    (tmp_path / "out/checkpoint.safetensors").write_text("the one before")
     err = tmp_path / "err.txt"
     assert forked(of_a_limited_process, tmp_path, resource.RLIMIT_FSIZE, 50_000, err) == 1
     assert err.read_text() == f"{tmp_path / 'out'}: File too large; the run was stopped\n"
-    assert (tmp_path / "out/checkpoint.zip").read_text() == "the one before"
+    assert (tmp_path / "out/checkpoint.safetensors").read_text() == "the one before"
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_the_printed_command_continues_the_run_when_pasted(command, tmp_path, mo
     folder = "my runs/lr=0.1,seed=[1] it's $5"
     small = ["high=fixed", "low=random", "num_envs=2", "steps_per_batch=2", "eval.layouts=2", "film=false"]
     assert command(*small, "total_frames=4", f"hydra.run.dir={for_hydra(folder)}")[0] == 0
-    assert (tmp_path / folder / "checkpoint.zip").is_file()
+    assert (tmp_path / folder / "checkpoint.safetensors").is_file()
     err = command(*small, "total_frames=8", f"hydra.run.dir={for_hydra(folder)}")[2]
     told = err.partition("continue it with ")[2].partition(", take another")[0]
     code, out, err = command(*shlex.split(told), "total_frames=8", f"hydra.run.dir={for_hydra(folder)}")

@@ -55,7 +55,7 @@ def jobs(monkeypatch):
             tell("reward is nan at frame 7: training stopped")
             return messages.DIVERGED
         frames = 5 if cfg.seed == 5 or (cfg.seed == 3 and stopped_at is None) else cfg.total_frames
-        (folder / "checkpoint.zip").touch()
+        (folder / "checkpoint.safetensors").touch()
         summary = {"score": float(cfg.seed), "frames": frames, "finished": cfg.seed == 5 or frames > 5}
         (folder / "summary.json").write_text(json.dumps(summary))
         return 0 if summary["finished"] else 130
@@ -161,7 +161,7 @@ def test_a_sweep_started_again_does_what_is_left(command, jobs):
     code, out, err = command(*words)
     assert code == 1 and err.startswith("seed=2: ZeroDivisionError") and err.count("\n") == 1
     assert [seed for seed, _ in jobs] == [3, 4, 2]
-    assert [file and file.parts[-2:] for _, file in jobs] == [("1", "checkpoint.zip"), None, None]
+    assert [file and file.parts[-2:] for _, file in jobs] == [("1", "checkpoint.safetensors"), None, None]
     assert "Job 0: skipped, finished before\n" in out and "Job 1: resumed and finished\n" in out
     jobs.clear()
     assert command(*words[:1], "seed=0,3,4", words[2])[0] == 0 and not jobs
@@ -349,7 +349,7 @@ STUDY = ["high=uniform,fixed", "seed=0,-1,1", "total_frames=16384", "checkpoint_
 )
 def test_a_killed_sweep_is_finished_by_the_same_command(tmp_path, launcher):
     jobs = tmp_path / "sweep"
-    kill_once_there(sweep(tmp_path, *STUDY, *launcher), jobs / "2/checkpoint.zip")
+    kill_once_there(sweep(tmp_path, *STUDY, *launcher), jobs / "2/checkpoint.safetensors")
     second = sweep(tmp_path, *STUDY, *launcher)
     out, err = second.communicate(timeout=300)
     assert second.returncode == 2, err
@@ -460,7 +460,7 @@ def test_a_search_with_a_storage_goes_on_when_it_is_started_again(command, monke
     def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn):
         tried.append((folder.name, cfg.low.clip, stopped_at is not None))
         (folder / "config.yaml").write_text(choose_selector(read(cfg)).to_yaml())
-        (folder / "checkpoint.zip").touch()
+        (folder / "checkpoint.safetensors").touch()
         if len(tried) == 3:
             return messages.INTERRUPTED
         if len(tried) == 5:

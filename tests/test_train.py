@@ -25,7 +25,7 @@ from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=32", "steps_per_batch=4", "eval.layouts=20", "total_frames=1024", "eval.every=512"]
-FILES = {"config.yaml", "metrics.csv", "summary.json", "evaluation.npz", "checkpoint.zip", "policy.pt"}
+FILES = {"config.yaml", "metrics.csv", "summary.json", "evaluation.npz", "checkpoint.safetensors", "policy.safetensors"}
 PICTURES = {"learning_curves.png", "trajectories.png", "choices.png"}
 
 
@@ -102,7 +102,7 @@ def test_training_ends_at_the_first_evaluation_that_reaches_the_stop_score(tmp_p
         ("512.0", "2.0"),
         ("1024.0", "3.0"),
     ]
-    assert checkpoint.progress_of(tmp_path / "checkpoint.zip")["frames"] == 1024
+    assert checkpoint.progress_of(tmp_path / "checkpoint.safetensors")["frames"] == 1024
     assert json.loads((tmp_path / "summary.json").read_text())["finished"]
     # Nothing is left to do, unless a higher score is asked for.
     for name, score, frames in (("same", 3.0, 1024), ("higher", next(rising) + 3.0, 1536)):
@@ -188,7 +188,7 @@ def test_a_run_goes_on_in_its_own_folder_with_its_own_rows_before(tmp_path):
     start(tmp_path, "low=random", "high=uniform", "total_frames=512")
     (tmp_path / "summary.json").unlink()
     words = ["low=random", "high=uniform", "total_frames=1024"]
-    file = tmp_path / "checkpoint.zip"
+    file = tmp_path / "checkpoint.safetensors"
     assert run(compose_config([*SMALL, *words]), tmp_path, words, file) == 0
     assert [row["frames"] for row in rows_of(tmp_path)] == ["0.0", "512.0", "1024.0"]
     assert checkpoint.progress_of(file)["config"]["resume"] is None
@@ -219,7 +219,7 @@ def test_a_resumed_run_keeps_its_agent(tmp_path):
 
 
 def test_a_foreign_file_is_no_checkpoint(tmp_path):
-    file = tmp_path / "checkpoint.zip"
+    file = tmp_path / "checkpoint.safetensors"
     file.write_bytes(b"PK\x03\x04 not a checkpoint")
     with pytest.raises(ConfigError, match="not a checkpoint"):
         checkpoint.find(file, "resume")

@@ -60,7 +60,7 @@ def run_cells(folder: Path) -> None:
     assert names["scores"]["score"] > 3.5
     assert names["driver"].evaluate(episodes=100)["success"] > 0.5
     assert names["returns"].mean() > 0.4
-    assert sorted(path.name for path in folder.iterdir()) == ["agent.pt", "runs"]
+    assert sorted(path.name for path in folder.iterdir()) == ["agent.safetensors", "runs"]
 
 
 def run(words: list[str]) -> None:

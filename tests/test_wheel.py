@@ -75,7 +75,7 @@ def test_it_holds_yaml_files_agents_the_page_and_types(wheel):
             name = file.relative_to(ROOT).as_posix()
             assert (name if name.startswith("hpamdp/") else f"hpamdp/{name}") in names
     assert {"hpamdp/py.typed", "hpamdp/__init__.pyi", "hpamdp/conf/config.yaml"} <= names
-    assert {f"hpamdp/agents/{name}/policy.pt" for name in AGENTS} <= names
+    assert {f"hpamdp/agents/{name}/policy.safetensors" for name in AGENTS} <= names
 
 
 def test_its_metadata_are_complete(wheel):

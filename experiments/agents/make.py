@@ -14,9 +14,10 @@ from pathlib import Path
 import torch
 
 from hpamdp.messages import exit_code
+from hpamdp.run.state_file import StateFile, write
 
 ROOT = Path(__file__).resolve().parents[2]
-KEPT = ("policy.pt", "config.yaml", "summary.json")
+KEPT = ("policy.safetensors", "config.yaml", "summary.json")
 # Only training needs the critics, so small ones suffice and make small files.
 SMALL = "low.critic_hidden_dims=[64,64]"
 ONE_BOAT = ["high=none", "low=hppo", SMALL, "total_frames=1000000", "eval.every=250000"]
@@ -78,12 +79,13 @@ def keep(name: str, run: Path) -> None:
     target.mkdir(parents=True, exist_ok=True)
     for file in KEPT:
         shutil.copyfile(run / file, target / file)
-    round_networks(target / "policy.pt")
+    round_networks(target / "policy.safetensors")
 
 
 def round_networks(file: Path) -> None:
     """Store the learners' networks in half precision, for half the size. A selector may hold counts, so it stays."""
-    saved = torch.load(file, weights_only=True)
+    opened = StateFile(file)
+    saved = {name: opened.read(name) for name in opened.names}
     agent = saved["agent"]
     # The same weights have several names, but are in the file once, so they must stay one tensor.
     rounded = {
@@ -94,7 +96,7 @@ def round_networks(file: Path) -> None:
     for name, value in agent.items():
         if isinstance(value, torch.Tensor) and value.data_ptr() in rounded:
             agent[name] = rounded[value.data_ptr()]
-    torch.save(saved, file)
+    write(file, saved)
 
 
 def main(words: list[str]) -> int:

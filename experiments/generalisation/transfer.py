@@ -43,7 +43,7 @@ def scores(name: str, trained_on: str, seed: int) -> Iterator[dict[str, Any]]:
     settings = {"high": None, "seed": seed, "eval.layouts": 250, "progress": False, **LEARNERS[name]}
     agent = hpamdp.train({"name": "boatdock", "controller": trained_on}, **settings)
     with TemporaryDirectory() as folder:
-        file = Path(folder) / "agent.pt"
+        file = Path(folder) / "agent.safetensors"
         agent.save(file)
         for controller in CONTROLLERS:
             loaded = hpamdp.load(file, **{"env.controller": controller})

@@ -16,6 +16,7 @@ import torch
 
 from hpamdp.messages import exit_code
 from hpamdp.run import checkpoint
+from hpamdp.run.state_file import StateFile
 
 COMMON = [
     "num_envs=8", "steps_per_batch=4", "total_frames=2048", "eval.every=512", "eval.layouts=20", "log_every=128",
@@ -38,7 +39,8 @@ def scores(folder: Path) -> list[dict[str, str]]:
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
     """Return the agent's tensors of a run's checkpoint."""
-    return torch.load(folder / "policy.pt", weights_only=True)["agent"]
+    state: dict[str, torch.Tensor] = StateFile(folder / "policy.safetensors").read("agent")
+    return state
 
 
 def is_same(one: Path, other: Path) -> bool:

@@ -190,7 +190,7 @@ class RunConfig(Settings):
     callbacks: Annotated[tuple[str | dict[str, Any], ...], FromList] = ()
     """Callbacks of training, in their order: `[NAME, {name: NAME, SETTING: VALUE, ...}, ...]`."""
     save_best: bool = False
-    """Keep the agent of the best evaluation in best.pt."""
+    """Keep the agent of the best evaluation in best.safetensors."""
     film: bool = True
     """Write episodes.gif, which shows three episodes of the agent's last evaluation."""
 

@@ -195,8 +195,8 @@ class Level:
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, by name.
 
-        Each value is an optimizer, a TorchRL `ReplayBuffer`, or has a `state_dict` of constant names and shapes. If one
-        is a replay buffer, override `replay_rows`, too.
+        Each value is an optimizer, a TorchRL `ReplayBuffer`, or has a `state_dict` of tensors, numbers and text, with
+        constant names and shapes. If one is a replay buffer, override `replay_rows`, too.
         """
         return {}
 

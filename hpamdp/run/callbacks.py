@@ -78,7 +78,7 @@ class Callback:
 class BestAgent(Callback):
     """Keep the agent with the highest score of an evaluation.
 
-    The agent goes to `best.pt` in the run's folder, or stays in memory if the run has no folder.
+    The agent goes to `best.safetensors` in the run's folder, or stays in memory if the run has no folder.
 
     Attributes:
         best_score: score of the kept agent; None before the first evaluation.
@@ -140,7 +140,7 @@ class BestAgent(Callback):
             raise RuntimeError("no agent to restore: there was no evaluation yet")
 
     def state(self) -> dict[str, Any]:
-        """Return the best score. The agent itself is in `best.pt`."""
+        """Return the best score. The agent itself is in `best.safetensors`."""
         return {"best_score": -math.inf if self.best_score is None else self.best_score}
 
     def set_state(self, state: Mapping[str, Any]) -> None:

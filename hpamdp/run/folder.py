@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import traceback
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from hpamdp.config.errors import ConfigError
-from hpamdp.files import read_regular, regular_size, remove_link, replacing
+from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.run_files import (
     BEST_NAME,
     CHECKPOINT_NAME,
@@ -25,20 +24,21 @@ from hpamdp.run_files import (
     EVALUATION_NAME,
     FIGURES_NAME,
     FILM_NAME,
-    MANIFEST_NAME,
     MAX_TEXT_BYTES,
     METRICS_NAME,
+    OLD_NAMES,
     POLICY_NAME,
     SUMMARY_NAME,
     TENSORBOARD_NAME,
     WANDB_NAME,
+    is_saved_agent,
     saved_config,
     saved_summary,
 )
 from hpamdp.shell import path_setting
 
 # The results of a run.
-_MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME, BEST_NAME)
+_MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME, BEST_NAME, *OLD_NAMES)
 _OTHERS = (
     METRICS_NAME,
     f"{METRICS_NAME}.previous",
@@ -120,10 +120,8 @@ def _is_of_a_run(folder: Path) -> bool:
     if {"finished", "frames"} <= saved_summary(folder).keys():
         return True
     try:
-        regular_size(folder / CHECKPOINT_NAME)
-        with zipfile.ZipFile(folder / CHECKPOINT_NAME) as archive:
-            return MANIFEST_NAME in archive.namelist()
-    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):  # missing, or a file of another kind
+        return is_saved_agent(folder / CHECKPOINT_NAME)
+    except OSError:  # missing, or no file
         return False
 
 

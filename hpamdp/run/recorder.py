@@ -30,7 +30,7 @@ from hpamdp.policies.base import Learner
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.loggers import EarlierRun, LenientLogger, Logger
-from hpamdp.run.state_checks import SavedPart, check_columns, check_values, checked
+from hpamdp.run.state_checks import SavedPart, check_like, check_values, checked
 from hpamdp.run.summary import ONE_OPTION, SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight, summarise
 from hpamdp.run_files import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
 
@@ -111,7 +111,7 @@ class Recorder:
     def state(self) -> dict[str, Any]:
         """Return the state that the next row of metrics depends on, for a checkpoint."""
         return {
-            "ended": [dict(ended.items()) for ended in self._ended],
+            "ended": [dict(TensorDict.cat(self._ended).items())] if self._ended else [],
             "scalars": dict(self._scalars),
             "held": dict(self._option_scores),
             "own": dict(self._callback_metrics),
@@ -126,7 +126,7 @@ class Recorder:
         saved = checked(_State, state)
         own = self._results(self.parts.env.fake_tensordict()).to_dict()
         for ended in saved.ended:
-            check_columns("ended", ended, own, any_rows=True)
+            check_like("ended", ended, own, any_rows=True)
             if len({len(column) for column in ended.values()}) > 1:
                 raise ValueError("ended: columns of different lengths")
             for name, column in ended.items():

@@ -113,7 +113,7 @@ class Trainer:
         self.recorder.resume_from(source.parent, frames, log_every)
         try:
             self.recorder.set_state(saved.states["recorder"])
-            self._restore_callbacks(saved.states.get("callbacks", {}))
+            self._restore_callbacks(saved.states["callbacks"])
         except ValueError as error:
             raise ConfigError(f"{source}: does not fit this run ({first_line(error)})") from error
         self._saved = saved
@@ -360,9 +360,9 @@ class Trainer:
             "recorder": self.recorder.state(),
             "callbacks": self._states_of_callbacks,
         }
+        self.save_policy(folder / POLICY_NAME)
         file = folder / checkpoint.FILE_NAME
         checkpoint.save(file, self.parts.agent, states, self.progress(), with_replay=with_replay)
-        self.save_policy(folder / POLICY_NAME)
 
     def save_policy(self, file: Path) -> None:
         """Write the networks, and the scale of the observations, to a file that `hpamdp.load` reads."""

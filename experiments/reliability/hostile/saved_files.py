@@ -1,14 +1,10 @@
-"""Make hostile checkpoints and policies: wrong contents with right checksums, code, links, and huge tensors."""
+"""Make hostile checkpoints and policies: wrong contents with right checksums, code, and links."""
 
 from __future__ import annotations
 
 import copy
-import hashlib
-import io
-import json
 import os
 import random
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +15,7 @@ import torch
 
 from hpamdp.config.compose import compose_words
 from hpamdp.run import train
+from hpamdp.run.state_file import StateFile, write
 
 from .case import ACCEPTED, HARM, SILENT, TRACEBACK, Case
 
@@ -39,7 +36,8 @@ SECRET = "hpamdp-hostile-secret"
 # Files that a run writes; in somebody else's folder, each could be a link to another place.
 WRITTEN = (
     *("summary.json", "config.yaml", "metrics.csv", "metrics.csv.previous", "metrics.csv.draft", "evaluation.npz"),
-    *("checkpoint.zip", "policy.pt", "checkpoint.diverged.zip", "episodes.gif", "trajectories.png", "learning.png"),
+    *("checkpoint.safetensors", "policy.safetensors", "checkpoint.diverged.safetensors"),
+    *("episodes.gif", "trajectories.png", "learning.png"),
     *(".lock", "error.txt", "run.log", ".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml"),
 )
 Members = dict[str, Any]
@@ -58,35 +56,15 @@ def train_agents(folder: Path) -> dict[str, Path]:
 def cases(agents: dict[str, Path], number: int, seed: int) -> Iterator[Case]:
     """Yield `number` cases of changed contents, and all other cases."""
     chance = random.Random(seed)
-    members = {name: _members(folder / "checkpoint.zip") for name, folder in agents.items()}
+    members = {name: _members(folder / "checkpoint.safetensors") for name, folder in agents.items()}
     yield from _changed_contents(agents, members, number, chance)
     yield from _code(agents)
     yield from _links(agents)
-    yield from chance.sample([*_bombs(agents, members)], 30)
 
 
 def _members(file: Path) -> Members:
-    with zipfile.ZipFile(file) as archive:
-        members: Members = {"manifest": json.loads(archive.read("manifest.json"))}
-        for name in members["manifest"]["members"]:
-            members[name] = torch.load(io.BytesIO(archive.read(f"{name}.pt")), weights_only=True)
-    return members
-
-
-def _write(members: Members, file: Path, compression: int = zipfile.ZIP_STORED) -> None:
-    """Write a checkpoint with the checksums of its contents."""
-    manifest = copy.deepcopy(members["manifest"])
-    with zipfile.ZipFile(file, "w", compression) as archive:
-        for name, state in members.items():
-            if name == "manifest":
-                continue
-            stream = io.BytesIO()
-            torch.save(state, stream)
-            data = stream.getvalue()
-            if isinstance(manifest, dict) and isinstance(manifest.get("members"), dict) and name in manifest["members"]:
-                manifest["members"][name] = hashlib.sha256(data).hexdigest()
-            archive.writestr(f"{name}.pt", data)
-        archive.writestr("manifest.json", json.dumps(manifest))
+    opened = StateFile(file)
+    return {name: opened.read(name) for name in opened.names}
 
 
 # Each function returns the new value, or raises LookupError if the change does not apply to the value.
@@ -129,8 +107,6 @@ CHANGES: list[tuple[str, Callable[[Any], Any], bool]] = [
     ("a tensor is empty", lambda v: _shaped(v, lambda t: t.reshape(-1)[:0].clone()), True),
     ("a tensor has another dtype", lambda v: _shaped(v, _of_another_dtype), True),
     ("a tensor is complex", lambda v: _shaped(v, lambda t: t.to(torch.complex64)), True),
-    ("a tensor is sparse", lambda v: _shaped(v, lambda t: t.float().reshape(1, -1).to_sparse()), True),
-    ("a tensor is expanded", lambda v: _shaped(v, lambda t: torch.zeros(1, dtype=t.dtype).expand(10**9)), True),
     ("a tensor is a list", lambda v: _shaped(v, lambda t: t.reshape(-1)[:5].tolist()), True),
     ("a tensor is None", lambda v: _shaped(v, lambda t: None), True),
     ("a tensor is a word", lambda v: _shaped(v, lambda t: "weights"), True),
@@ -185,9 +161,11 @@ def _changed_contents(
     made = 0
     while made < number:
         agent = chance.choice([*agents])
-        member = chance.choice([*members[agent], "manifest", "recorder", "rng", "collection"])
+        member = chance.choice([*members[agent], "progress", "recorder", "rng", "collection"])
+        if member == "format":
+            continue
         path = chance.choice([*_places(members[agent][member])])
-        if (member == "manifest" and path[:2] == ("progress", "config")) or path[:1] == ("members",):
+        if member == "progress" and path[:1] == ("config",):
             continue  # the config has separate cases
         name, change, is_wrong = chance.choice([*CHANGES, ("an entry is missing", _delete, False)])
         try:
@@ -196,8 +174,6 @@ def _changed_contents(
             else:
                 state = _changed(members[agent][member], path, change)
         except LookupError:
-            continue
-        if member == "manifest" and not _is_json(state):
             continue
         made += 1
         # An evaluation may ignore entries that only training needs.
@@ -210,14 +186,6 @@ def _changed_contents(
             _Resume(agents[agent], way, {**members[agent], member: state}),
             must_be_refused=is_wrong,
         )
-
-
-def _is_json(state: Any) -> bool:
-    try:
-        json.dumps(state)
-    except TypeError:
-        return False
-    return True
 
 
 def _delete(value: Any) -> Any:
@@ -242,8 +210,8 @@ class _Resume:
     members: Members
 
     def __call__(self, folder: Path) -> str:
-        _write(self.members, folder / "checkpoint.zip")
-        words = [f"{self.way}={folder / 'checkpoint.zip'}", "eval.layouts=2", "total_frames=320"]
+        write(folder / "checkpoint.safetensors", self.members)
+        words = [f"{self.way}={folder / 'checkpoint.safetensors'}", "eval.layouts=2", "total_frames=320"]
         if self.way == "checkpoint":
             words = ["mode=eval", *words[:2]]
         code = train.run(compose_words(words), folder / "out", words)
@@ -264,9 +232,13 @@ CODE = {
 def _code(agents: dict[str, Path]) -> Iterator[Case]:
     """Yield files whose config names code, secrets or other files, for every way to open them."""
     changes = [*_strange_groups(), *_strange_settings()]
-    ways = [(way, name) for way in ("eval", "watch", "low.checkpoint") for name in ("checkpoint.zip", "policy.pt")]
+    ways = [
+        (way, name)
+        for way in ("eval", "watch", "low.checkpoint")
+        for name in ("checkpoint.safetensors", "policy.safetensors")
+    ]
     for what, change in changes:
-        for way, name in [*ways, ("resume", "checkpoint.zip")]:
+        for way, name in [*ways, ("resume", "checkpoint.safetensors")]:
             yield Case(
                 "code and secrets in a config",
                 f"{way} {name}: {what}",
@@ -349,15 +321,9 @@ class _OpenConfig:
         (folder / "run" / "canary.py").write_text(CANARY.replace("{file!r}", repr(str(folder / "executed"))))
         os.environ["SECRET"] = SECRET
         file = folder / self.name
-        if self.name == "policy.pt":
-            policy = torch.load(self.agent / self.name, weights_only=True)
-            progress = json.loads(policy["progress"])
-            self.change(progress["config"])
-            torch.save({**policy, "progress": json.dumps(progress)}, file)
-        else:
-            members = _members(self.agent / "checkpoint.zip")
-            self.change(members["manifest"]["progress"]["config"])
-            _write(members, file)
+        members = _members(self.agent / self.name)
+        self.change(members["progress"]["config"])
+        write(file, members)
         words = {
             "eval": ["mode=eval", f"checkpoint={file}", "eval.layouts=2"],
             "resume": [f"resume={file}", "total_frames=320", "eval.layouts=2"],
@@ -425,44 +391,3 @@ class _Linked:
         if any("Traceback" in line for line in ending.errors):
             return f"{TRACEBACK}: {ending.errors[-1][:150]}"
         return ACCEPTED
-
-
-def _bombs(agents: dict[str, Path], members: dict[str, Members]) -> Iterator[Case]:
-    """Yield small files that claim much memory."""
-    for agent, state in members.items():
-        for member in state:
-            if member == "manifest":
-                continue
-            for name in BOMBS:
-                yield Case("bombs", f"{agent}: {member}: {name}", _Bomb(agents[agent], state, member, name))
-
-
-BOMBS: dict[str, Callable[[], torch.Tensor]] = {
-    "zeros, compressed": lambda: torch.zeros(3 * 10**8),
-    "expanded": lambda: torch.zeros(1).expand(4 * 10**9),
-    "many rows, expanded": lambda: torch.zeros(1, 8).expand(5 * 10**8, 8),
-}
-
-
-@dataclass(frozen=True)
-class _Bomb:
-    """Resume from a file in which one member has a large tensor."""
-
-    agent: Path
-    members: Members
-    member: str
-    name: str
-
-    def __call__(self, folder: Path) -> str:
-        # Another process writes the file, so that its memory does not count.
-        writer = os.fork()
-        if writer == 0:
-            state, value = self.members[self.member], BOMBS[self.name]()
-            changed = {**state, "extra": value} if isinstance(state, dict) else {"extra": value}
-            compression = zipfile.ZIP_DEFLATED if "compressed" in self.name else zipfile.ZIP_STORED
-            _write({**self.members, self.member: changed}, folder / "checkpoint.zip", compression)
-            os._exit(0)
-        os.waitpid(writer, 0)
-        words = [f"resume={folder / 'checkpoint.zip'}", "eval.layouts=2", "total_frames=320"]
-        code = train.run(compose_words(words), folder / "out", words)
-        return f"{SILENT}: exit code {code}" if code else ACCEPTED

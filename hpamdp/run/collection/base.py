@@ -15,7 +15,7 @@ from hpamdp import keys
 from hpamdp.cards import CollectorCard
 from hpamdp.policies.stored_rows import check_choices
 from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.state_checks import SavedPart, check_columns, check_generator, checked, example_steps
+from hpamdp.run.state_checks import SavedPart, check_generator, check_like, checked, example_steps
 
 
 class CollectionState(SavedPart):
@@ -50,7 +50,7 @@ def checked_state(saved: Any, parts: AssembledRun) -> CollectionState:
                     f"num_envs={env.num_envs}: the state is of {sizes.pop()} environments; leave num_envs out when you "
                     "resume"
                 )
-        check_columns("env", state.env, own)
+        check_like("env", state.env, own)
         env.check_env_state(state.env)
         if env.keeps_episodes and state.root is None:
             raise ValueError("root is missing, from which the episodes in env continue")
@@ -81,7 +81,7 @@ def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, 
     own = example.to_dict()
     if "collector" in saved:  # TorchRL's numbers of trajectories
         own["collector"] = {"traj_ids": example.get(keys.DONE).squeeze(-1).long()}
-    check_columns(where, saved, own)
+    check_like(where, saved, own)
     steps = TensorDict(saved)
     for key in parts.env.fake_tensordict().keys(include_nested=True, leaves_only=True):
         value = steps.get(key, None)
