@@ -439,21 +439,6 @@ def test_a_missing_argument_of_an_environment_is_named_as_no_value(tmp_path, com
     assert code == 2 and "with env.kwargs.is_wrong=true for no value;" in err
 
 
-def test_jobs_whose_folder_cannot_be_made_are_named_and_the_others_run(tmp_path, command, capsys):
-    folder = tmp_path / "sweep"
-    folder.mkdir()
-    (folder / "seed0").write_text("a file of this name")
-    (folder / "seed2").symlink_to(folder / "nowhere/at/all")
-    capsys.readouterr()
-    words = ["-m", *TINY, "film=false", "seed=0,1,2", "hydra.sweep.dir=sweep", "hydra.sweep.subdir=seed${seed}"]
-    for state in ("1 finished", "1 skipped, finished before"):
-        code, out, err = command(*words)
-        named = [line for line in err.splitlines() if "(sweep/" in line]
-        assert code == 1 and len(named) == 2 and all("its folder cannot be made" in line for line in named)
-        assert f"3 jobs: 2 failed; {state}\n" in out and "Traceback" not in err
-    assert (folder / "seed0").read_text() == "a file of this name"
-
-
 def test_a_job_that_was_finished_by_hand_counts_as_finished_in_its_sweep(tmp_path, command):
     words = ["-m", *TINY, "film=false", "checkpoint_every=96", "seed=0", "hydra.sweep.dir=sweep"]
     with pytest.MonkeyPatch.context() as patch:

@@ -6,9 +6,9 @@ import warnings
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from hpamdp.config.errors import ConfigError
 from hpamdp.messages import first_line
@@ -63,6 +63,12 @@ def first_job_of_search(config: DictConfig) -> int | None:
     return first
 
 
+def has_numbered_folders(config: DictConfig) -> bool:
+    """Return whether the folder of a sweep's job is named after the job's number."""
+    settings: Any = OmegaConf.to_container(config.hydra.sweep, resolve=False)
+    return settings["subdir"] == "${hydra.job.num}"
+
+
 def _load(config: DictConfig) -> Study:
     """Load the study from the storage, or create it. By default, its name is the sweep's folder."""
     import optuna
@@ -91,7 +97,7 @@ def _load(config: DictConfig) -> Study:
 def _move(config: DictConfig, before: int, now: int) -> None:
     """Rename a trial's folder to its new number, unless a process uses it, so that the job finds its checkpoint."""
     sweep = config.hydra.sweep
-    if sweep._get_node("subdir")._value() != "${hydra.job.num}":
+    if not has_numbered_folders(config):
         return
     old, new = (Path(sweep.dir, str(number)) for number in (before, now))
     if old.is_dir() and not new.exists():

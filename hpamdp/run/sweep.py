@@ -17,11 +17,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from hydra.core.config_loader import ConfigLoader
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf
 
 from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError
@@ -29,7 +27,7 @@ from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, MISTAKE, one_line, reason_of, say, warn
 from hpamdp.run.folder import check_no_link, has_foreign_error, is_about_folder, locked, remove_error, write_error
-from hpamdp.run.search import first_job_of_search
+from hpamdp.run.search import first_job_of_search, has_numbered_folders
 from hpamdp.run.stopping import exits_explained, pass_on_signal
 from hpamdp.run_files import ERROR_NAME, MAX_TEXT_BYTES, saved_summary
 from hpamdp.shell import path_setting
@@ -57,7 +55,7 @@ class SweepFolderCallback(Callback):
         _check_fixed(config, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Remember the sweep's folder, and leave the folders of the jobs to `run_job`."""
+        """Remember the sweep's folder, and refuse what no sweep can do."""
         _check_output_subdir(config)
         _check_effects(config, _OF_RUNS, "has no effect on a sweep; give hydra.sweep.dir")
         _check_fixed(config, "hydra.sweep.dir")
@@ -73,9 +71,8 @@ class SweepFolderCallback(Callback):
                 f"{SweepFolderCallback.path}: this search has all of its trials; set hydra.sweeper.n_trials to add some"
             )
             sys.exit(0)
-        hydra = GlobalHydra.instance().hydra
-        assert hydra is not None
-        _compose_jobs_without_folders(hydra.config_loader, first_job)
+        if first_job and has_numbered_folders(config):  # the words of the sweep are words of its jobs, too
+            config.hydra.overrides.hydra.append(f"+hydra.sweep.first_job={first_job}")
 
 
 def _check_effects(config: DictConfig, settings: tuple[str, ...], effect: str) -> None:
@@ -88,8 +85,8 @@ def _check_effects(config: DictConfig, settings: tuple[str, ...], effect: str) -
 
 def _check_fixed(config: DictConfig, name: str) -> None:
     """Exit if `resume=auto` would never find the run again, because each start makes a folder of its own."""
-    folder = OmegaConf.select(config, name.rpartition(".")[0])._get_node("dir")._value()
-    if config.resume == RESUME_AUTO and "${now:" in str(folder):
+    settings: Any = OmegaConf.to_container(OmegaConf.select(config, name.rpartition(".")[0]), resolve=False)
+    if config.resume == RESUME_AUTO and "${now:" in str(settings["dir"]):
         warn(f"resume=auto: goes on with the run in a folder, so give {name}")
         sys.exit(MISTAKE)
 
@@ -128,44 +125,16 @@ def _check_output_subdir(config: DictConfig) -> None:
         sys.exit(MISTAKE)
 
 
-def _compose_jobs_without_folders(loader: ConfigLoader, first_job: int) -> None:
-    """Make Hydra compose the configs of jobs without creating their folders.
-
-    Hydra ends the whole sweep if it cannot create the folder of one job. `run_job` creates it instead.
-
-    Args:
-        loader: the loader that composes the configs.
-        first_job: number of the first job; not 0 if a search is continued.
-    """
-    # Launchers send the loader to other processes, so the function must be picklable.
-    loader.load_sweep_config = functools.partial(_job_config, loader, first_job)  # type: ignore[method-assign]
-
-
-def _job_config(
-    loader: ConfigLoader, first_job: int, master_config: DictConfig, sweep_overrides: list[str]
-) -> DictConfig:
-    """Return a job's config, with its folder inside the sweep's folder as `hydra.sweep.job_subdir`."""
-    config = type(loader).load_sweep_config(loader, master_config, sweep_overrides)
-    with open_dict(config.hydra.sweep):
-        config.hydra.sweep.job_subdir = config.hydra.sweep._get_node("subdir")._value()
-        config.hydra.sweep.first_job = first_job
-    config.hydra.sweep.subdir = "."
-    config.hydra.output_subdir = None
-    return config
-
-
-def _job_folder() -> Path:
-    """Return the current job's folder, and write the folder and the job's number into Hydra's settings."""
+def _job_folder() -> tuple[Path, int]:
+    """Return the current job's folder and number, which a search counts on from its earlier starts."""
     hydra: Any = HydraConfig.get()
-    root = hydra._get_root()  # the folder's name is resolved in it
-    number = hydra.job.num + hydra.sweep.first_job
-    for settings in (root.hydra, hydra):
-        with read_write(settings):
-            settings.job.num = number
-    folder = Path(os.path.abspath(Path(hydra.sweep.dir, str(root.hydra.sweep.job_subdir))))
-    with read_write(hydra):
-        hydra.runtime.output_dir = str(folder)
-    return folder
+    folder, first_job = Path(hydra.runtime.output_dir), hydra.sweep.get("first_job")
+    if first_job is None:
+        return folder, hydra.job.num
+    with suppress(OSError):
+        folder.rmdir()  # Hydra made it; it stays if it is not empty
+    number = hydra.job.num + first_job
+    return folder.with_name(str(number)), number
 
 
 @dataclass
@@ -224,10 +193,10 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     Raises:
         SystemExit: the user stopped it.
     """
-    folder = _job_folder()
+    folder, number = _job_folder()
     hydra = HydraConfig.get()
     overrides = job_overrides()
-    job = Job(hydra.job.num, " ".join(overrides), str(folder))
+    job = Job(number, " ".join(overrides), str(folder))
     records = Records(Path(hydra.runtime.cwd, hydra.sweep.dir), start)
     if hydra.runtime.choices["hydra/launcher"] != "basic":
         os.environ.setdefault("TQDM_DISABLE", "1")  # the bars of jobs side by side overwrite each other
