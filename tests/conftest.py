@@ -1,6 +1,5 @@
 """What the tests share."""
 
-import copy
 import gc
 import math
 import multiprocessing
@@ -20,16 +19,11 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from hydra._internal import defaults_list
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.config_repository import CachingConfigRepository, ConfigRepository
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.object_type import ObjectType
-from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig
 
 from hpamdp.cli import main
+from hpamdp.config.command_line import search_word
 from hpamdp.config.compose import read
 from hpamdp.config.schema import Config
 from hpamdp.data.human import released_file
@@ -55,7 +49,7 @@ CROSSING = Path(__file__).resolve().parent.parent / "examples" / "crossing"
 sys.path.insert(0, str(CROSSING))
 # The folders of the tests' own yaml files and of that of the example, and the word that adds them.
 OWN_FOLDERS = (Path(__file__).resolve().parent / "conf", CROSSING / "conf")
-OWN = f"hydra.searchpath=[{','.join(f'file://{folder}' for folder in OWN_FOLDERS)}]"
+OWN = search_word([*map(str, OWN_FOLDERS)])
 
 
 def assert_same(one: object, other: object, where: str = "") -> None:
@@ -111,95 +105,6 @@ def _composed(*overrides: str) -> bytes:
     """Compose the words of each test once."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return pickle.dumps(compose("config", [*overrides], return_hydra_config=True))
-
-
-@pytest.fixture(scope="session", autouse=True)
-def yaml_files_read_once() -> Iterator[None]:
-    """Have Hydra read, list and merge the project's own yaml files once for the same choices.
-
-    A composition takes longer than most tests. Hydra applies the values of a test's words each time. Files in other
-    folders may change, so they are read each time.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ConfigRepository, "load_config", _read_once(ConfigRepository.load_config))
-        # Each composition copies a repository, to give the copy other sources. It need not copy the sources themselves.
-        patch.setattr(ConfigRepository, "__deepcopy__", lambda repo, memo: copy.copy(repo), raising=False)
-        patch.setattr(defaults_list, "_create_defaults_list", _listed_once(defaults_list._create_defaults_list))
-        patch.setattr(defaults_list, "_create_interpolation_map", _if_needed(defaults_list._create_interpolation_map))
-        merge = ConfigLoaderImpl._compose_config_from_defaults_list
-        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", _merged_once(merge))
-        yield
-
-
-# The places of the project's own yaml files, as Hydra's sources name them.
-_OWN_PLACES = {"hydra.conf", "", *map(str, (CONF, *OWN_FOLDERS))}
-
-
-def _places_of(repository: CachingConfigRepository) -> tuple[tuple[str, ...], str]:
-    """Return the places that Hydra searches, and what Python code has stored beside them."""
-    stored = {group: names for group, names in ConfigStore.instance().repo.items() if group != "hydra"}
-    return tuple(source.path for source in repository.get_sources()), repr(stored)
-
-
-def _read_once(read):
-    files: dict[object, ConfigResult | None] = {}
-
-    def read_once(repository, config_path):
-        source = repository._find_object_source(config_path, ObjectType.CONFIG)
-        if source is None or source.scheme() == "structured" or source.path not in _OWN_PLACES:
-            return read(repository, config_path)
-        if (source.path, config_path) not in files:
-            files[source.path, config_path] = read(repository, config_path)
-        return files[source.path, config_path]
-
-    return read_once
-
-
-def _listed_once(list_defaults):
-    listed: dict[object, tuple[object, dict[str, object]]] = {}
-
-    def list_once(repo, config_name, overrides, prepend_hydra, skip_missing):
-        choices = repr((overrides.override_choices, overrides.append_group_defaults, overrides.deletions))
-        places, stored = _places_of(repo)
-        given = (places, stored, config_name, choices, prepend_hydra, skip_missing)
-        if given not in listed:
-            defaults = list_defaults(repo, config_name, overrides, prepend_hydra, skip_missing)
-            if not _OWN_PLACES.issuperset(places):
-                return defaults
-            found = {name: value for name, value in vars(overrides).items() if name != "config_overrides"}
-            listed[given] = defaults, found  # the other words of a command line differ from test to test
-        defaults, found = listed[given]
-        vars(overrides).update(found)
-        return defaults
-
-    return list_once
-
-
-def _if_needed(make_map):
-    """Have Hydra collect all choices only for a defaults list that refers to one, not for each file."""
-
-    def make_if_needed(overrides, defaults, self_added):
-        return make_map(overrides, defaults, self_added) if any(each.is_interpolation() for each in defaults) else None
-
-    return make_if_needed
-
-
-def _merged_once(merge):
-    merged: dict[object, bytes] = {}
-
-    def merge_once(loader, defaults, repo):
-        places, stored = _places_of(repo)
-        given = (places, stored, repr(defaults))
-        if given not in merged:
-            own = copy.copy(repo)
-            own.cache = pickle.loads(pickle.dumps(repo.cache))  # the merge changes what it holds
-            config = merge(loader, defaults, own)
-            if not _OWN_PLACES.issuperset(places):
-                return config
-            merged[given] = pickle.dumps(config)
-        return pickle.loads(merged[given])  # five times as fast as a deep copy
-
-    return merge_once
 
 
 def make_config(overrides: Sequence[str]) -> Config:

@@ -5,10 +5,10 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+import hydra
 import pytest
 import yaml
 from conftest import SIMULATORS, choices, compose_config, make_config
-from hydra._internal.hydra import Hydra
 
 import hpamdp
 from hpamdp.config.errors import ConfigError
@@ -95,8 +95,8 @@ def test_the_file_of_an_agent_has_todays_form_which_loads_without_further_compos
     assert progress["config"] == config_of(name) == upgraded(progress["config"])
     skip_without_simulator(name)
     composing: list[object] = []
-    compose = Hydra.compose_config
-    monkeypatch.setattr(Hydra, "compose_config", lambda *args, **kw: composing.append(args) or compose(*args, **kw))
+    compose = hydra.compose
+    monkeypatch.setattr(hydra, "compose", lambda *args, **kw: composing.append(args) or compose(*args, **kw))
     hpamdp.load(name)
     assert len(composing) == 2
 

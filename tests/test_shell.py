@@ -10,14 +10,11 @@ from pathlib import Path
 
 import pytest
 from conftest import CONF, forked
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
-from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import QuotedString
 from omegaconf import OmegaConf
 
 from hpamdp import cli
-from hpamdp.config.yaml_files import complete_yaml_files
 from hpamdp.files import replacing
 from hpamdp.messages import exit_code, say
 from hpamdp.run import train
@@ -210,12 +207,6 @@ def test_no_file_of_the_working_directory_takes_the_place_of_a_package_in_worker
     command = [sys.executable, "-m", "hpamdp", *words, *small]
     done = subprocess.run(command, cwd=hostile, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def test_a_launchers_worker_that_registers_hydras_reader_again_keeps_ours():
-    complete_yaml_files()
-    SourcesRegistry.instance().register(FileConfigSource)
-    assert hasattr(SourcesRegistry.instance().resolve("file"), "load_alone")
 
 
 def test_a_clone_stays_first_where_python_looks_for_modules(monkeypatch, tmp_path):

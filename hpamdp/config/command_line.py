@@ -24,10 +24,13 @@ from hpamdp.config.components import CALLBACK, GROUPS
 from hpamdp.config.compose import beginning_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO, RunConfig
+from hpamdp.config.yaml_files import completed_path
 from hpamdp.messages import first_line
-from hpamdp.shell import setting
+from hpamdp.shell import for_hydra, setting
 
 GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
+# The setting that adds folders of yaml files.
+SEARCH_PATH = "hydra.searchpath"
 _SAVED_RUNS = ("resume", "checkpoint", "low.checkpoint")
 # Flags of Hydra, with their short forms and their arguments for argparse.
 _SWITCH: dict[str, Any] = {"action": "store_true"}
@@ -92,11 +95,7 @@ class CommandLine:
     @property
     def search_path(self) -> list[str]:
         """The word that adds the command line's own folders of yaml files, if it has any."""
-        given = self.given().get("hydra.searchpath")
-        if given is not None:
-            return [given.input_line or ""]
-        folder = self.flags["config-dir"]
-        return [] if folder is None else [f"hydra.searchpath=['{Path(folder).absolute()}']"]
+        return [word for word in self.words if word.startswith(f"{SEARCH_PATH}=")]
 
     def with_words(self, words: Sequence[str]) -> CommandLine:
         """Return the command line with more words in front of its settings."""
@@ -124,7 +123,43 @@ def parse(argv: Sequence[str], conf: Path) -> CommandLine:
         _refuse("--resolve goes with --cfg only")
     line = CommandLine(flags, _parsed(words))
     _check_groups(line, conf)
-    return line
+    return _with_completed_folders(line)
+
+
+def _with_completed_folders(line: CommandLine) -> CommandLine:
+    """Have Hydra add the default settings of classes to the yaml files of the command line's own folders.
+
+    Raises:
+        ConfigError: the folder of `--config-dir` does not exist.
+    """
+    folder, given = line.flags["config-dir"], line.given().get(SEARCH_PATH)
+    paths = [] if given is None else given.value()
+    if (folder is None and given is None) or not isinstance(paths, list) or not all(isinstance(p, str) for p in paths):
+        return line  # Hydra reports a wrong value
+    if folder is not None:
+        paths = [folder_path(folder, "--config-dir"), *paths]
+    others = [word for word, override in zip(line.words, line.overrides, strict=True) if override is not given]
+    return CommandLine({**line.flags, "config-dir": None}, _parsed([search_word(paths), *others]))
+
+
+def folder_path(folder: str | Path, where: str) -> str:
+    """Return the path of a folder of yaml files for Hydra.
+
+    Args:
+        folder: the folder.
+        where: the argument or flag that names it, for the error.
+
+    Raises:
+        ConfigError: the folder does not exist.
+    """
+    if not os.path.isdir(folder):
+        raise ConfigError(f"{where}: there is no folder {folder}")
+    return completed_path(str(Path(folder).resolve()))
+
+
+def search_word(paths: Sequence[str]) -> str:
+    """Return the word that adds folders of yaml files."""
+    return f"{SEARCH_PATH}=[{','.join(for_hydra(completed_path(path)) for path in paths)}]"
 
 
 def _parser() -> argparse.ArgumentParser:

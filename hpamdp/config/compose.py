@@ -20,7 +20,7 @@ from hpamdp.complaints import as_json, no_such
 from hpamdp.config.components import CALLBACK, GROUPS, TARGET, PlaceOf, file_of
 from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.schema import Config, RunConfig, check_run, checked_config
-from hpamdp.config.yaml_files import complete_yaml_files
+from hpamdp.config.yaml_files import SCHEME
 from hpamdp.messages import first_line
 
 NESTED = "a yaml file names itself among its defaults, or a value nests too deep"
@@ -38,8 +38,6 @@ _NOT_PER_OPTION = {
     "freeze": "all learners are frozen or none; set low.freeze",
     "per_option": "an option has one learner",
 }
-
-complete_yaml_files()
 
 
 def conf_dir() -> Path:
@@ -141,7 +139,7 @@ def searched_folders(node: Any) -> tuple[str, ...]:
         node: the config's `hydra` part.
     """
     added = [each for each in node.runtime.config_sources if each.provider not in ("hydra", "main", "schema")]
-    return tuple(str(Path(each.path).absolute()) for each in added if each.schema == "file")
+    return tuple(str(Path(each.path).absolute()) for each in added if each.schema in ("file", SCHEME))
 
 
 def _check_found(node: Any, names: Mapping[str, str]) -> None:
@@ -153,8 +151,8 @@ def _check_found(node: Any, names: Mapping[str, str]) -> None:
     """
     for path in node.searchpath:
         scheme, _, folder = str(path).rpartition("://")
-        if scheme in ("", "file") and not Path(folder).is_dir():
-            raise ConfigError(f"hydra.searchpath={path}: there is no such folder")
+        if scheme in ("", "file", SCHEME) and not Path(folder).is_dir():
+            raise ConfigError(f"hydra.searchpath={folder}: there is no such folder")
     env = names["env"]
     own_recipes = {
         RECIPE: f"{env}_{names['low']}",

@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hpamdp.config.command_line import CommandLine, parse
+from hpamdp.config.command_line import CommandLine, folder_path, parse, search_word
 from hpamdp.config.components import (
     GROUPS,
     SUPPLIED_ARGUMENTS,
@@ -202,11 +202,7 @@ def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list
         folders = [folders]
     if not isinstance(folders, list | tuple) or not all(isinstance(each, str | Path) and str(each) for each in folders):
         raise ConfigError(f"{where}={as_code(folders)}: must be a list of folders")
-    missing = [folder for folder in folders if not Path(folder).is_dir()]
-    if missing:
-        raise ConfigError(f"{where}: there is no folder {missing[0]}")
-    paths = [f"file://{Path(folder).resolve()}" for folder in folders]
-    return [word("hydra.searchpath", paths)] if paths else []
+    return [search_word([folder_path(folder, where) for folder in folders])] if folders else []
 
 
 def choosing_class(group: str, cls: type) -> str:

@@ -1,12 +1,19 @@
-"""Add the default settings of their classes to yaml files when Hydra reads them."""
+"""Give Hydra the yaml files of a folder together with the default settings of their classes.
+
+The composed config then has all settings. The command line can override them, `--cfg job` shows them, and other yaml
+files can refer to them. Importing this module registers two plugins with Hydra: a source of configs for paths with the
+scheme `hpamdp`, and a search path that reads the folder of the main config from this source.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
-from omegaconf import DictConfig, Node, OmegaConf
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
 
 from hpamdp.config.components import (
     CALLBACK,
@@ -18,26 +25,45 @@ from hpamdp.config.components import (
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RunConfig
 
-
-def complete_yaml_files() -> None:
-    """Have Hydra's reader add the defaults of missing settings.
-
-    The composed config then has all settings. The command line can override them, `--cfg job` shows them, and other
-    yaml files can refer to them.
-    """
-    readers: list[Any] = [each for each in Plugins.instance().discover(ConfigSource) if each.scheme() == "file"]  # type: ignore[attr-defined]
-    for reader in readers:
-        if not hasattr(reader, "load_alone"):
-            reader.load_alone = reader.load_config
-            reader.load_config = _load_complete
+SCHEME = "hpamdp"
+_plugins = Plugins.instance()
+# Hydra's own source of yaml files in a folder.
+_FileSource: Any = next(each for each in _plugins.discover(ConfigSource) if each.scheme() == "file")  # type: ignore[attr-defined]
 
 
-def _load_complete(reader: Any, config_path: str) -> ConfigResult:
-    """Read a yaml file; replaces the method `load_config` of Hydra's reader."""
-    result: ConfigResult = reader.load_alone(config_path)
-    if isinstance(result.config, DictConfig):
-        result.config = OmegaConf.merge(_defaults(config_path, result.config), result.config)
-    return result
+class CompletedFiles(_FileSource):
+    """The yaml files of a folder, completed by the default settings of their classes."""
+
+    @staticmethod
+    def scheme() -> str:
+        """Return what precedes `://` in paths of this source."""
+        return SCHEME
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Read a yaml file, and add the settings that it does not give."""
+        result: ConfigResult = super().load_config(config_path)
+        if isinstance(result.config, DictConfig):
+            result.config = OmegaConf.merge(_defaults(config_path, result.config), result.config)
+        return result
+
+
+class CompletedMain(SearchPathPlugin):
+    """Reads the folder of the main config with the default settings of classes."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Change the scheme of the main folder's path."""
+        for each in search_path.get_path():
+            if each.provider == "main":
+                each.path = completed_path(each.path)
+
+
+_plugins.register(CompletedFiles)
+_plugins.register(CompletedMain)
+
+
+def completed_path(path: str) -> str:
+    """Return the path of a folder, with or without `file://`, such that Hydra adds the default settings of classes."""
+    return path if "://" in path.removeprefix("file://") else f"{SCHEME}://{path.removeprefix('file://')}"
 
 
 def _defaults(config_path: str, cfg: DictConfig) -> dict[str, Any]:
@@ -45,10 +71,11 @@ def _defaults(config_path: str, cfg: DictConfig) -> dict[str, Any]:
     if config_path.removesuffix(".yaml") == "config":
         return defaults_of(RunConfig)
     group = config_path.partition("/")[0]
-    target = cfg._get_node(TARGET) if group in (*GROUPS, CALLBACK) else None  # as it is written, not resolved
-    if not isinstance(target, Node) or not isinstance(target._value(), str):
+    written: Any = OmegaConf.to_container(cfg, resolve=False)
+    target = written.get(TARGET) if group in (*GROUPS, CALLBACK) else None
+    if not isinstance(target, str):
         return {}
     try:
-        return defaults_of(model_of(target._value(), group))
+        return defaults_of(model_of(target, group))
     except ConfigError:  # which the check of the config raises again, with the name of the file
         return {}
