@@ -23,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from hpamdp.config.command_line import CommandLine, completed, parse
+from hpamdp.config.command_line import CommandLine, completed, parse, saved_run
 from hpamdp.config.compose import conf_dir, job_overrides, read
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import explained, not_understood
@@ -184,7 +184,7 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
 
     protect_children()
     try:
-        line = completed(line, conf)
+        line = completed(_with_saved_choices(line), conf)
         sys.argv[1:] = line.argv()  # which Hydra parses
         hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()
     except (Exception, KeyboardInterrupt, SystemExit) as error:
@@ -208,6 +208,16 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         sys.exit(sweep.report(start))
     if line.is_multirun:
         raise ConfigError(f"{' '.join(line.words)}: no job to run; give every swept setting a value")
+
+
+def _with_saved_choices(line: CommandLine) -> CommandLine:
+    """Return the command line with the choices of the saved run that it names, if there is one."""
+    saved = saved_run(line)
+    if saved is None:
+        return line
+    from hpamdp.run.resume import saved_words  # takes seconds, which other commands need not wait for
+
+    return line.with_words(saved_words(*saved, line.words))
 
 
 def _run_job(cfg: DictConfig, start: str) -> float | None:
@@ -260,13 +270,14 @@ def _go_on(cfg: DictConfig, output_dir: Path) -> int:
 
     cfg.resume = None
     words = job_overrides()
-    score, source = rest_of(resolve(cfg, words)[0], output_dir, f"resume=auto: {output_dir}")
+    config, start = resolve(cfg, words)
+    score, source = rest_of(config, output_dir, f"resume=auto: {output_dir}")
     if score is not None:
         say(f"{output_dir}: this run is finished, with score {score:.3f}")
         return 0
     if source is not None:
         say(f"Going on from {source}")
-    return train.run(cfg, output_dir, words, source, may_overwrite=True)
+    return train.run(cfg, output_dir, words, source or start, config=config, may_overwrite=True)
 
 
 def _refuse_early(cfg: DictConfig) -> None:

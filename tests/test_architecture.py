@@ -149,6 +149,16 @@ def test_the_data_knows_the_environments_and_nobody_below_knows_the_data():
     assert not importers("hpamdp.data", inside="hpamdp.env") | importers("hpamdp.data", inside="hpamdp.policies")
 
 
+def test_no_rooms_know_each_other_in_a_circle_also_within_functions():
+    rooms = {module.split(".")[1] for module in FILES if module.count(".") > 1}
+    assert {"api", "config", "env", "policies", "run"} <= rooms
+    knows = {one: {room for room in rooms - {one} if importers(f"hpamdp.{room}", f"hpamdp.{one}")} for one in rooms}
+    while free := [room for room, known in knows.items() if not known & knows.keys()]:
+        for room in free:
+            del knows[room]
+    assert not knows
+
+
 def test_environments_and_policies_know_nothing_of_a_run():
     for room in ("hpamdp.run", "hpamdp.config", "hpamdp.cli"):
         assert not importers(room, inside="hpamdp.env") | importers(room, inside="hpamdp.policies")

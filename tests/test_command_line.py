@@ -58,7 +58,7 @@ MISTAKES = [
     (["high=ucb,fixed"], "high=ucb,fixed: several values; add --multirun"),
     (["--sed", "3"], "unrecognized arguments: --sed; see --help"),
     (["--cfg", "jobs"], "argument --cfg/-c: invalid choice: "),
-    (["--multirun", "--cfg", "job"], "--multirun and --cfg do not go together"),
+    (["--multirun", "--cfg", "job"], "Only one of --run, --multirun, --cfg, --info"),
     (["--config-name", "foo"], "Cannot find primary config 'foo'"),
     (["hydra.run.dir=/proc/nowhere/x"], "/proc/nowhere: No such file or directory"),
     # A value that cannot be.

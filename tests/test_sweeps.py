@@ -44,7 +44,7 @@ def jobs(monkeypatch):
     """Replace training by a function that writes what a run does; return what each run was started with."""
     started = []
 
-    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn):
+    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn, **_):
         started.append((cfg.seed, stopped_at))
         (folder / "config.yaml").write_text(choose_selector(read(cfg)).to_yaml())
         if cfg.seed == 1:
@@ -431,7 +431,7 @@ def test_a_missing_cluster_is_told_in_one_line(command, monkeypatch):
 def test_a_search_maximises_the_score_skips_finished_trials_and_survives_failed_ones(command, monkeypatch, tmp_path):
     tried = []
 
-    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn):
+    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn, **_):
         tried.append(cfg.low.clip)
         if len(tried) == 2:
             raise ZeroDivisionError("a bug")
@@ -456,7 +456,7 @@ def test_a_search_with_a_storage_goes_on_when_it_is_started_again(command, monke
         pytest.skip("Optuna 2 needs SQLAlchemy 1 for a storage")
     tried = []
 
-    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn):
+    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn, **_):
         tried.append((folder.name, cfg.low.clip, stopped_at is not None))
         (folder / "config.yaml").write_text(choose_selector(read(cfg)).to_yaml())
         (folder / "checkpoint.safetensors").touch()

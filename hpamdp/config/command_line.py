@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override, QuotedString, ValueType
 from hydra.errors import HydraException
@@ -21,11 +20,9 @@ from omegaconf.errors import OmegaConfBaseException
 from hpamdp import __version__
 from hpamdp.complaints import no_such
 from hpamdp.config.components import CALLBACK, GROUPS
-from hpamdp.config.compose import beginning_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO, RunConfig
-from hpamdp.config.yaml_files import completed_path
-from hpamdp.messages import first_line
+from hpamdp.config.yaml_files import SCHEME, completed_path
 from hpamdp.shell import for_hydra, setting
 
 GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
@@ -49,8 +46,6 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {
     "config-dir": ("-cd", {}),
     "info": ("-i", {"nargs": "?", "const": "all", "choices": _INFO}),
 }
-# A command line has at most one of these flags.
-_EXCLUSIVE = ("run", "multirun", "cfg", "info", "shell-completion")
 
 
 @dataclass(frozen=True)
@@ -97,6 +92,19 @@ class CommandLine:
         """The word that adds the command line's own folders of yaml files, if it has any."""
         return [word for word in self.words if word.startswith(f"{SEARCH_PATH}=")]
 
+    @property
+    def folders(self) -> list[Path]:
+        """The command line's own folders of yaml files."""
+        given = self.given().get(SEARCH_PATH)
+        paths = [] if given is None else given.value()
+        ours = [str(path).partition(f"{SCHEME}://")[2] for path in paths] if isinstance(paths, list) else []
+        return [Path(path) for path in ours if path]
+
+    def with_replaced(self, words: Mapping[str, str]) -> CommandLine:
+        """Return the command line with other words for the settings of these names."""
+        overrides = {each.key_or_group: each for each in _parsed([*words.values()])}
+        return replace(self, overrides=tuple(overrides.get(each.key_or_group, each) for each in self.overrides))
+
     def with_words(self, words: Sequence[str]) -> CommandLine:
         """Return the command line with more words in front of its settings."""
         return replace(self, overrides=(*_parsed(words), *self.overrides))
@@ -110,17 +118,12 @@ def parse(argv: Sequence[str], conf: Path) -> CommandLine:
         conf: the folder of the yaml files.
 
     Raises:
-        ConfigError: a flag or a setting that does not exist, or flags that do not go together.
+        ConfigError: a flag or a setting that does not exist.
         OverrideParseException: a word is not in Hydra's grammar.
     """
     arguments = vars(_parser().parse_args(argv))
     words = arguments.pop("overrides")
     flags = {name: arguments[name.replace("-", "_")] for name in _FLAGS}
-    given = [f"--{name}" for name in _EXCLUSIVE if flags[name]]
-    if len(given) > 1:
-        _refuse(f"{' and '.join(given)} do not go together")
-    if flags["resolve"] and not flags["cfg"]:
-        _refuse("--resolve goes with --cfg only")
     line = CommandLine(flags, _parsed(words))
     _check_groups(line, conf)
     return _with_completed_folders(line)
@@ -138,8 +141,8 @@ def _with_completed_folders(line: CommandLine) -> CommandLine:
         return line  # Hydra reports a wrong value
     if folder is not None:
         paths = [folder_path(folder, "--config-dir"), *paths]
-    others = [word for word, override in zip(line.words, line.overrides, strict=True) if override is not given]
-    return CommandLine({**line.flags, "config-dir": None}, _parsed([search_word(paths), *others]))
+    others = [override for override in line.overrides if override is not given]
+    return CommandLine({**line.flags, "config-dir": None}, (*_parsed([search_word(paths)]), *others))
 
 
 def folder_path(folder: str | Path, where: str) -> str:
@@ -185,12 +188,7 @@ def _refuse(message: str) -> NoReturn:
 
 
 def _parsed(words: Sequence[str]) -> tuple[Override, ...]:
-    try:
-        return tuple(OverridesParser.create().parse_overrides(list(words)))
-    except RecursionError as error:
-        raise ConfigError(f"{beginning_of(words)}a value nests too deep") from error
-    except ValueError as error:  # an integer with more digits than Python converts
-        raise ConfigError(f"{beginning_of(words)}{first_line(error)}") from error
+    return tuple(OverridesParser.create().parse_overrides(list(words)))
 
 
 def _check_groups(line: CommandLine, conf: Path) -> None:
@@ -202,7 +200,7 @@ def _check_groups(line: CommandLine, conf: Path) -> None:
             raise ConfigError(f"{override.key_or_group}: nothing chosen; set {override.key_or_group}=NAME")
         if override.is_delete() and override.key_or_group.partition(".")[0] in (*GROUPS, *RunConfig.model_fields):
             raise ConfigError(f"{override.input_line}: a setting cannot be removed; give it a value")
-        is_text = override.is_sweep_override() or isinstance(override.value(), str | QuotedString | None)
+        is_text = override.is_sweep_override() or isinstance(override.value(), str | None)
         if override.key_or_group in _SAVED_RUNS and not override.is_delete() and not is_text:
             raise ConfigError(f"{override.input_line}: must be a folder; write {as_text(override.input_line or '')}")
         if override.key_or_group == CALLBACK:
@@ -228,11 +226,8 @@ def _check_choice(override: Override, folder: Path) -> None:
 
 def _is_choice(value: object) -> bool:
     """Return whether the value can name a yaml file in a group's folder, or in a folder there."""
-    return isinstance(value, str | QuotedString) and not set(_text(value).split("/")) & {"", "..", "."}
-
-
-def _text(value: Any) -> str:
-    return value.text if isinstance(value, QuotedString) else str(value)
+    value = value.text if isinstance(value, QuotedString) else value  # `sweep_iterator` leaves the quotes
+    return isinstance(value, str) and not set(value.split("/")) & {"", "..", "."}
 
 
 def as_text(word: str) -> str:
@@ -248,33 +243,28 @@ def choices_in(folder: Path) -> list[str]:
     return sorted({str(choice) for name in names for choice in (name, *name.parents[:-1])})
 
 
-def completed(line: CommandLine, conf: Path) -> CommandLine:
-    """Add what the words stand for: a saved run's choices, a folder's experiments, globs and the sweep's folder.
-
-    Raises:
-        ConfigError: there is no such run, or a glob matches nothing. Or the experiments of a sweep have different
-            folders, or choose other problems than the command line.
-    """
-    line = line.with_words(_saved_words(line))
-    line = _with_globs_written_out(_with_experiments_of_a_folder(line, conf), conf)
-    _check_one_problem(line, conf)
-    return line.with_words(_sweep_folder(line, conf))
-
-
-def _saved_words(line: CommandLine) -> list[str]:
-    """Return the saved run's choices as words, except the choices that the command line makes, and its folders."""
+def saved_run(line: CommandLine) -> tuple[str, str] | None:
+    """Return the saved run whose choices complete the command line, and the setting that names it, if there is one."""
     values = {o.key_or_group: o.value() for o in line.overrides if not o.is_sweep_override() and not o.is_delete()}
     where = "resume" if values.get("resume") else "checkpoint"
     source = values.get(where)
-    if not isinstance(source, str | QuotedString) or not _text(source) or "${" in _text(source):
-        return []
-    if where == "checkpoint" and values.get("mode") != "eval":
-        return []  # which is refused
-    if line.is_multirun or (where == "resume" and source == RESUME_AUTO):
-        return []  # the command line alone describes the run
-    from hpamdp.run.resume import saved_words  # takes seconds, which other commands need not wait for
+    if line.is_multirun or not isinstance(source, str) or not source or "${" in source:
+        return None
+    if where == "resume" and source == RESUME_AUTO:
+        return None  # the command line alone describes the run
+    is_refused = where == "checkpoint" and values.get("mode") != "eval"
+    return None if is_refused else (source, where)
 
-    return saved_words(_text(source), where, [*line.search_path, *line.words])
+
+def completed(line: CommandLine, conf: Path) -> CommandLine:
+    """Add what the words stand for: a folder's experiments, the choices of globs, and the sweep's folder.
+
+    Raises:
+        ConfigError: a glob matches nothing. Or the experiments of a sweep have different folders, or choose other
+            problems than the command line.
+    """
+    line = _with_globs_written_out(_with_experiments_of_a_folder(line, conf), conf)
+    return line.with_words(_sweep_folder(line, conf))
 
 
 def _with_experiments_of_a_folder(line: CommandLine, conf: Path) -> CommandLine:
@@ -282,62 +272,30 @@ def _with_experiments_of_a_folder(line: CommandLine, conf: Path) -> CommandLine:
     chosen = line.given().get("experiment")
     if chosen is None or chosen.is_delete() or chosen.is_sweep_override():
         return line
-    folder = conf / "experiment" / _text(chosen.value())
+    folder = conf / "experiment" / str(chosen.value())
     if not os.path.isdir(folder):
         return line
     experiments = ",".join(f"{folder.name}/{file.stem}" for file in sorted(folder.glob("*.yaml")))
-    words = [f"experiment={experiments}" if override is chosen else override.input_line for override in line.overrides]
-    return CommandLine({**line.flags, "multirun": True}, _parsed([word or "" for word in words]))
+    line = line.with_replaced({"experiment": f"experiment={experiments}"})
+    return replace(line, flags={**line.flags, "multirun": True})
 
 
 def _with_globs_written_out(line: CommandLine, conf: Path) -> CommandLine:
-    """Write `GROUP=glob(...)` out as a sweep over the choices that Hydra finds.
+    """Write `GROUP=glob(...)` out as a sweep over the choices in all folders.
 
     Raises:
         ConfigError: a glob matches no choice.
     """
-    words = line.words
-    globs = [i for i, each in enumerate(line.overrides) if each.value_type == ValueType.GLOB_CHOICE_SWEEP]
-    if not line.is_multirun or not globs:
-        return line
-    with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-        loader = GlobalHydra.instance().config_loader()
-        for i in globs:
-            override = line.overrides[i]
-            group, pattern = override.key_or_group, override.value()
-            assert isinstance(pattern, Glob)
-            names = loader.get_group_options(group, config_name="config", overrides=line.search_path)
+    replaced = {}
+    for override in line.overrides:
+        group, pattern = override.key_or_group, override.value()
+        if isinstance(pattern, Glob) and line.is_multirun:
+            names = sorted({file.stem for folder in (conf, *line.folders) for file in (folder / group).glob("*.yaml")})
             found = pattern.filter(names)
             if not found:
-                raise ConfigError(f"{words[i]}: matches no choice; conf/{group} has {', '.join(names)}")
-            words[i] = f"{override.get_key_element()}={','.join(found)}"
-    return CommandLine(line.flags, _parsed(words))
-
-
-def _check_one_problem(line: CommandLine, conf: Path) -> None:
-    """Refuse a problem beside a sweep over experiments that choose other ones, whose folders it would share.
-
-    Raises:
-        ConfigError: the problem is refused.
-    """
-    given = line.given()
-    experiments, env = given.get("experiment"), given.get("env")
-    if experiments is None or env is None or not (line.is_multirun and experiments.is_discrete_sweep()):
-        return
-    allowed = {word.partition("=")[2] for word in written_out(env)}
-    try:
-        with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-            allowed.add(_problem_of(line.search_path))  # the default, which experiments of any problem have
-            own = {choice: _problem_of([choice, *line.search_path]) for choice in written_out(experiments)}
-    except (HydraException, OmegaConfBaseException):
-        return  # which Hydra will report
-    for choice, problem in own.items():
-        if problem not in allowed:
-            raise ConfigError(f"{env.input_line}: {choice} chooses env={problem} itself; leave {env.input_line} out")
-
-
-def _problem_of(words: Sequence[str]) -> str:
-    return hydra.compose("config", [*words], return_hydra_config=True).hydra.runtime.choices.env
+                raise ConfigError(f"{override.input_line}: matches no choice; conf/{group} has {', '.join(names)}")
+            replaced[group] = f"{override.get_key_element()}={','.join(found)}"
+    return line.with_replaced(replaced)
 
 
 def _sweep_folder(line: CommandLine, conf: Path) -> list[str]:
@@ -346,23 +304,33 @@ def _sweep_folder(line: CommandLine, conf: Path) -> list[str]:
     Hydra reads a sweep's folder from the config without swept groups, so from none of the experiments.
 
     Raises:
-        ConfigError: they name different ones.
+        ConfigError: they name different ones, or one chooses another problem than the command line, under whose name
+            its runs would be saved.
     """
     given = line.given()
-    experiments = given.get("experiment")
-    if not line.is_multirun or "hydra.sweep.dir" in given:
+    experiments, env = given.get("experiment"), given.get("env")
+    if experiments is None or not (line.is_multirun and experiments.is_discrete_sweep()):
         return []
-    if experiments is None or not experiments.is_discrete_sweep():
+    try:
+        with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+            default, *composed = (
+                hydra.compose("config", [*choice, *line.search_path], return_hydra_config=True).hydra
+                for choice in ([], *([each] for each in written_out(experiments)))
+            )
+    except (HydraException, OmegaConfBaseException):
+        return []  # which Hydra will report
+    if env is not None:
+        allowed = {default.runtime.choices.env, *(word.partition("=")[2] for word in written_out(env))}
+        for choice, own in zip(written_out(experiments), composed, strict=True):
+            problem = own.runtime.choices.env
+            if problem not in allowed:
+                raise ConfigError(
+                    f"{env.input_line}: {choice} chooses env={problem} itself; leave {env.input_line} out"
+                )
+    if "hydra.sweep.dir" in given:
         return []
-    folders: dict[str, None] = {}
-    for choice in written_out(experiments):
-        try:
-            with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-                cfg = hydra.compose("config", [choice, *line.search_path], return_hydra_config=True)
-        except (HydraException, OmegaConfBaseException):
-            return []  # which Hydra will report
-        settings: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
-        folders[settings["dir"]] = None
+    settings: list[Any] = [OmegaConf.to_container(own.sweep, resolve=False) for own in composed]
+    folders = list(dict.fromkeys(each["dir"] for each in settings))
     if len(folders) > 1:
         different = f"their sweeps have different folders, {' and '.join(folders)}"
         raise ConfigError(f"{experiments.input_line}: {different}; set hydra.sweep.dir")

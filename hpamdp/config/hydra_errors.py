@@ -95,13 +95,13 @@ def _wrong_setting(line: CommandLine, conf: Path) -> str | None:
         except (HydraException, OmegaConfBaseException):
             return None
         for override in others:
-            wrong = _missing_setting(cfg, override.key_or_group, conf)
+            wrong = missing_setting(cfg, override.key_or_group, conf)
             if wrong is not None:
                 return wrong
     return None
 
 
-def _missing_setting(cfg: DictConfig, setting: str, conf: Path) -> str | None:
+def missing_setting(cfg: DictConfig, setting: str, conf: Path) -> str | None:
     """Return a message that a setting with a dotted name is not in the config; None if it is."""
     node: Any = OmegaConf.to_container(cfg)
     names = setting.split(".")

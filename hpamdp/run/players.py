@@ -96,8 +96,8 @@ def load_agent(path: str | None, settings: Sequence[str], objects: Mapping[str, 
     """Load a saved agent, or build one that settings describe.
 
     Args:
-        path: the agent's folder, a checkpoint, `policy.safetensors`, or the name of an agent that comes with the package. If
-            None, the settings describe the agent.
+        path: the agent's folder, a checkpoint, `policy.safetensors`, or the name of an agent that comes with the
+            package. If None, the settings describe the agent.
         settings: words of a command line, such as `env=goal` or `eval.layouts=6`.
         objects: arguments for the problem's constructor from Python code.
 

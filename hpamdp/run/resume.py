@@ -49,13 +49,15 @@ def resolve(
     Raises:
         ConfigError: a value is wrong, the checkpoint does not exist, or a word would change the saved agent or nothing.
     """
+    if cfg.resume is None and cfg.mode != "eval":
+        config = read(cfg).with_objects(objects)
+        compatibility.check_saved_run(config.run)
+        compatibility.check_effects(config.run.mode, overrides)
+        return choose_selector(config, overrides), None
     run, place_of, folders = read_run(cfg)
     compatibility.check_saved_run(run)
     where = "resume" if run.resume is not None else "checkpoint"
-    source = run.resume or run.checkpoint
-    if source is None:
-        compatibility.check_effects(run.mode, overrides)
-        return choose_selector(read(cfg).with_objects(objects), overrides), None
+    source = run.resume or run.checkpoint or ""
     file = checkpoint.find(source, where)
     saved = checkpoint.progress_of(file)["config"]
     if run.resume is not None and run.mode != saved["mode"]:

@@ -233,15 +233,15 @@ def _run_rest(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[
 
     if cfg.resume == RESUME_AUTO:  # as every sweep does
         cfg.resume = None
-    wanted, _ = resolve(cfg, overrides)
-    done, source = rest_of(wanted, folder)
+    config, start = resolve(cfg, overrides)
+    done, source = rest_of(config, folder)
     if done is not None:
         return _SKIPPED, done, ""
     remove_error(folder)
     if source is not None:
         say(f"Going on from {source}")
     reasons: list[str] = []
-    code = train.run(cfg, folder, overrides, source, may_overwrite=True, tell=reasons.append)
+    code = train.run(cfg, folder, overrides, source or start, config=config, may_overwrite=True, tell=reasons.append)
     if code in (DIVERGED, FAILED):
         return _FAILED, None, one_line(" ".join(reasons))
     if code:

@@ -36,6 +36,7 @@ def run(
     overrides: Sequence[str] = (),
     stopped_at: Path | None = None,
     *,
+    config: Config | None = None,
     may_overwrite: bool = False,
     tell: Callable[[str], None] = warn,
 ) -> int:
@@ -52,6 +53,7 @@ def run(
         output_dir: folder of the run, created if it is missing.
         overrides: the command line's words, which change a resumed run's config.
         stopped_at: the checkpoint of this very run, to continue from.
+        config: the checked config, if it is known; else None.
         may_overwrite: whether the results of a run in the folder may be overwritten, as with `overwrite=true`.
         tell: function that gets the reason of the exit codes 3 and 1 in one line.
 
@@ -60,9 +62,10 @@ def run(
     """
     try:
         with exits_explained(), problems_explained():
-            config, source = resolve(cfg, overrides)
+            source = stopped_at
+            if config is None:
+                config, source = resolve(cfg, overrides)
             with memory_errors_explained(config):
-                source = stopped_at or source
                 trainer = begin(config, source, output_dir, overrides, may_overwrite=may_overwrite)
                 return _run_to_the_end(trainer, output_dir, tell)
     except ProgramExitError as error:
