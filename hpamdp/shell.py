@@ -44,9 +44,13 @@ def for_shell(word: str) -> str:
 
 def for_hydra(text: str) -> str:
     """Return a text in double quotes, in which only quotes, `${` and backslashes before them are special."""
-    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
-    text = re.sub(r'(\\*)"', r'\1\1\\"', text)
+    text = re.sub(r'(\\*)"', r'\1\1\\"', escaped(text))
     return f'"{text}{_trailing_backslashes(text)}"'
+
+
+def escaped(text: str) -> str:
+    """Return a text in which `${` begins no interpolation in a config."""
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
 
 
 def _trailing_backslashes(text: str) -> str:

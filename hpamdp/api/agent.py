@@ -17,13 +17,13 @@ from torchrl.envs.utils import ExplorationType
 
 from hpamdp import keys
 from hpamdp.acting import acting
-from hpamdp.api.arguments import flag, path_argument, problem_arguments, without_env_prefix
+from hpamdp.api.arguments import flag, path_argument, problem_of, without_env_prefix
 from hpamdp.api.export import export_onnx
 from hpamdp.complaints import as_json
 from hpamdp.config.components import TARGET, Component, component
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
-from hpamdp.config.outside_jobs import composed, word
+from hpamdp.config.outside_jobs import composed
 from hpamdp.config.schema import Config, EnvConfig
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import DecisionTracker, decision_tracker
@@ -261,10 +261,10 @@ class Agent:
             target = f"{own.cls.__module__}.{own.cls.__qualname__}"
             changed = component("env", own.name, {TARGET: target, **own.settings, **settings})
             return self._fitting(replace(changed, objects=own.objects))
-        arguments = problem_arguments(env)
-        words = arguments.with_words([word(f"env.{name}", value) for name, value in settings.items()])
-        with composed(words) as cfg:
-            other = read(cfg).with_objects(arguments.objects)
+        problem = problem_of(env)
+        given = problem.with_settings((f"env.{name}", value) for name, value in settings.items())
+        with composed(problem.words, given) as cfg:
+            other = read(cfg).with_objects(problem.objects)
             grouping = other.run.env.grouping
             if grouping not in (None, self._config.run.env.grouping, self._env.grouping):
                 raise ConfigError(
@@ -273,8 +273,8 @@ class Agent:
                 )
             own = self._config.env
             if other.env.cls is own.cls and other.env.name == own.name:
-                given = {each.partition("=")[0].removeprefix("env.") for each in words}
-                kept = {name: value for name, value in own.settings.items() if name not in (*given, *SOURCE_SETTINGS)}
+                left_out = {*SOURCE_SETTINGS, *(name.removeprefix("env.") for name, _ in given)}
+                kept = {name: value for name, value in own.settings.items() if name not in left_out}
                 other = other.with_problem(replace(other.env, settings={**other.env.settings, **kept}))
         return self._fitting(other.env)
 

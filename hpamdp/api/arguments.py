@@ -1,4 +1,4 @@
-"""Turn the arguments of Python functions into the words of a command line, and objects that no word can hold."""
+"""Turn the arguments of Python functions into choices of yaml files, settings and objects."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import copy
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -19,10 +19,9 @@ from torchrl.envs import EnvBase
 
 from hpamdp.complaints import no_such
 from hpamdp.config.components import GROUPS, takes_settings_model
-from hpamdp.config.compose import conf_dir, setting_of
+from hpamdp.config.compose import choosing, conf_dir
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.outside_jobs import check_given_once, choosing_class, given_twice, word
-from hpamdp.config.schema import RunConfig
+from hpamdp.config.outside_jobs import choosing_class, given_twice
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import as_code, first_line
 
@@ -33,32 +32,28 @@ _ACCEPTED = (
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Problem:
     """The argument of a Python function that chooses a problem.
 
     Attributes:
-        words: the words of the command line that says the same.
-        objects: arguments for the constructor of the problem, which no word can hold.
-        copied: words for the class and the settings of a built problem. Unlike `words`, they may be given once more
-            with other values.
+        words: the word of the command line that chooses it, if it is chosen.
+        settings: its settings by their names on the command line.
+        objects: arguments for its constructor, which no file can hold.
+        copied: the settings of a built problem. Unlike `settings`, they may be given once more with other values.
         num_envs: number of environments of a built problem; else None.
     """
 
     words: list[str] = field(default_factory=list)
+    settings: list[tuple[str, Any]] = field(default_factory=list)
     objects: Mapping[str, Any] = field(default_factory=dict)
-    copied: list[str] = field(default_factory=list)
+    copied: Mapping[str, Any] = field(default_factory=dict)
     num_envs: int | None = None
 
-    def with_words(self, others: Sequence[str] = ()) -> list[str]:
-        """Return the words of the problem, and after them those of the function's other arguments.
-
-        Raises:
-            ConfigError: a setting is given twice. On a command line the last one would count in silence.
-        """
-        given = [*self.words, *others]
-        check_given_once(given)
-        replaced = {setting_of(each) for each in given}  # Hydra would merge two mappings
-        return [*(each for each in self.copied if setting_of(each) not in replaced), *given]
+    def with_settings(self, others: Iterable[tuple[str, Any]] = ()) -> list[tuple[str, Any]]:
+        """Return the settings of the problem, and after them those of the function's other arguments."""
+        given = [*self.settings, *others]
+        names = {name if name.startswith("env.") else f"env.{name}" for name, _ in given}
+        return [*((name, value) for name, value in self.copied.items() if name not in names), *given]
 
 
 def path_argument(name: str, value: Any) -> Path:
@@ -67,12 +62,8 @@ def path_argument(name: str, value: Any) -> Path:
     Raises:
         ConfigError: the value is no path.
     """
-    if not isinstance(value, str | Path) or not str(value) or "\0" in str(value):
+    if not isinstance(value, str | Path) or not str(value):
         raise ConfigError(f"{name}={as_code(value)}: must be a path")
-    try:
-        os.fsencode(value)
-    except UnicodeEncodeError as error:
-        raise ConfigError(f"{name}={as_code(value)}: must be a path; no file can have this name") from error
     path = Path(os.path.expanduser(value))  # before `Path` drops "./", after which "./~" would mean the home directory
     return path.absolute() if str(path).startswith("~") else path  # so that nobody expands it later
 
@@ -87,13 +78,8 @@ def flag(name: str, value: Any) -> None:
         raise ConfigError(f"{name}={as_code(value)}: must be True or False")
 
 
-def all_but(settings: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    """Return the settings whose names are not among these."""
-    return {name: value for name, value in settings.items() if name not in names}
-
-
-def settings_words(settings: Mapping[str, Any]) -> list[str]:
-    """Return the words for settings by their names on the command line, such as `seed` and `low.lr`.
+def choices_and_settings(given: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, Any]]]:
+    """Return the words for the choices among arguments such as `low="hppo"` and `seed=1`, and the other arguments.
 
     The value of a group, such as `low`, is the name of a yaml file, a class, None, or a mapping of `name` and settings.
 
@@ -101,29 +87,18 @@ def settings_words(settings: Mapping[str, Any]) -> list[str]:
         ConfigError: a value has no such form, or the setting is Hydra's.
     """
     words: list[str] = []
-    for name, value in settings.items():
+    settings: list[tuple[str, Any]] = []
+    for name, value in given.items():
         if name.partition(".")[0] == "hydra":
             raise ConfigError(f"{name}: Hydra runs no job here; give folder or config_dirs instead")
-        value = str(value) if isinstance(value, torch.device) else value
-        words += _group_words(name, value) if name in GROUPS else [word(name, value)]
-    return words
-
-
-def unprefixed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings without a dot that are neither a value of the run nor a group, such as `max_steps`."""
-    names = {*RunConfig.model_fields, *GROUPS, *(folder.name for folder in conf_dir().iterdir())}
-    return {name: value for name, value in settings.items() if "." not in name and name not in names}
-
-
-def with_env_prefix(settings: Mapping[str, Any], of_problem: Iterable[str]) -> dict[str, Any]:
-    """Return settings with `env.` before the names that the problem has; other names stay, for `composed` to refuse.
-
-    Args:
-        settings: what `unprefixed` returned.
-        of_problem: names of the problem's settings.
-    """
-    known = set(of_problem)
-    return {f"env.{name}" if name in known else name: value for name, value in settings.items()}
+        if name in GROUPS:
+            chosen, own = _choice(name, value)
+            words, settings = [*words, *chosen], [*settings, *own]
+        elif (conf_dir() / name).is_dir():
+            words.append(f"{name}=null" if value is None else choosing(name, str(value)))
+        else:
+            settings.append((name, str(value) if isinstance(value, torch.device) else value))
+    return words, settings
 
 
 def without_env_prefix(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -141,22 +116,20 @@ def without_env_prefix(settings: Mapping[str, Any]) -> dict[str, Any]:
     return plain
 
 
-def _group_words(group: str, value: Any) -> list[str]:
-    if isinstance(value, type):
-        return [choosing_class(group, value)]
+def _choice(group: str, value: Any) -> tuple[list[str], list[tuple[str, Any]]]:
+    """Return the word that chooses a yaml file or a class for a group, if one is chosen, and the group's settings."""
     if isinstance(value, Mapping):
-        chosen = _group_words(group, value["name"]) if "name" in value else []
-        own = {name: each for name, each in value.items() if name != "name"}
-        return [*chosen, *(word(f"{group}.{name}", each) for name, each in own.items())]
-    if value is None:
-        return [f"{group}=none"]
-    if not isinstance(value, str):
+        chosen = _choice(group, value["name"])[0] if "name" in value else []
+        return chosen, [(f"{group}.{name}", each) for name, each in value.items() if name != "name"]
+    if isinstance(value, type):
+        return [choosing(group, choosing_class(group, value))], []
+    if value is not None and not isinstance(value, str):
         raise ConfigError(f"{group}={as_code(value)}: must be a name, a class, None, or a dict of name and settings")
-    return [word(group, value)]
+    return [choosing(group, "none" if value is None else value)], []
 
 
-def problem_arguments(env: Any) -> Arguments:
-    """Return the arguments that choose a problem.
+def problem_of(env: Any) -> Problem:
+    """Return what the argument that chooses a problem says.
 
     Args:
         env: see `hpamdp.train`.
@@ -165,25 +138,24 @@ def problem_arguments(env: Any) -> Arguments:
         ConfigError: it is nothing of the accepted kind.
     """
     if env is None:
-        return Arguments()
+        return Problem()
     if isinstance(env, str):
-        return Arguments(_words_of_name(env))
+        return _named(env)
     if isinstance(env, Mapping) and "name" in env:
-        chosen = problem_arguments(env["name"])
-        own = [word(f"env.{name}", value) for name, value in env.items() if name != "name"]
-        return replace(chosen, words=[*chosen.words, *own])
+        chosen, own = problem_of(env["name"]), _choice("env", {**env, "name": "none"})[1]
+        return replace(chosen, settings=[*chosen.settings, *own])
     if isinstance(env, Mapping) or _is_problem_class(env):
-        return Arguments(_group_words("env", env))
+        return Problem(*_choice("env", env))
     if isinstance(env, PAMDPEnv):
-        return Arguments(copied=_words_of_built(env), num_envs=env.num_envs)
-    return _arguments_of_gymnasium(env)
+        return _like_built(env)
+    return _of_gymnasium(env)
 
 
-def _arguments_of_gymnasium(env: Any) -> Arguments:
+def _of_gymnasium(env: Any) -> Problem:
     if isinstance(env, gymnasium.Env):
-        return Arguments(["env=gymnasium"], {"make": _copier(env)})
+        return Problem(["env=gymnasium"], objects={"make": _copier(env)})
     if callable(env) and not isinstance(env, EnvBase | VectorEnv):
-        return _arguments_of_callable(env)
+        return _of_callable(env)
     raise ConfigError(f"env={as_code(env)}: must be {_ACCEPTED}")
 
 
@@ -191,7 +163,7 @@ def _is_problem_class(env: Any) -> bool:
     return isinstance(env, type) and issubclass(env, PAMDPEnv)
 
 
-def _words_of_name(name: str) -> list[str]:
+def _named(name: str) -> Problem:
     own = plain_name(name)
     if name.startswith("hpamdp/"):
         if re.search(r"-v\d+$", name) and name.lower() not in {each.lower() for each in gymnasium.registry}:
@@ -199,13 +171,11 @@ def _words_of_name(name: str) -> list[str]:
             raise ConfigError(f"{name}: {no_such('problem with a Gymnasium id', name, ids)}")
         names = [file.stem for file in (conf_dir() / "env").glob("*.yaml") if plain_name(file.stem) == own]
         if names:
-            return [word("env", names[0])]
+            return Problem([choosing("env", names[0])])
     is_id = name in gymnasium.registry or re.search(r"-v\d+$", name)
-    if is_id:
-        return ["env=gymnasium", word("env.id", name)]
-    if ":" in name:
-        return ["env=gymnasium", word("env.entry_point", name)]
-    return [word("env", name)]
+    if is_id or ":" in name:
+        return Problem(["env=gymnasium"], [("env.id" if is_id else "env.entry_point", name)])
+    return Problem([choosing("env", name)])
 
 
 def plain_name(name: str) -> str:
@@ -213,14 +183,14 @@ def plain_name(name: str) -> str:
     return name.removeprefix("hpamdp/").partition("-v")[0].replace("_", "").lower()
 
 
-def _words_of_built(env: PAMDPEnv) -> list[str]:
-    """Return the words for a problem like a built one, with its options."""
+def _like_built(env: PAMDPEnv) -> Problem:
+    """Return a problem like a built one, with its options."""
     cls = type(env)
     if not takes_settings_model(cls):
         raise ConfigError(f"env={as_code(env)}: its settings are unknown; pass the class {cls.__name__}")
-    settings = [word(f"env.{name}", value) for name, value in env.options.model_dump(mode="json").items()]
-    grouping = [] if env.grouping is None else [word("env.grouping", env.grouping)]
-    return [choosing_class("env", cls), *settings, *grouping]
+    settings = {f"env.{name}": value for name, value in env.options.model_dump(mode="json").items()}
+    grouping = {} if env.grouping is None else {"env.grouping": env.grouping}
+    return Problem(_choice("env", cls)[0], copied={**settings, **grouping}, num_envs=env.num_envs)
 
 
 def _copier(env: gymnasium.Env) -> Callable[[], gymnasium.Env]:
@@ -237,13 +207,13 @@ def _copier(env: gymnasium.Env) -> Callable[[], gymnasium.Env]:
     return partial(copy.deepcopy, first)
 
 
-def _arguments_of_callable(make: Callable[[], Any]) -> Arguments:
-    """Return the arguments for a class or a function: its name if it can be imported, otherwise itself."""
+def _of_callable(make: Callable[[], Any]) -> Problem:
+    """Return the problem of a class or a function: by its name if it can be imported, otherwise by itself."""
     module, name = getattr(make, "__module__", None), getattr(make, "__qualname__", "")
     if (
         module not in (None, "__main__")
         and name.isidentifier()
         and getattr(sys.modules.get(module), name, None) is make
     ):
-        return Arguments(["env=gymnasium", word("env.entry_point", f"{module}:{name}")])
-    return Arguments(["env=gymnasium"], {"make": make})
+        return Problem(["env=gymnasium"], [("env.entry_point", f"{module}:{name}")])
+    return Problem(["env=gymnasium"], objects={"make": make})

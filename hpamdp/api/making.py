@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
+from gymnasium import VectorizeMode
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+from gymnasium.vector import AutoresetMode
 from pydantic import NonNegativeInt
 
-from hpamdp.api.arguments import plain_name, problem_arguments, without_env_prefix
-from hpamdp.api.gymnasium_arguments import check_single, checked_arguments, names_of_arguments, vector_arguments
+from hpamdp.api.arguments import plain_name, problem_of, without_env_prefix
 from hpamdp.complaints import close_names, no_such
 from hpamdp.config.components import SUPPLIED_ARGUMENTS
-from hpamdp.config.compose import read
+from hpamdp.config.compose import job_overrides, read
 from hpamdp.config.errors import ConfigError, validated
-from hpamdp.config.outside_jobs import composed, word
+from hpamdp.config.outside_jobs import composed
 from hpamdp.config.schema import Device, usable_device
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
@@ -23,6 +28,19 @@ from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run.assemble import grouped
 from hpamdp.run.compatibility import lack_of, settings_without_effect
 from hpamdp.settings import NumAtOnce, SettingError, Settings
+
+# Values of `vectorization_mode` for a problem's own vector, if it has one.
+_OWN_VECTOR = (None, "vector_entry_point", VectorizeMode.VECTOR_ENTRY_POINT)
+# Errors of Gymnasium and of constructors about their arguments.
+_REFUSALS = (
+    gymnasium.error.Error,
+    AssertionError,
+    ModuleNotFoundError,
+    MemoryError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
 
 
 class _Sizes(Settings):
@@ -56,15 +74,15 @@ def make(name: Any, num_envs: int | None = None, *, device: Any = "cpu", seed: i
         torch.Size([4, 3, 1])
     """
     supplied = {each: settings.pop(each) for each in SUPPLIED_ARGUMENTS["env"] if each in settings}
-    arguments = problem_arguments(name)
+    problem = problem_of(name)
     if num_envs is None:
-        num_envs = arguments.num_envs or 1
+        num_envs = problem.num_envs or 1
     sizes = validated(_Sizes, {"num_envs": num_envs, "seed": seed, **supplied}, "", "argument", "hpamdp.make")
-    own = [word(f"env.{each}", value) for each, value in without_env_prefix(settings).items()]
-    with composed(arguments.with_words([*own, word("device", str(device))])) as cfg:
-        config = read(cfg).with_objects(arguments.objects)
-    for line in settings_without_effect(config, own):
-        warn(line)
+    own = [(f"env.{each}", value) for each, value in without_env_prefix(settings).items()]
+    with composed(problem.words, problem.with_settings([*own, ("device", str(device))])) as cfg:
+        config = read(cfg).with_objects(problem.objects)
+        for line in settings_without_effect(config, job_overrides()):
+            warn(line)
     needs = {each: True for each in ("oracle", "human") if getattr(sizes, each)}
     for need in needs:
         lack = lack_of(need, config)
@@ -110,16 +128,45 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
     if "device" in sizes:
         own["device"] = usable_device(checked.device)
     try:
-        own = checked_arguments(own)
         if num_envs is None:
-            check_single(env_id, own)
             return gymnasium.make(env_id, **own)
-        return gymnasium.make_vec(env_id, num_envs=checked.num_envs, **vector_arguments(env_id, own))
-    except (gymnasium.error.Error, ValueError, ModuleNotFoundError, TypeError, RuntimeError, MemoryError) as error:
+        return gymnasium.make_vec(env_id, num_envs=checked.num_envs, **_vector_arguments(env_id, own))
+    except _REFUSALS as error:
         complaint = _complaint(error, env_id, num_envs)
         if complaint is None:
             raise
         raise ConfigError(f"{env_id}: {complaint}") from error
+
+
+def _vector_arguments(env_id: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return arguments for `gymnasium.make_vec`, which takes `autoreset_mode` elsewhere in each kind of vector.
+
+    A vector of a problem of this package restarts in the same step, unless `autoreset_mode` says otherwise.
+    """
+    others = {name: value for name, value in given.items() if name != "autoreset_mode"}
+    restarts = given.get("autoreset_mode") or (AutoresetMode.SAME_STEP if env_id.startswith("hpamdp/") else None)
+    if restarts is None:
+        return others
+    has_own = _spec_of(env_id).vector_entry_point is not None
+    if has_own and others.get("vectorization_mode") in _OWN_VECTOR:
+        return {**others, "autoreset_mode": restarts}
+    return {**others, "vector_kwargs": {"autoreset_mode": restarts, **(others.get("vector_kwargs") or {})}}
+
+
+def _spec_of(env_id: str) -> EnvSpec:
+    module, _, name = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)  # as `gymnasium.make` does
+    return gymnasium.spec(name)
+
+
+def _names_of_arguments(env_id: str) -> list[str]:
+    """Return the names of the arguments that the constructor behind an id takes."""
+    creator: Any = _spec_of(env_id).entry_point
+    if isinstance(creator, str):
+        creator = load_env_creator(creator)
+    parameters = [] if creator is None else inspect.signature(creator).parameters.values()
+    return [each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
 
 
 def _complaint(error: Exception, env_id: str, num_envs: int | None) -> str | None:
@@ -133,7 +180,7 @@ def _complaint(error: Exception, env_id: str, num_envs: int | None) -> str | Non
         unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
         if unknown is None:
             return None
-        return f"{unknown.group(1)}: {no_such('argument', unknown.group(1), names_of_arguments(env_id))}"
+        return f"{unknown.group(1)}: {no_such('argument', unknown.group(1), _names_of_arguments(env_id))}"
     is_refusal = isinstance(error, gymnasium.error.Error | SettingError | ModuleNotFoundError)
     return first_line(error) if is_refusal or env_id.startswith("hpamdp/") else None
 

@@ -6,7 +6,7 @@ import logging
 import multiprocessing
 import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -16,23 +16,13 @@ import torchrl
 from torchrl.checkpoint import GlobalRNGState
 
 from hpamdp.api.agent import Agent
-from hpamdp.api.arguments import (
-    Arguments,
-    all_but,
-    flag,
-    path_argument,
-    problem_arguments,
-    settings_words,
-    unprefixed,
-    with_env_prefix,
-)
-from hpamdp.complaints import no_such
-from hpamdp.config.components import TARGET
-from hpamdp.config.compose import setting_of
+from hpamdp.api.arguments import Problem, choices_and_settings, flag, path_argument, problem_of
+from hpamdp.config.command_line import SEARCH_PATH
+from hpamdp.config.compose import conf_dir, job_overrides, setting_of
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.outside_jobs import check_no_sweep, choosing_class, composed, searching, word
+from hpamdp.config.outside_jobs import check_no_sweep, choosing_class, composed, searching
 from hpamdp.config.saved import choices_of
-from hpamdp.config.schema import RESUME_AUTO, Config
+from hpamdp.config.schema import RESUME_AUTO, Config, RunConfig
 from hpamdp.env.errors import closed_on_error
 from hpamdp.env.facts import NAMING_SETTINGS
 from hpamdp.messages import as_code, reason_of, say, warn
@@ -40,7 +30,6 @@ from hpamdp.metrics_file import read_rows, what_is_lost
 from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import Callback
 from hpamdp.run.capacity import memory_errors_explained
-from hpamdp.run.compatibility import check_effects
 from hpamdp.run.continuation import Rest, refuse_another, rest_of
 from hpamdp.run.folder import locked
 from hpamdp.run.players import load_agent
@@ -108,17 +97,18 @@ def train(
     flag("progress", progress)
     output_dir = None if folder is None else path_argument("folder", folder)
     callbacks = _checked_callbacks(callbacks)
-    arguments = problem_arguments(env)
+    problem = problem_of(env)
     goes_on = settings.get("resume") == RESUME_AUTO
     _check_what_needs_runs(settings, output_dir)
     if goes_on:
         settings = {**settings, "resume": None}
-    saved, words = _words_of(settings, arguments, searching(config_dirs))
+    choices, own = _given(problem, settings, config_dirs)
     with _torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
         stack.enter_context(_warned_if_concurrent())
-        with composed([*saved, *words]) as cfg:
+        with composed(choices, own) as cfg:
+            words = job_overrides()
             check_no_sweep(cfg, words)
-            config, source = resolve(cfg, words, arguments.objects)
+            config, source = resolve(cfg, words, problem.objects)
             if output_dir is None:
                 _check_no_files(config, words)
             stack.enter_context(memory_errors_explained(config))
@@ -127,7 +117,7 @@ def train(
             if goes_on and output_dir is not None:
                 score, source = _rest_of(config, output_dir)
                 if score is not None:
-                    return _finished_agent(config, output_dir, arguments, config_dirs)
+                    return _finished_agent(config, output_dir, problem, config_dirs)
             trainer = begin(config, source, output_dir, words, may_overwrite=goes_on, callbacks=callbacks)
         stack.callback(trainer.parts.close)
         trainer.shows_progress = progress
@@ -169,28 +159,24 @@ def _check_no_files(config: Config, words: Sequence[str]) -> None:
             raise ConfigError(f"{each}: writes files, so give the run a folder")
 
 
-def _words_of(settings: Mapping[str, Any], problem: Arguments, folders: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the words of the run to resume, if there is one, and the words of all arguments.
+def _given(
+    problem: Problem, settings: Mapping[str, Any], config_dirs: Sequence[str | Path]
+) -> tuple[list[str], list[tuple[str, Any]]]:
+    """Return the words for folders and choices, also those of the run to resume, and all settings.
 
-    Args:
-        settings: the settings by their names.
-        problem: the argument that chooses a problem.
-        folders: the word that adds folders of yaml files, if there are any.
+    Raises:
+        ConfigError: the run to resume was trained on an object, which is not given again.
     """
     if problem.num_envs is not None:
         settings = {"num_envs": problem.num_envs, **settings}
-    of_problem = unprefixed(settings)
-    own = settings_words(all_but(settings, of_problem))
-    words = [*folders, *problem.with_words(own)]
-    resumed = settings.get("resume")
-    saved = [] if resumed is None else saved_words(str(resumed), "resume", words)
-    if resumed is not None and not problem.words and not problem.objects:
-        _check_problem(checkpoint.find(str(resumed), "resume"), words, "resume")
-    if of_problem:
-        with composed([*saved, *words]) as cfg:
-            own += settings_words(with_env_prefix(of_problem, cfg.env))
-        words = [*folders, *problem.with_words(own)]
-    return saved, words
+    choices, own = choices_and_settings(settings)
+    words = [*searching(config_dirs), *problem.words, *choices]
+    if settings.get("resume") is not None:
+        resumed, trust = str(settings["resume"]), ["trust=true"] if settings.get("trust") is True else []
+        words = [*saved_words(resumed, "resume", [*words, *trust]), *words]
+        if not problem.words and not problem.objects:
+            _check_problem(checkpoint.find(resumed, "resume"), [*settings, *dict(problem.settings)], "resume")
+    return words, problem.with_settings(own)
 
 
 def _check_guarded() -> None:
@@ -244,20 +230,12 @@ def _own_folder(folder: Path) -> Iterator[None]:
             try:
                 stack.enter_context(locked(folder))
             except OSError as error:
-                raise ConfigError(f"folder={folder}: {_why_not_made(folder, error)}") from error
+                raise ConfigError(f"folder={folder}: {reason_of(error)}") from error
             yield
     finally:
         with suppress(OSError):  # at the first folder that is not empty
             for each in missing:
                 each.rmdir()
-
-
-def _why_not_made(folder: Path, error: OSError) -> str:
-    """Return why a folder cannot be made. The system calls a link to nowhere an existing file."""
-    for each in (folder, *folder.parents):
-        if os.path.islink(each) and not os.path.exists(each):
-            return f"{each}: a link to {os.readlink(each)}, which does not exist"
-    return reason_of(error)
 
 
 def _rest_of(config: Config, folder: Path) -> Rest:
@@ -320,29 +298,26 @@ def load(
     """
     flag("trust", trust)
     file = checkpoint.find(path_argument("load", source), "load")
-    arguments = problem_arguments(env)
-    of_problem = all_but(unprefixed(settings), _OF_LOADING)
-    known = _names_of_problem(file, arguments, config_dirs) if of_problem else []
-    unknown = [name for name in of_problem if name not in known]
-    if unknown:
-        raise ConfigError(f"{unknown[0]}: {no_such('setting of the problem', unknown[0], known)}")
+    problem = problem_of(env)
     _check_classes(file, settings)
-    others = all_but(settings, [*of_problem, *_OF_AGENT])
-    for name in others:
-        if name not in _OF_LOADING and name.partition(".")[0] not in ("env", "eval"):
+    given = {name: value for name, value in settings.items() if name not in _OF_AGENT}
+    for name in given:
+        group = name.partition(".")[0]
+        is_of_run = group in RunConfig.model_fields or (conf_dir() / group).is_dir()
+        if is_of_run and group not in ("env", "eval") and name not in _OF_LOADING:
             raise ConfigError(f"{name}: has no effect on a trained agent; leave it out")
-    own = [*settings_words(others), *settings_words(with_env_prefix(of_problem, known))]
-    check_effects("agent", own)
-    words = [*searching(config_dirs), *arguments.with_words(own), *(["trust=true"] if trust else [])]
+    choices, own = choices_and_settings(given)
+    own = problem.with_settings(own)
+    words = [*searching(config_dirs), *problem.words, *choices, *(["trust=true"] if trust else [])]
     if env is None:
-        _check_problem(file, words, "load")
-    return _loaded(file, words, arguments.objects)
+        _check_problem(file, given, "load")
+    return _loaded(file, words, own, problem.objects)
 
 
-def _loaded(file: Path, words: Sequence[str], objects: Mapping[str, Any]) -> Agent:
+def _loaded(file: Path, words: Sequence[str], settings: Sequence[tuple[str, Any]], objects: Mapping[str, Any]) -> Agent:
     """Return the agent of a file, and the metrics beside it."""
     with _torch_restored(), problems_explained():
-        loaded = load_agent(str(file), words, objects)
+        loaded = load_agent(str(file), words, settings, objects, where="agent")
     with closed_on_error(loaded.env):
         metrics = file.parent / METRICS_NAME
         rows, run = read_rows(metrics), loaded.config.run
@@ -353,7 +328,7 @@ def _loaded(file: Path, words: Sequence[str], objects: Mapping[str, Any]) -> Age
         return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, rows)
 
 
-def _finished_agent(config: Config, folder: Path, arguments: Arguments, config_dirs: Sequence[str | Path]) -> Agent:
+def _finished_agent(config: Config, folder: Path, problem: Problem, config_dirs: Sequence[str | Path]) -> Agent:
     """Return the agent of a finished run. It needs no trust: it is built as this config would build it.
 
     Raises:
@@ -361,8 +336,8 @@ def _finished_agent(config: Config, folder: Path, arguments: Arguments, config_d
     """
     file = checkpoint.find(folder, "load")
     refuse_another(config, checkpoint.progress_of(file)["config"], str(file))
-    folders = searching(config_dirs) or [word("hydra.searchpath", [])]  # instead of those that the file names
-    return _loaded(file, [*folders, *arguments.with_words(), "trust=true"], arguments.objects)
+    folders = searching(config_dirs) or [f"{SEARCH_PATH}=[]"]  # instead of those that the file names
+    return _loaded(file, [*folders, *problem.words, "trust=true"], problem.with_settings(), problem.objects)
 
 
 def _check_classes(file: Path, settings: Mapping[str, Any]) -> None:
@@ -381,25 +356,15 @@ def _check_classes(file: Path, settings: Mapping[str, Any]) -> None:
             )
         if not isinstance(cls, type):
             raise ConfigError(f"{group}: has no effect on a trained agent; leave it out")
-        if choosing_class(group, cls) != word(group, choices[group]):
+        if choosing_class(group, cls) != choices[group]:
             raise ConfigError(
                 f"{group}={cls.__name__}: the agent was trained with {group}={choices[group]}; pass that class, or "
                 "leave it out"
             )
 
 
-def _names_of_problem(file: Path, arguments: Arguments, config_dirs: Sequence[str | Path]) -> list[str]:
-    """Return the names of the settings of the problem that the arguments choose, or else of a saved agent's."""
-    words = arguments.with_words()
-    if not words:
-        saved = checkpoint.progress_of(file)["config"].get("env")
-        return [*saved] if isinstance(saved, Mapping) else []
-    with composed([*searching(config_dirs), *words]) as cfg:
-        return [name for name in cfg.env if name != TARGET]
-
-
-def _check_problem(file: Path, words: Sequence[str], where: str) -> None:
-    """Refuse an agent whose problem was an object, unless words name the problem.
+def _check_problem(file: Path, settings: Iterable[str], where: str) -> None:
+    """Refuse an agent whose problem was an object, unless one of these settings names the problem.
 
     `where` is the argument that gives the file.
 
@@ -407,7 +372,7 @@ def _check_problem(file: Path, words: Sequence[str], where: str) -> None:
         ConfigError: the problem is unknown.
     """
     saved = checkpoint.progress_of(file)["config"].get("env")
-    is_named = any(each.startswith(f"env.{name}=") for each in words for name in NAMING_SETTINGS)
+    is_named = any(each.removeprefix("env.") in NAMING_SETTINGS for each in settings)
     is_generic = isinstance(saved, Mapping) and {*NAMING_SETTINGS} <= saved.keys()
     if is_generic and not is_named and all(saved[name] is None for name in NAMING_SETTINGS):
         raise ConfigError(f"{where}: {file}: the agent was trained on an object from Python; pass it again as env")

@@ -22,6 +22,7 @@ from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.schema import Config, RunConfig, check_run, checked_config
 from hpamdp.config.yaml_files import SCHEME
 from hpamdp.messages import first_line
+from hpamdp.shell import for_hydra
 
 NESTED = "a yaml file names itself among its defaults, or a value nests too deep"
 RECIPE = "recipe"
@@ -59,17 +60,16 @@ def _package() -> Path:
     return Path(__file__).resolve().parent.parent
 
 
-def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
+def read(cfg: DictConfig) -> Config:
     """Check the composed config.
 
     Args:
         cfg: as Hydra composes conf/config.yaml, with or without its `hydra` part.
-        choices: the name that was chosen for each group. If None, Hydra's choices.
 
     Raises:
         ConfigError: a value is wrong, or nothing is chosen for a group.
     """
-    given, names, place_of, folders = _as_plain_values(cfg, chosen_names(cfg) if choices is None else choices)
+    given, names, place_of, folders = _as_plain_values(cfg)
     return replace(check(given, names, place_of), config_dirs=folders)
 
 
@@ -82,17 +82,18 @@ def read_run(cfg: DictConfig) -> tuple[RunConfig, PlaceOf | None, tuple[str, ...
     Raises:
         ConfigError: a value is wrong, or nothing is chosen for a group.
     """
-    given, names, place_of, folders = _as_plain_values(cfg, chosen_names(cfg), may_lack=True)
+    given, names, place_of, folders = _as_plain_values(cfg, may_lack=True)
     return check_run(given, names, place_of), place_of, folders
 
 
 def _as_plain_values(
-    cfg: DictConfig, names: Mapping[str, str], *, may_lack: bool = False
+    cfg: DictConfig, *, may_lack: bool = False
 ) -> tuple[dict[str, Any], Mapping[str, str], PlaceOf | None, tuple[str, ...]]:
     """Return the composed config as plain values, the names, where a setting was set, and the folders of yaml files.
 
     `may_lack`: see `plain`.
     """
+    names = chosen_names(cfg)
     for group in GROUPS:
         if cfg.get(group) is None or TARGET not in cfg[group]:
             if names.get(group) is not None:
@@ -121,7 +122,9 @@ def _place_of(words: Sequence[str], names: Mapping[str, str], folders: Sequence[
         setting: its name on the command line, such as `low.lr`.
     """
     given = [re.split("[=~]", word.lstrip("+~"), maxsplit=1)[0] for word in words]
-    if any(setting == name or setting.startswith(f"{name}.") for name in given if name not in GROUPS):
+    if any(
+        f"{setting}.".startswith(f"{name}.") or name.startswith(f"{setting}.") for name in given if name not in GROUPS
+    ):
         return "given as an argument"
     group, _, rest = setting.partition(".")
     for where, path in ((_EXPERIMENT, setting), (f"{RECIPE}/{group}", setting), (RECIPE, setting), (group, rest)):
@@ -188,14 +191,8 @@ def _learners_of_options(run: RunConfig, env: str) -> dict[str, tuple[str, dict[
     """Return each learner in `low.per_option`: its name, and its yaml file and recipe with the given settings."""
     learners = {}
     for option, choice in (run.low.per_option or {}).items():
-        given = {"name": choice} if isinstance(choice, str) else dict(choice)
         where = f"low.per_option.{option}"
-        name = given.pop("name", None)
-        if not is_name(name):
-            raise ConfigError(f"{where}={as_json(choice)}: must be the name of a learner, or its name and settings")
-        for word, instead in _NOT_PER_OPTION.items():
-            if word in given:
-                raise ConfigError(f"{where}.{word}: {instead}")
+        name, given = _name_and_settings(choice, where, "a learner", _NOT_PER_OPTION)
         try:
             cfg = compose([choosing("env", env), choosing("low", name)])
         except ConfigError as error:
@@ -216,13 +213,8 @@ def listed_callbacks(choices: Sequence[Any], run: Mapping[str, Any]) -> list[tup
     """
     callbacks = []
     for i, choice in enumerate(choices):
-        given = dict(choice) if isinstance(choice, Mapping) else {"name": choice}
         where = f"callbacks.{i}"
-        name = given.pop("name", None)
-        if not is_name(name):
-            raise ConfigError(f"{where}={as_json(choice)}: must be the name of a callback, or its name and settings")
-        if TARGET in given:
-            raise ConfigError(f"{where}.{TARGET}: {_NAMED_BY_YAML}")
+        name, given = _name_and_settings(choice, where, "a callback", {TARGET: _NAMED_BY_YAML})
         try:
             cfg = compose([f"+{choosing(CALLBACK, name)}"])
         except MissingChoiceError as error:
@@ -231,6 +223,22 @@ def listed_callbacks(choices: Sequence[Any], run: Mapping[str, Any]) -> list[tup
             raise ConfigError(f"{where}={name}: {file_of(CALLBACK, name)} names no class as {TARGET}")
         callbacks.append((name, {**plain_groups(cfg, run, [CALLBACK])[CALLBACK], **given}))
     return callbacks
+
+
+def _name_and_settings(choice: Any, where: str, what: str, refused: Mapping[str, str]) -> tuple[str, dict[str, Any]]:
+    """Return the name of a yaml file in a list or mapping, and the settings beside it.
+
+    Raises:
+        ConfigError: there is no name, or one of the settings in `refused`, which give the advice for the error.
+    """
+    given = dict(choice) if isinstance(choice, Mapping) else {"name": choice}
+    name = given.pop("name", None)
+    if not is_name(name):
+        raise ConfigError(f"{where}={as_json(choice)}: must be the name of {what}, or its name and settings")
+    for setting, instead in refused.items():
+        if setting in given:
+            raise ConfigError(f"{where}.{setting}: {instead}")
+    return name, given
 
 
 def compose(overrides: list[str]) -> DictConfig:
@@ -360,4 +368,4 @@ def _names_in(name: str, value: Any) -> list[str]:
 
 def choosing(group: str, name: str) -> str:
     """Return the word that chooses a yaml file for a group. The quotes make names of `null` and `3`."""
-    return f"{group}='{name}'"
+    return f"{group}={for_hydra(name)}"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +13,14 @@ import yaml
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.types import QuotedString
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from hpamdp.complaints import as_json
 from hpamdp.config.command_line import CommandLine, folder_path, parse, search_word
 from hpamdp.config.components import (
-    GROUPS,
     SUPPLIED_ARGUMENTS,
     TARGET,
     check_base_class,
@@ -31,11 +29,11 @@ from hpamdp.config.components import (
     name_of_passed,
     settings_model,
 )
-from hpamdp.config.compose import conf_dir, is_name, settings_in
+from hpamdp.config.compose import conf_dir, is_name, setting_of
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.hydra_errors import explained, not_understood
-from hpamdp.messages import as_code
-from hpamdp.shell import for_hydra
+from hpamdp.config.hydra_errors import explained, missing_setting, not_understood
+from hpamdp.messages import as_code, first_line
+from hpamdp.shell import escaped
 
 # Hydra keeps one state for the whole process.
 _HYDRA = threading.RLock()
@@ -46,19 +44,27 @@ _BUDGET = {"num_envs": 16, "steps_per_batch": 128, "total_frames": 200_000, "eva
 
 
 @contextmanager
-def composed(words: Sequence[str]) -> Iterator[DictConfig]:
-    """Compose the words of a command line. Inside the block, the folders that they add are searched.
+def composed(words: Sequence[str], settings: Iterable[tuple[str, Any]] = ()) -> Iterator[DictConfig]:
+    """Compose the words of a command line, and change the result by settings from Python code.
 
-    Other threads wait until the block ends. Then Hydra's earlier state comes back.
+    Inside the block, the folders that the words add are searched, and `job_overrides` returns what was given. Other
+    threads wait until the block ends. Then Hydra's earlier state comes back.
+
+    Args:
+        words: choices of yaml files, and settings in Hydra's grammar.
+        settings: names as on the command line, without `env.` for settings of the problem if nothing else has the
+            name, and their values.
 
     Yields:
         The config with its `hydra` part.
 
     Raises:
-        ConfigError: the words cannot be composed.
+        ConfigError: the words cannot be composed, or a setting does not exist, has no value that a yaml file can hold,
+            or is given twice.
     """
     with _own_hydra():
         cfg = _compose(words, conf_dir())
+        _change(cfg, settings, conf_dir())
         HydraConfig.instance().set_config(cfg)  # `compose` takes the searched folders from it
         yield cfg
 
@@ -106,55 +112,88 @@ def _parsed(words: Sequence[str], conf: Path) -> CommandLine:
         raise ConfigError(not_understood(error.override)) from error
 
 
-def word(name: str, value: Any) -> str:
-    """Return the word of a command line that gives a setting this value.
+def _change(cfg: DictConfig, settings: Iterable[tuple[str, Any]], conf: Path) -> None:
+    """Change a composed config by settings from Python code, as Hydra changes it by the words of a command line.
+
+    Raises:
+        ConfigError: a setting does not exist, has no value that a yaml file can hold, or is given twice.
+    """
+    given: dict[str, Any] = {}
+    words = []
+    for written, value in settings:
+        name, is_new = written.lstrip("+"), written.startswith("+")
+        if "." not in name and name not in cfg and name in cfg.env:
+            name = f"env.{name}"
+        plain = plain_value(name, value)
+        singles = dict(_single_values(name, plain))
+        for single, each in singles.items():
+            wrong = None if is_new else missing_setting(cfg, single, conf)
+            if wrong is not None:
+                raise ConfigError(wrong)
+            _check_once(single, each, given)
+        given |= singles
+        before = OmegaConf.select(cfg, name, throw_on_resolution_failure=False)
+        has_entries = isinstance(before, DictConfig)  # of which a mapping changes some
+        words += [f"{one}={as_json(each)}" for one, each in (singles if has_entries else {name: plain}).items()]
+        try:
+            OmegaConf.update(cfg, name, _as_node(plain), merge=True, force_add=is_new)
+        except OmegaConfBaseException as error:
+            raise ConfigError(f"{name}={as_code(value)}: {first_line(error)}") from error
+    cfg.hydra.overrides.task.extend(words)
+
+
+def _check_once(name: str, value: Any, given: Mapping[str, Any]) -> None:
+    """Refuse a setting that was given before, also one inside a mapping, such as `eval={"seed": 7}` and `eval.seed`.
+
+    On a command line the last word counts.
+    """
+    for earlier, first in given.items():
+        if f"{name}.".startswith(f"{earlier}.") or earlier.startswith(f"{name}."):
+            raise ConfigError(given_twice(min(name, earlier, key=len), first, value))
+
+
+def _single_values(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the entries of a mapping, of the mappings in it and so on, or else the value itself; nothing if empty."""
+    if not isinstance(value, Mapping):
+        yield name, value
+        return
+    for entry, each in value.items():
+        yield from _single_values(f"{name}.{entry}", each)
+
+
+def plain_value(name: str, value: Any) -> Any:
+    """Return the value of a setting from Python code as a yaml file could hold it.
 
     Raises:
         ConfigError: the value is no number, text, list or mapping of these.
     """
-    return f"{name}={_written(name, value)}"
-
-
-def _written(name: str, value: Any) -> str:
     if hasattr(value, "item") and getattr(value, "ndim", None) == 0:  # a number of NumPy or torch
         value = value.item()
     elif hasattr(value, "tolist") and getattr(value, "ndim", None) == 1 and not name.startswith(_OF_CONSTRUCTOR):
         value = value.tolist()
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, Integral | Real):
-        return repr(value)
     if isinstance(value, str | Path):
-        return for_hydra(str(value))
+        return str(value)
+    if value is None or isinstance(value, bool | int | float):
+        return value
     if isinstance(value, list | tuple | range):
-        return f"[{','.join(_written(name, item) for item in value)}]"
+        return [plain_value(name, item) for item in value]
     if isinstance(value, Mapping):
         for entry in value:
             if not is_name(entry):
                 raise ConfigError(
                     f"{name}: the name {as_code(entry)} of an entry must be a text of letters, digits, _, . and -"
                 )
-        return f"{{{','.join(f'{entry}:{_written(name, item)}' for entry, item in value.items())}}}"
+        return {entry: plain_value(name, item) for entry, item in value.items()}
     raise ConfigError(f"{name}={as_code(value)}: must be a number, a text, or a list or mapping of these")
 
 
-def check_given_once(words: Sequence[str]) -> None:
-    """Refuse a setting that two words give, also one inside a mapping, such as `eval={seed:7}` and `eval.seed=8`.
-
-    This is for the arguments of Python functions. On a command line the last word counts.
-
-    Raises:
-        ConfigError: a setting is given twice.
-    """
-    given: list[tuple[tuple[str, ...], Any]] = []
-    for override in _parsed(words, conf_dir()).overrides:
-        if override.key_or_group not in GROUPS:  # there it is a choice, such as `low=hppo` before `low.lr=0.001`
-            given += _single_values(tuple(override.key_or_group.split(".")), override.value())
-    for place, (name, value) in enumerate(given):
-        for earlier, first in given[:place]:
-            shorter = min(len(name), len(earlier))
-            if name[:shorter] == earlier[:shorter]:
-                raise ConfigError(given_twice(".".join(name[:shorter]), first, value))
+def _as_node(value: Any) -> Any:
+    """Return a plain value for a config, in which `${` would begin an interpolation."""
+    if isinstance(value, list):
+        return [_as_node(each) for each in value]
+    if isinstance(value, dict):
+        return {name: _as_node(each) for name, each in value.items()}
+    return escaped(value) if isinstance(value, str) else value
 
 
 def check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
@@ -163,7 +202,7 @@ def check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
     Raises:
         ConfigError: the message names the swept settings.
     """
-    given = {name for each in words for name in settings_in(each)}
+    given = {setting_of(each) for each in words}
     swept = [name for name in cfg.hydra.sweeper.get("params") or {} if name not in given]
     if cfg.hydra.mode == RunMode.MULTIRUN and swept:
         chosen = cfg.hydra.runtime.choices
@@ -172,15 +211,6 @@ def check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
             f"{sweep}: a sweep over {', '.join(swept)}, for the command line; to train one agent, give "
             f"{'it a value' if len(swept) == 1 else 'each of them a value'}"
         )
-
-
-def _single_values(name: tuple[str, ...], value: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield the entries of a mapping, of the mappings in it and so on, or else the value itself; nothing if empty."""
-    if not isinstance(value, dict):
-        yield name, value.text if isinstance(value, QuotedString) else value
-        return
-    for entry, each in value.items():
-        yield from _single_values((*name, str(entry)), each)
 
 
 def given_twice(name: str, first: Any, second: Any) -> str:
@@ -206,7 +236,7 @@ def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list
 
 
 def choosing_class(group: str, cls: type) -> str:
-    """Return the word that chooses a class for a group, by its yaml file or as a choice of its own.
+    """Return the name of a class in a group: that of its yaml file, or a choice of its own, which Hydra then knows.
 
     Raises:
         ConfigError: the class does not fit the group, or has the name of another choice.
@@ -215,7 +245,7 @@ def choosing_class(group: str, cls: type) -> str:
     files = {file.stem: yaml.safe_load(file.read_text()) for file in sorted((conf_dir() / group).glob("*.yaml"))}
     own = [name for name, values in files.items() if values.get(TARGET) == dotted]
     if own:  # the file with the fewest differences from the class's defaults
-        return word(group, min(own, key=lambda name: len(files[name])))
+        return min(own, key=lambda name: len(files[name]))
     name = cls.__name__
     if name in files:
         raise ConfigError(f"{group}: {dotted} has the name of {file_of(group, name)}; rename the class")
@@ -226,4 +256,4 @@ def choosing_class(group: str, cls: type) -> str:
     budget = {"budget": _BUDGET} if group == "low" else {}
     settings = defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group]))
     ConfigStore.instance().store(name=name, group=group, node={TARGET: dotted, **settings, **budget})
-    return word(group, name)
+    return name

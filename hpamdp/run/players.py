@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
-from hpamdp.config.compose import read, setting_of
+from hpamdp.config.compose import choosing, job_overrides, read, setting_of
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.outside_jobs import composed, searching, word
+from hpamdp.config.outside_jobs import composed, searching
 from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.errors import closed_on_error
@@ -92,32 +92,42 @@ def whole_number(least: int, most: int) -> Callable[[str], int]:
     return read_number
 
 
-def load_agent(path: str | None, settings: Sequence[str], objects: Mapping[str, Any] | None = None) -> LoadedAgent:
+def load_agent(
+    path: str | None,
+    words: Sequence[str],
+    settings: Sequence[tuple[str, Any]] = (),
+    objects: Mapping[str, Any] | None = None,
+    *,
+    where: str = "player",
+) -> LoadedAgent:
     """Load a saved agent, or build one that settings describe.
 
     Args:
         path: the agent's folder, a checkpoint, `policy.safetensors`, or the name of an agent that comes with the
             package. If None, the settings describe the agent.
-        settings: words of a command line, such as `env=goal` or `eval.layouts=6`.
+        words: words of a command line, such as `env=goal` or `eval.layouts=6`.
+        settings: settings from Python code, as for `composed`.
         objects: arguments for the problem's constructor from Python code.
+        where: `player`, who is watched or played with, or `agent`, which Python code loads.
 
     Raises:
         ConfigError: the agent does not exist, or a setting is wrong or has no effect.
     """
-    for each in settings:
+    for each in words:
         if setting_of(each) in _SAVED:
             raise ConfigError(f"{each}: give the folder or the name of a saved agent alone, without a setting")
-    check_effects("player", settings)
-    words = list(settings)
+    saved: list[str] = []
     if path is not None:
-        words = [*saved_words(path, "checkpoint", settings), *settings, "mode=eval", word("checkpoint", path)]
-    with composed(words) as cfg:
+        saved = [*saved_words(path, "checkpoint", words), "mode=eval", choosing("checkpoint", path)]
+    with composed([*saved, *words], settings) as cfg:
+        given = [each for each in job_overrides() if each not in saved]
+        check_effects(where, given)
         if path is None:
-            check_effects("eval", settings)
-            config, source = choose_selector(read(cfg).with_objects(objects).with_run(mode="eval"), settings), None
+            check_effects("eval", given)
+            config, source = choose_selector(read(cfg).with_objects(objects).with_run(mode="eval"), given), None
             check(config)
         else:
-            config, source = resolve(cfg, settings, objects)
+            config, source = resolve(cfg, given, objects)
         torch.set_num_threads(config.run.threads)
         torch.manual_seed(config.run.seed)
         device = config.run.resolve_device()
