@@ -286,7 +286,7 @@ def _with_globs_written_out(line: CommandLine, conf: Path) -> CommandLine:
     Raises:
         ConfigError: a glob matches no choice.
     """
-    replaced = {}
+    replaced: dict[str, str] = {}
     for override in line.overrides:
         group, pattern = override.key_or_group, override.value()
         if isinstance(pattern, Glob) and line.is_multirun:

@@ -116,11 +116,11 @@ def load_agent(
     for each in words:
         if setting_of(each) in _SAVED:
             raise ConfigError(f"{each}: give the folder or the name of a saved agent alone, without a setting")
-    saved: list[str] = []
+    of_run: list[str] = []
     if path is not None:
-        saved = [*saved_words(path, "checkpoint", words), "mode=eval", choosing("checkpoint", path)]
-    with composed([*saved, *words], settings) as cfg:
-        given = [each for each in job_overrides() if each not in saved]
+        of_run = [*saved_words(path, "checkpoint", words), "mode=eval", choosing("checkpoint", path)]
+    with composed([*of_run, *words], settings) as cfg:
+        given = [each for each in job_overrides() if each not in of_run]
         check_effects(where, given)
         if path is None:
             check_effects("eval", given)

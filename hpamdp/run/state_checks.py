@@ -196,7 +196,7 @@ def checked_optimizer(where: str, saved: Any, optimizer: torch.optim.Optimizer) 
         raise ValueError(f"{where} has {len(state.param_groups)} param_groups, but must have {len(groups)}")
     for group, saved_group in zip(groups, state.param_groups, strict=True):
         for name, value in group.items():
-            found = saved_group.get(name)
+            found: Any = saved_group.get(name)
             if name in _SCHEDULED:
                 fits = type(found) in (int, float) and 0.0 <= found <= _MOST_SCHEDULED
                 group[name] = found

@@ -145,7 +145,7 @@ def _unpacked(value: Any, tensor: Callable[[str], Tensor]) -> Any:
 
 
 def _checksum(tensor: Tensor) -> int:
-    return zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy())
+    return zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data)
 
 
 def _checksum_of_json(content: Mapping[str, Any]) -> int:
