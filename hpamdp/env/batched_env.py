@@ -310,6 +310,12 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             yield from itertools.repeat(picture, max(1, round(fps * self.seconds_per_step)))
 
     @property
+    def position(self) -> Tensor | None:
+        """The columns `x` and `y` of the state, `[N, 2]`; None if it has none."""
+        columns = self._state._asdict()
+        return torch.stack([columns["x"], columns["y"]], -1) if {"x", "y"} <= columns.keys() else None
+
+    @property
     def has_choice(self) -> bool:
         """Whether the agent chooses an option."""
         return self._chooses or self.option_actions is not None

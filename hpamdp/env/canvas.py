@@ -76,6 +76,11 @@ class Canvas:
             x, y = start_x + piece * step_x, start_y + piece * step_y
             self._note_drawn((x, x + step_x), (y, y + step_y), r)
 
+    def way(self, places: Sequence[Point], colour: str, width: float = 2.0) -> None:
+        """Draw lines from each place to the next."""
+        for start, end in itertools.pairwise(places):
+            self.line(start, end, colour, width)
+
     def polygon(self, points: list[Point], fill: str, edge: str | None = None, width: float = 0.0) -> None:
         """Draw a polygon."""
         scaled = [(self._unit * x, self._unit * y) for x, y in points]
@@ -104,6 +109,30 @@ class Canvas:
         """Write a line of text. `anchor` is Pillow's: `lm` is the middle of the left edge."""
         x, y = place
         self._pen.text((x * self._unit, y * self._unit), text, colour, _font(size * self._unit), anchor)
+
+    def caption(
+        self,
+        steps: int,
+        outcome: int,
+        outcomes: Sequence[str],
+        *,
+        word: str = "step",
+        top: float = 22.0,
+        bottom: float = PAPER - 20.0,
+    ) -> None:
+        """Write the number of steps on the left and, if the episode is over, how it ended on the right.
+
+        Args:
+            steps: number of steps.
+            outcome: number of the outcome: 0 if the episode goes on, 1 if it succeeded.
+            outcomes: names of the outcomes.
+            word: what a step is called.
+            top, bottom: height of the steps and of the outcome.
+        """
+        self.write((18.0, top), f"{steps} {word if steps == 1 else f'{word}s'}", FAINT)
+        if outcome:
+            colour = GOOD_EDGE if outcome == 1 else BAD_EDGE
+            self.write((PAPER - 18.0, bottom), outcomes[outcome], colour, 16.0, anchor="rm")
 
 
 @lru_cache(maxsize=4)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from hpamdp.env import point_pictures
@@ -44,11 +43,6 @@ class PointEnv(BatchedEnv[PointEpisode], Generic[PointEpisode]):
     def facts(cls, options: Any) -> ProblemFacts:
         """Return the facts about the problem under these settings."""
         return ProblemFacts(title=cls.__name__, has_oracle=True)
-
-    @property
-    def position(self) -> Tensor:
-        """The agents' positions, `[N, 2]`."""
-        return torch.stack([self.state.x, self.state.y], -1)
 
     def draw(self, track: Sequence[PointEpisode]) -> np.ndarray:
         """Return a picture of the agent's path to the target, uint8 `[480, 480, 3]`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -61,8 +60,7 @@ def draw(scene: Scene, size: int = 480) -> np.ndarray:
     canvas.disc(on_paper(scene.target), scene.radius * scale, fill, edge, 1.6)
     canvas.disc(on_paper(scene.target), 2.5, edge)
     path = [on_paper(point) for point in scene.path]
-    for start, end in itertools.pairwise(path):
-        canvas.line(start, end, _PATH, 2.0)
+    canvas.way(path, _PATH)
     # On a long path, dots for single steps would merge.
     for point in path[1:-1] if len(path) < 60 else ():
         canvas.disc(point, 2.0, _PATH)

@@ -213,11 +213,6 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         return rendering.draw(rendering.scene_of(track, self.rules))
 
     @property
-    def position(self) -> Tensor:
-        """Positions of the boats, px from the harbour's centre, `[N, 2]`."""
-        return torch.stack([self._state.x, self._state.y], -1)
-
-    @property
     def symmetries(self) -> Symmetries:
         """The rotations and reflections of the plane that permute the directions of a controller or swap controllers.
 

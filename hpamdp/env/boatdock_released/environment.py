@@ -76,6 +76,7 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
     parameter_high = (1.0,) * 3
     start_shapes: ClassVar[Mapping[str, tuple[int, ...]]] = {"start": (2,), "goal": (2,), "keymap": ()}
     action_names = ("key", "durations")
+    position = None  # evaluations keep no paths
 
     def __init__(
         self,

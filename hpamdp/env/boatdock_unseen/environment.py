@@ -205,11 +205,6 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
             redundant=tuple(entry[name] for name in names),
         )
 
-    @property
-    def position(self) -> Tensor:
-        """Positions of the boats, px from the harbour's centre, `[N, 2]`."""
-        return torch.stack([self._state.x, self._state.y], -1)
-
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
         """Return the pictures of one session, in which boats move as they do in the task."""
         from hpamdp.env.boatdock_unseen import film  # only films need it

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD_EDGE, INK, PAPER, Canvas
+from hpamdp.env.canvas import BACKGROUND, FAINT, INK, PAPER, Canvas
 from hpamdp.env.circuit import gates, rules
 from hpamdp.env.circuit.gates import Gate
 from hpamdp.env.circuit.rules import CircuitState, Design
@@ -55,12 +55,8 @@ def draw(track: Sequence[CircuitState], design: Design, size: int = 480) -> np.n
                 (_x(place), _WIRES_TOP + _WIRES_HEIGHT), f"{math.degrees(angle):.0f}°", FAINT, 10.0, anchor="mm"
             )
     num = len([gate for gate, _ in used if gate.kind != gates.STOP])
-    finished.write((18.0, 22.0), f"{num} {'gate' if num == 1 else 'gates'}", FAINT)
+    finished.caption(num, int(last.outcome), rules.OUTCOMES, word="gate")
     finished.write((left, top - 16.0), f"similarity {similarity:.3f}, cost {float(last.cost):.3f}", INK)
-    outcome = int(last.outcome)
-    if outcome != rules.BUILDING:
-        colour = GOOD_EDGE if outcome == rules.MATCHED else BAD_EDGE
-        finished.write((PAPER - 18.0, PAPER - 20.0), rules.OUTCOMES[outcome], colour, 16.0, anchor="rm")
     return np.array(finished.image)
 
 

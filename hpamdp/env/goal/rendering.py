@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 
 import numpy as np
 from torch import Tensor
 
-from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD_EDGE, INK, PAPER, Canvas, Point
+from hpamdp.env.canvas import BACKGROUND, INK, PAPER, Canvas, Point
 from hpamdp.env.goal import rules
 from hpamdp.env.goal.rules import GoalState
 
@@ -36,20 +35,15 @@ def draw(track: Sequence[GoalState], size: int = 480) -> np.ndarray:
         post = (rules.LENGTH, side * rules.GOAL_HALF_WIDTH)
         canvas.line(_on_paper((rules.LENGTH, side * rules.HALF_WIDTH)), _on_paper(post), _LINE, 2.0)
         canvas.disc(_on_paper(post), 4.0, INK)
-    places = [_place(state.ball_x, state.ball_y) for state in track]
-    for start, end in itertools.pairwise(places):
-        canvas.line(_on_paper(start), _on_paper(end), _PATH, 2.0)
-    for place in places[:-1]:
-        canvas.disc(_on_paper(place), 2.5, _PATH)
+    path = [_on_paper(_place(state.ball_x, state.ball_y)) for state in track]
+    canvas.way(path, _PATH)
+    for place in path[:-1]:
+        canvas.disc(place, 2.5, _PATH)
     _draw_body(canvas, _place(last.keeper_x, last.keeper_y), float(last.keeper_angle), rules.KEEPER_SIZE, _KEEPER)
     _draw_body(canvas, _place(last.player_x, last.player_y), float(last.player_angle), rules.PLAYER_SIZE, _PLAYER)
-    canvas.disc(_on_paper(places[-1]), rules.BALL_SIZE * _SCALE, _BALL, BACKGROUND, 1.5)
+    canvas.disc(path[-1], rules.BALL_SIZE * _SCALE, _BALL, BACKGROUND, 1.5)
     finished = canvas.smoothed()
-    steps, outcome = int(last.steps), int(last.outcome)
-    finished.write((18.0, 16.0), f"{steps} {'step' if steps == 1 else 'steps'}", FAINT)
-    if outcome != rules.PLAYING:
-        colour = GOOD_EDGE if outcome == rules.GOAL else BAD_EDGE
-        finished.write((PAPER - 18.0, 16.0), rules.OUTCOMES[outcome], colour, 16.0, anchor="rm")
+    finished.caption(int(last.steps), int(last.outcome), rules.OUTCOMES, top=16.0, bottom=16.0)
     return np.array(finished.image)
 
 

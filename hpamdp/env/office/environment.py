@@ -65,11 +65,6 @@ class OfficeEnv(BatchedEnv[OfficeState]):
         """The lowest and the highest observation, `[4 + 2 tiles]` each."""
         return bounds_with_tiles(len(rules.OBSERVATION_NAMES), self.options.tiles)
 
-    @property
-    def position(self) -> Tensor:
-        """The agents' positions, `[N, 2]`."""
-        return torch.stack([self.state.x, self.state.y], -1)
-
     def start(self, episode: Tensor, rng: RngKey) -> OfficeState:
         """Return the states at the start, with neither coffee nor mail; nothing about them is random."""
         return rules.start(episode)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
-from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, Canvas, Point
+from hpamdp.env.canvas import BACKGROUND, FAINT, GOOD, GOOD_EDGE, INK, Canvas, Point
 from hpamdp.env.office import rules
 from hpamdp.env.office.options import GOALS
 from hpamdp.env.office.rules import OfficeState
@@ -37,21 +36,16 @@ def draw(track: Sequence[OfficeState], size: int = 480) -> np.ndarray:
     for wall in rules.WALLS:
         canvas.polygon(_box(*wall), _WALL)
     places = [_on_paper(float(state.x), float(state.y)) for state in track]
-    for start, end in itertools.pairwise(places):
-        canvas.line(start, end, _PATH, 2.0)
+    canvas.way(places, _PATH)
     canvas.disc(places[0], 4.0, BACKGROUND, INK, 1.5)
     canvas.disc(places[-1], 7.0, _BODY, BACKGROUND, 1.6)
     for place, (is_held, colour) in enumerate(zip(has, (_COFFEE, _MAIL), strict=True)):
         if is_held:
             canvas.disc((places[-1][0] + (-3.0, 3.0)[place], places[-1][1]), 2.6, colour)
     finished = canvas.smoothed()
-    steps, outcome = int(last.steps), int(last.outcome)
-    finished.write((18.0, 22.0), f"{steps} {'step' if steps == 1 else 'steps'}", FAINT)
+    finished.caption(int(last.steps), int(last.outcome), rules.OUTCOMES)
     for (x, y), name in zip(rules.PLACES, GOALS, strict=True):
         finished.write(_on_paper(x, y), name, INK, 12.0, anchor="mm")
-    if outcome != rules.ON_THE_WAY:
-        colour = GOOD_EDGE if outcome == rules.DELIVERED else BAD_EDGE
-        finished.write((PAPER - 18.0, PAPER - 20.0), rules.OUTCOMES[outcome], colour, 16.0, anchor="rm")
     return np.array(finished.image)
 
 

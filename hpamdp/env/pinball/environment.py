@@ -78,11 +78,6 @@ class PinballEnv(BatchedEnv[PinballState]):
         """The lowest and the highest observation, `[4 + 2 tiles]` each."""
         return bounds_with_tiles(len(rules.OBSERVATION_NAMES), self.options.tiles)
 
-    @property
-    def position(self) -> Tensor:
-        """The balls' positions, `[N, 2]`."""
-        return torch.stack([self.state.x, self.state.y], -1)
-
     def file_checksums(self) -> dict[str, Tensor]:
         """Return the checksum of a map that is not the source's, int64 `[1]`; nothing for the source's maps."""
         if self.options.map in SOURCE_MAPS:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
-from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, PAPER, Canvas, Point
+from hpamdp.env.canvas import BACKGROUND, GOOD, GOOD_EDGE, PAPER, Canvas, Point
 from hpamdp.env.pinball import rules
 from hpamdp.env.pinball.maps import PinballMap
 from hpamdp.env.pinball.rules import PinballState
@@ -32,15 +31,10 @@ def draw(track: Sequence[PinballState], table: PinballMap, size: int = 480) -> n
     for polygon in table.polygons:
         canvas.polygon([_on_paper(corner) for corner in polygon], _WALL)
     path = [_on_paper((float(state.x), float(state.y))) for state in track]
-    for begin, end in itertools.pairwise(path):
-        canvas.line(begin, end, _PATH, 2.0)
+    canvas.way(path, _PATH)
     canvas.disc(path[-1], table.ball * _SCALE, _BALL, BACKGROUND, 1.5)
     finished = canvas.smoothed()
-    steps, outcome = int(track[-1].steps), int(track[-1].outcome)
-    finished.write((18.0, 18.0), f"{steps} {'step' if steps == 1 else 'steps'}", FAINT)
-    if outcome != rules.ROLLING:
-        colour = GOOD_EDGE if outcome == rules.REACHED else BAD_EDGE
-        finished.write((PAPER - 18.0, 18.0), rules.OUTCOMES[outcome], colour, 16.0, anchor="rm")
+    finished.caption(int(track[-1].steps), int(track[-1].outcome), rules.OUTCOMES, top=18.0, bottom=18.0)
     return np.array(finished.image)
 
 

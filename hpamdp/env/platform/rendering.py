@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
-from hpamdp.env.canvas import BAD_EDGE, FAINT, GOOD_EDGE, INK, PAPER, Canvas
+from hpamdp.env.canvas import INK, PAPER, Canvas
 from hpamdp.env.platform import rules
 from hpamdp.env.platform.rules import PlatformState
 
@@ -30,21 +29,17 @@ def draw(track: Sequence[PlatformState], size: int = 480) -> np.ndarray:
         canvas.polygon([_on_paper(x, y) for x, y in corners], _GROUND)
     last = track[-1]
     middles = [float(state.x) + rules.BODY_WIDTH / 2.0 for state in track]
-    for start, end in itertools.pairwise(middles):
-        canvas.line(_on_paper(start, 60.0), _on_paper(end, 60.0), _PATH, 2.0)
-    for middle in middles:
-        canvas.disc(_on_paper(middle, 60.0), 2.6, _PATH)
+    path = [_on_paper(middle, 60.0) for middle in middles]
+    canvas.way(path, _PATH)
+    for place in path:
+        canvas.disc(place, 2.6, _PATH)
     for enemy in _enemies(track):
         _draw_body(canvas, enemy, _ENEMY, 0.0)
     has_fallen = int(last.outcome) == rules.FELL
     _draw_body(canvas, float(last.x), _AGENT, -rules.BODY_HEIGHT if has_fallen else 0.0)
     finished = canvas.smoothed()
-    steps, outcome = int(last.steps), int(last.outcome)
-    finished.write((18.0, 22.0), f"{steps} {'action' if steps == 1 else 'actions'}", FAINT)
+    finished.caption(int(last.steps), int(last.outcome), rules.OUTCOMES, word="action")
     finished.write((PAPER - 18.0, 22.0), f"{100.0 * float(last.x) / rules.END:.0f} % of the course", INK, anchor="rm")
-    if outcome != rules.ON_THE_WAY:
-        colour = GOOD_EDGE if outcome == rules.ARRIVED else BAD_EDGE
-        finished.write((PAPER - 18.0, PAPER - 20.0), rules.OUTCOMES[outcome], colour, 16.0, anchor="rm")
     return np.array(finished.image)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, Canvas, Point
+from hpamdp.env.canvas import BACKGROUND, GOOD, GOOD_EDGE, INK, PAPER, Canvas, Point
 from hpamdp.env.rooms import rules
 
 _WALL, _DOORWAY, _ICE, _SAND = "#8f8a7c", "#fffdf8", "#d6e7ec", "#f4e6c4"
@@ -32,18 +32,13 @@ def draw(path: Sequence[tuple[int, int]], outcome: int, size: int = 480) -> np.n
     for x, y in itertools.product(range(rules.SIZE), repeat=2):
         canvas.polygon(_square((x, y)), _floor(x, y))
     canvas.polygon(_square((rules.GOAL, rules.GOAL)), GOOD, GOOD_EDGE, 2.0)
-    for start, end in itertools.pairwise(path):
-        canvas.line(_middle(start), _middle(end), _PATH, 2.5)
+    canvas.way([_middle(cell) for cell in path], _PATH, 2.5)
     for cell in path[1:-1]:
         canvas.disc(_middle(cell), 3.5, _PATH)
     canvas.disc(_middle(path[0]), 6.0, BACKGROUND, INK, 2.0)
     canvas.disc(_middle(path[-1]), 9.0, _BODY, BACKGROUND, 1.6)
     finished = canvas.smoothed()
-    steps = len(path) - 1
-    finished.write((18.0, 22.0), f"{steps} {'step' if steps == 1 else 'steps'}", FAINT)
-    if outcome != rules.GOING_ON:
-        colour = GOOD_EDGE if outcome == rules.ARRIVED else BAD_EDGE
-        finished.write((PAPER - 18.0, PAPER - 20.0), rules.OUTCOMES[outcome], colour, 16.0, anchor="rm")
+    finished.caption(len(path) - 1, outcome, rules.OUTCOMES)
     return np.array(finished.image)
 
 
