@@ -145,17 +145,6 @@ def test_pictures_are_made_when_they_are_asked_for():
     assert len(list(itertools.islice(pictures, 4))) == 4 and env.asked == 10
 
 
-def test_a_gif_that_takes_too_much_memory_is_refused_before_all_of_its_pictures_are_made(tmp_path, monkeypatch):
-    monkeypatch.setattr(film, "MOST_KEPT", 1 << 20)
-    same = np.zeros((100, 100, 3), np.uint8)
-    film.write(tmp_path / "a.gif", itertools.repeat(same, 1000), 10.0)  # counts once
-    env = Endless()
-    with pytest.raises(film.TooLargeError, match=r"b\.gif: the pictures of the GIF take more than 1 MiB of memory"):
-        film.write(tmp_path / "b.gif", film.film(env, [None], 10.0, 100), 10.0)
-    assert 90 < env.asked < 110
-    assert not (tmp_path / "b.gif").exists()
-
-
 def test_pictures_that_stay_the_same_are_kept_once(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (300, 300, 3), np.uint8)
     tracemalloc.start()
@@ -163,22 +152,6 @@ def test_pictures_that_stay_the_same_are_kept_once(tmp_path):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 30 * noise.nbytes
-
-
-def test_watch_names_the_flags_that_make_a_gif_smaller(command, monkeypatch, tmp_path):
-    monkeypatch.setattr(film, "MOST_KEPT", 1 << 14)
-    code, _, err = command("watch", "high=uniform", "low=random", "--episodes", "2", "--to", "a.gif", "--size", "200")
-    assert code == 2 and err.count("\n") == 1
-    assert "a.gif: the pictures of the GIF take more than 0 MiB of memory; use a smaller --size, --fps" in err
-    assert "or --episodes, or write an .mp4" in err and not (tmp_path / "a.gif").exists()
-
-
-def test_a_run_ends_without_the_film_that_would_take_too_much_memory(command, monkeypatch, tmp_path):
-    monkeypatch.setattr(film, "MOST_KEPT", 1 << 14)
-    words = ["env=platform", "high=none", "low=random", "num_envs=2", "steps_per_batch=4", "total_frames=8"]
-    code, _, err = command(*words, "eval.layouts=2")
-    assert code == 0 and "film=false leaves the film out" in err
-    assert not [*tmp_path.rglob("episodes.gif")] and [*tmp_path.rglob("summary.json")]
 
 
 def test_a_path_is_told_from_settings(tmp_path):

@@ -10,7 +10,6 @@ from PIL import Image
 from tensordict import TensorDict
 from toy_environments import Drawn
 
-from hpamdp.analysis import film
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 
@@ -97,11 +96,3 @@ def test_a_run_with_running_statistics_evaluates_and_leaves_a_film(command, tmp_
     code, _, err = command(*words, "num_envs=2", "steps_per_batch=4", "total_frames=16", "eval.layouts=2")
     assert code == 0, err
     assert list(tmp_path.rglob("episodes.gif"))
-
-
-def test_watch_refuses_more_pictures_than_it_may_keep_and_names_the_settings(command, monkeypatch, tmp_path):
-    monkeypatch.setattr(film, "MOST_KEPT", 1 << 20)
-    code, _, err = command("watch", "low=random", *WORDS, "env.kwargs={render_mode:rgb_array}", "--episodes", "3")
-    assert code == 2 and err.count("\n") == 1
-    assert "--episodes 3: the pictures of 3 steps take more than 1 MiB of memory" in err
-    assert "use fewer --episodes or a smaller env.max_steps" in err and not (tmp_path / "episodes.gif").exists()

@@ -24,7 +24,6 @@ MOST_FPS = 240
 MOST_PIXELS = 8192  # from edge to edge of a film
 _PAUSE = 1.5  # seconds for which the last picture stays
 _GIF_COLOURS = 128
-MOST_KEPT = 1 << 31  # bytes of pictures that wait in memory
 
 Track = Sequence[Mapping[str, Tensor]]
 
@@ -35,10 +34,6 @@ class FilmError(ValueError):
 
 class NoPictureError(FilmError):
     """Raised if there is no picture to write."""
-
-
-class TooLargeError(FilmError):
-    """Raised if the pictures take too much memory. The caller knows the settings that make them smaller."""
 
 
 def grid(num_episodes: int) -> tuple[int, int]:
@@ -97,7 +92,6 @@ def write(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 
     Raises:
         NoPictureError: there is no picture.
-        TooLargeError: the pictures of a GIF take too much memory.
         FilmError: the path has another suffix, or imageio is missing.
     """
     remaining = iter(pictures)
@@ -117,18 +111,12 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:
     # All pictures share one palette, made from three of them, because separate palettes would flicker. Until the last
     # picture is there, they wait in memory. Compressed, drawn ones take a fiftieth of their size.
     kept: list[bytes] = []
-    num_bytes = 0
     shape: tuple[int, ...] = ()
     for picture in pictures:
         shape = picture.shape
         compressed = zlib.compress(picture.tobytes(), 1)
-        if kept and compressed == kept[-1]:
-            kept.append(kept[-1])  # the same object, which takes no further memory
-            continue
-        kept.append(compressed)
-        num_bytes += len(compressed) + shape[0] * shape[1]  # Pillow keeps a byte for each pixel
-        if num_bytes > MOST_KEPT:
-            raise TooLargeError(f"{path}: the pictures of the GIF take more than {MOST_KEPT >> 20} MiB of memory")
+        # The same object takes no further memory.
+        kept.append(kept[-1] if kept and compressed == kept[-1] else compressed)
 
     def restored(number: int) -> np.ndarray:
         return np.frombuffer(zlib.decompress(kept[number]), np.uint8).reshape(shape)

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, cast, get_args
 from urllib.parse import urlsplit
 
 from pydantic import ValidationError
@@ -32,15 +32,8 @@ class EarlierRun(NamedTuple):
 
 # Seconds that an online wandb run may keep the training waiting, at its start and at its end.
 _WANDB_START, _WANDB_FINISH = 20.0, 60.0
-WandbMode = Literal["offline", "online", "disabled"]
-# Values of WANDB_MODE, with two older names of wandb.
-_WANDB_MODES: dict[str, WandbMode] = {
-    "online": "online",
-    "offline": "offline",
-    "disabled": "disabled",
-    "run": "online",
-    "dryrun": "offline",
-}
+
+WandbMode = Literal["online", "offline", "disabled"]
 
 
 class Logger(Protocol):
@@ -67,7 +60,7 @@ class Logger(Protocol):
 
 
 class LenientLogger:
-    """Pass every call on to a logger. After its first error, warn once and drop all later calls.
+    """A logger that may fail: after its first error, warn once and drop all later calls.
 
     Args:
         name: the logger's name, for the warning.
@@ -84,11 +77,12 @@ class LenientLogger:
         except Exception as error:
             self._give_up(error)
 
-    def _pass(self, call: Callable[[Logger], None]) -> None:
+    def call(self, act: Callable[[Logger], None]) -> None:
+        """Act on the logger, unless it has failed before."""
         if self._logger is None:
             return
         try:
-            call(self._logger)
+            act(self._logger)
         except Exception as error:
             self._give_up(error)
 
@@ -100,26 +94,6 @@ class LenientLogger:
         with suppress(Exception):
             getattr(self._logger, "abandon", lambda: None)()
         self._logger = None
-
-    def log(self, row: dict[str, float], step: int) -> None:
-        """Pass one row on."""
-        self._pass(lambda logger: logger.log(row, step))
-
-    def images(self, paths: Iterable[Path]) -> None:
-        """Pass figures on."""
-        self._pass(lambda logger: logger.images(paths))
-
-    def film(self, path: Path) -> None:
-        """Pass a film on."""
-        self._pass(lambda logger: logger.film(path))
-
-    def summary(self, figures: dict[str, Any]) -> None:
-        """Pass the summary on."""
-        self._pass(lambda logger: logger.summary(figures))
-
-    def close(self) -> None:
-        """Close the logger."""
-        self._pass(lambda logger: logger.close())
 
 
 class CSVLogger(Logger):
@@ -339,19 +313,17 @@ def _wandb_id(folder: Path) -> str | None:
 
 def _check_wandb_mode() -> None:
     given = os.environ.get("WANDB_MODE")
-    if given and given not in _WANDB_MODES:
-        raise SettingError(f"WANDB_MODE={given}: must be one of {', '.join(_WANDB_MODES)}")
+    if given and given not in get_args(WandbMode):
+        raise SettingError(f"WANDB_MODE={given}: must be one of {', '.join(get_args(WandbMode))}")
 
 
 def _wandb_mode(mode: str, server: str) -> WandbMode:
-    given = mode
     if mode == "auto":
-        given = os.environ.get("WANDB_MODE") or ("online" if _has_wandb_key(server) else "offline")
-    chosen = _WANDB_MODES[given]
-    if chosen == "online" and not _has_wandb_key(server):
+        mode = os.environ.get("WANDB_MODE") or ("online" if _has_wandb_key(server) else "offline")
+    if mode == "online" and not _has_wandb_key(server):
         warn("wandb has no API key (WANDB_API_KEY or netrc), so the run is logged offline")
         return "offline"
-    return chosen
+    return cast("WandbMode", mode)
 
 
 def _has_wandb_key(server: str) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +65,7 @@ class Recorder:
         self.output_dir = output_dir
         self.metrics = Metrics(None if output_dir is None else output_dir / METRICS_NAME)
         self.summary: dict[str, Any] = {}
-        self._logger: Logger | None = None
+        self._logger: LenientLogger | None = None
         self._resumed_from: Path | None = None  # the folder of the run that is continued
         self._ended: list[TensorDictBase] = []
         self._scalars: dict[str, float] = {}
@@ -180,8 +180,7 @@ class Recorder:
             measured = self.parts.evaluation.measure(self._play())
             row |= {f"eval/{name}": value for name, value in (measured | self._drift(measured)).items()}
         self.metrics.append(row)
-        if self._logger is not None:
-            self._logger.log(row, frames)
+        self._pass_on(lambda logger: logger.log(row, frames))
         self._ended = []
         self._scalars = {}
         return row
@@ -241,13 +240,15 @@ class Recorder:
             partial.write_text(json.dumps(self.summary, indent=2) + "\n")
         images = figures.draw_all(folder, type(self.parts.evaluation.problem), self.summary, played)
         filmed = self._film(folder)
-        if self._logger is None:
-            return
-        self._logger.images(images)
+        self._pass_on(lambda logger: logger.images(images))
         if filmed is not None:
-            self._logger.film(filmed)
-        self._logger.summary(self.summary)
-        self._logger.close()
+            self._pass_on(lambda logger: logger.film(filmed))
+        self._pass_on(lambda logger: logger.summary(self.summary))
+        self._pass_on(lambda logger: logger.close())
+
+    def _pass_on(self, act: Callable[[Logger], None]) -> None:
+        if self._logger is not None:
+            self._logger.call(act)
 
     def _film(self, folder: Path) -> Path | None:
         """Film the first episodes of the last evaluation, if the problem has pictures, and return the file."""
@@ -258,9 +259,6 @@ class Recorder:
         try:
             film.write(path, pictures, _FPS)
         except film.NoPictureError:
-            return None
-        except film.TooLargeError as error:
-            warn(f"{error}; film=false leaves the film out")
             return None
         return path
 

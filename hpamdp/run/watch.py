@@ -60,15 +60,13 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     lack = f"{player.config.env}: has no pictures to film{'' if draws else '; use env.render=true'}"
     if not evaluation.problem.film_state(1):
         raise ConfigError(lack)
-    states = _States(options.episodes)
+    states: list[dict[str, Tensor]] = []
     played = evaluation.run(player.agent.policy, states)
     pictures = film.film(evaluation.problem, film.tracks_of(states), float(options.fps), options.size)
     try:
         film.write(options.to, pictures, float(options.fps))
     except film.NoPictureError as error:
         raise ConfigError(lack) from error
-    except film.TooLargeError as error:
-        raise ConfigError(f"--to {error}; use a smaller --size, --fps or --episodes, or write an .mp4") from error
     except film.FilmError as error:
         raise ConfigError(f"--to {error}") from error
     except OSError as error:
@@ -76,29 +74,6 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     scores = ", ".join(f"{score:.2f}" for score in played["score"])
     say(f"{options.to}: {len(played['score'])} episodes, scores {scores}")
     return 0
-
-
-class _States(list[dict[str, Tensor]]):
-    """The states of the filmed episodes. Those of problems that draw themselves are pictures, which wait in memory."""
-
-    def __init__(self, num_episodes: int) -> None:
-        super().__init__()
-        self._num_episodes = num_episodes
-        self._num_bytes = 0
-
-    def append(self, state: dict[str, Tensor]) -> None:
-        """Add the states after a step.
-
-        Raises:
-            ConfigError: all of them take too much memory.
-        """
-        super().append(state)
-        self._num_bytes += sum(column.nbytes for column in state.values())
-        if self._num_bytes > film.MOST_KEPT:
-            raise ConfigError(
-                f"--episodes {self._num_episodes}: the pictures of {len(self)} steps take more than "
-                f"{film.MOST_KEPT >> 20} MiB of memory; use fewer --episodes or a smaller env.max_steps"
-            )
 
 
 def _check_film(options: argparse.Namespace) -> None:
