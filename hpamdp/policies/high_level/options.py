@@ -1,4 +1,4 @@
-"""Settings of the selectors."""
+"""The settings and the cards of the selectors."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from hpamdp.policies.shared.bandit_options import (
     SessionBanditOptions,
 )
 from hpamdp.policies.shared.options import (
+    MemoryOptions,
     OnPolicyOptions,
     OptionValueOptions,
-    SelectorMemoryOptions,
-    SelectorReplayMemoryOptions,
-    SelectorStackOptions,
+    ReplayMemoryOptions,
+    StackOptions,
 )
 from hpamdp.settings import Fraction, LearningRate, OnlyWith, OwnSteps, PositiveFraction, Settings, Widths
 
@@ -65,7 +65,7 @@ class LinUCBOptions(LinearBanditOptions):
     """Width of the bounds, in standard deviations of the prediction; alpha in the source."""
 
 
-class ActorOptions(SelectorMemoryOptions, OnPolicyOptions):
+class ActorOptions(MemoryOptions, OnPolicyOptions):
     """Settings of `Actor`; the rows of an update are decisions."""
 
     hidden_dims: Widths = (128, 128)
@@ -80,7 +80,7 @@ class ActorOptions(SelectorMemoryOptions, OnPolicyOptions):
     """Weight of the entropy bonus. With 0.02 the policy settles on the option whose learner improves first."""
 
 
-class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
+class MetaCriticOptions(ReplayMemoryOptions, OptionValueOptions):
     """Settings of `MetaCritic`; an update learns from stored decisions."""
 
     num_members: PositiveInt = 3
@@ -100,7 +100,7 @@ class MetaCriticOptions(SelectorReplayMemoryOptions, OptionValueOptions):
     """Decisions of all environments, with random options, before the first update; those of a data set do not count."""
 
 
-class OptionCriticOptions(SelectorStackOptions, OptionValueOptions):
+class OptionCriticOptions(StackOptions, OptionValueOptions):
     """Settings of `OptionCritic`; an update learns from stored steps."""
 
     batch_size: PositiveInt = 512

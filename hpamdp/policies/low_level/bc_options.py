@@ -1,4 +1,4 @@
-"""Settings of `bc`."""
+"""The settings and the card of behaviour cloning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of `hppo`."""
+"""The settings and the card of H-PPO."""
 
 from __future__ import annotations
 

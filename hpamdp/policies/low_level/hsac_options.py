@@ -1,4 +1,4 @@
-"""Settings of `hsac`."""
+"""The settings and the card of H-SAC."""
 
 from __future__ import annotations
 

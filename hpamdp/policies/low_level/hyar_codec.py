@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from hpamdp.policies.low_level.hyar_options import CodecOptions
+from hpamdp.policies.low_level.hyar_options import HyAROptions
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.networks import OutputLinear, as_preactivations, mlp
 from hpamdp.specs import PAMDPSpecs
@@ -26,7 +26,7 @@ class HybridCodec(nn.Module):
     z_low: Tensor
     z_high: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, latent_dim: int, options: CodecOptions) -> None:
+    def __init__(self, specs: PAMDPSpecs, latent_dim: int, options: HyAROptions) -> None:
         super().__init__()
         self.latent_dim = latent_dim
         self.is_change_bounded = options.predicted_change == "bounded"

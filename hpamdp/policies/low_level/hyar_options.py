@@ -1,4 +1,4 @@
-"""Settings of HyAR."""
+"""The settings and the card of HyAR."""
 
 from __future__ import annotations
 
@@ -10,12 +10,59 @@ from typing_extensions import Self
 
 from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import REPLAY_CARD, SearchingActorOptions, TargetRateOptions
-from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction, Settings
+from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction
 
 
-class CodecOptions(Settings):
-    """Settings of `HybridCodec` and of its training."""
+class HyAROptions(TargetRateOptions, SearchingActorOptions):
+    """Settings of `HyAR`. Noise is in units where the latent action's bounds are [-1, 1].
 
+    The published settings are those of `low=hyar_published`.
+    """
+
+    twin: bool = True
+    """Train by TD3 (HyAR-TD3). If false, train by DDPG (HyAR-DDPG): one critic, no delay, no target smoothing."""
+    discrete: Literal["greedy", "nearest"] = "greedy"
+    """Discrete action: the one with the highest value (`greedy`), or with the embedding nearest to e (`nearest`).
+
+    `nearest` is the published form. With `greedy`, updates take longer the more discrete actions there are.
+    """
+    warmup_steps: PositiveInt = 2000
+    """Random steps of a learner before its first update; the codec is trained on them."""
+    critic_window: PositiveInt | None = None
+    """Newest steps after the warm-up that the critics and the actor learn from; if null, all that are stored."""
+    inverting_gradients: bool = False
+    """Scale the gradient of a latent action by the range that is left to its bound, as published, in addition to tanh.
+
+    The range is that in the direction of the gradient (Hausknecht and Stone 2016, arXiv 1511.04143).
+    """
+    actor_max_grad_norm: PositiveFloat | None = None
+    """Largest gradient norm of an update of the actor; if null, there is no limit."""
+    noise_initial: PositiveFloat | None = None
+    """Scale of the exploring noise after the warm-up; it falls to `parameter_noise`. If null, it is constant."""
+    noise_episodes: Annotated[PositiveInt, OnlyWith("noise_initial")] = 1000
+    """The learner's own episodes, after its warm-up, within which the scale of the noise falls linearly."""
+    correction_factor: Annotated[PositiveFloat, OnlyWith("parameter_tolerance", None)] = 5.0
+    """Encode a stored z again if the error of its predicted change is this many times the codec's error."""
+    correction_error: Annotated[Literal["mean", "latest"], OnlyWith("parameter_tolerance", None)] = "mean"
+    """The codec's error: its mean over the last hundred or so updates of the codec, or the `latest`, as published.
+
+    The latest error is that of the 4,096 stored transitions from which the range of z was estimated last.
+    """
+    parameter_tolerance: NonNegativeFloat | None = None
+    """Encode a stored z again if its decoded parameters differ from the executed ones by more than this.
+
+    If null, the predicted change decides (`correction_factor`). If the next state is hard to predict, the parameters
+    are the surer sign.
+    """
+    relabelling: Literal["mean", "sample"] = "sample"
+    """Latent action in place of an outdated or random one: the encoder's mean, or a sample as published.
+
+    The means lie on a line in the latent space. Off that line, where the actor goes, only samples teach the critics.
+    """
+    lr_final_fraction: PositiveFraction = 0.1
+    """Fraction of the three learning rates that is left after `lr_steps`; 1 keeps them constant."""
+    epsilon_steps: NonNegativeInt = 15_000
+    """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
     embedding_dim: PositiveInt = 6
     """Dimension of a discrete action's embedding e."""
     latent_dim: PositiveInt | None = None
@@ -68,58 +115,6 @@ class CodecOptions(Settings):
     """Central fraction of the encoded z that the actor can reach: the latent-space constraint of the paper."""
     latent_range_every: PositiveInt = 100
     """Updates of the codec for each new estimate of the range of z, from 4,096 stored transitions."""
-
-
-class HyAROptions(CodecOptions, TargetRateOptions, SearchingActorOptions):
-    """Settings of `HyAR`. Noise is in units where the latent action's bounds are [-1, 1].
-
-    The published settings are those of `low=hyar_published`.
-    """
-
-    twin: bool = True
-    """Train by TD3 (HyAR-TD3). If false, train by DDPG (HyAR-DDPG): one critic, no delay, no target smoothing."""
-    discrete: Literal["greedy", "nearest"] = "greedy"
-    """Discrete action: the one with the highest value (`greedy`), or with the embedding nearest to e (`nearest`).
-
-    `nearest` is the published form. With `greedy`, updates take longer the more discrete actions there are.
-    """
-    warmup_steps: PositiveInt = 2000
-    """Random steps of a learner before its first update; the codec is trained on them."""
-    critic_window: PositiveInt | None = None
-    """Newest steps after the warm-up that the critics and the actor learn from; if null, all that are stored."""
-    inverting_gradients: bool = False
-    """Scale the gradient of a latent action by the range that is left to its bound, as published, in addition to tanh.
-
-    The range is that in the direction of the gradient (Hausknecht and Stone 2016, arXiv 1511.04143).
-    """
-    actor_max_grad_norm: PositiveFloat | None = None
-    """Largest gradient norm of an update of the actor; if null, there is no limit."""
-    noise_initial: PositiveFloat | None = None
-    """Scale of the exploring noise after the warm-up; it falls to `parameter_noise`. If null, it is constant."""
-    noise_episodes: Annotated[PositiveInt, OnlyWith("noise_initial")] = 1000
-    """The learner's own episodes, after its warm-up, within which the scale of the noise falls linearly."""
-    correction_factor: Annotated[PositiveFloat, OnlyWith("parameter_tolerance", None)] = 5.0
-    """Encode a stored z again if the error of its predicted change is this many times the codec's error."""
-    correction_error: Annotated[Literal["mean", "latest"], OnlyWith("parameter_tolerance", None)] = "mean"
-    """The codec's error: its mean over the last hundred or so updates of the codec, or the `latest`, as published.
-
-    The latest error is that of the 4,096 stored transitions from which the range of z was estimated last.
-    """
-    parameter_tolerance: NonNegativeFloat | None = None
-    """Encode a stored z again if its decoded parameters differ from the executed ones by more than this.
-
-    If null, the predicted change decides (`correction_factor`). If the next state is hard to predict, the parameters
-    are the surer sign.
-    """
-    relabelling: Literal["mean", "sample"] = "sample"
-    """Latent action in place of an outdated or random one: the encoder's mean, or a sample as published.
-
-    The means lie on a line in the latent space. Off that line, where the actor goes, only samples teach the critics.
-    """
-    lr_final_fraction: PositiveFraction = 0.1
-    """Fraction of the three learning rates that is left after `lr_steps`; 1 keeps them constant."""
-    epsilon_steps: NonNegativeInt = 15_000
-    """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
 
     @model_validator(mode="after")
     def _check_hyar(self) -> Self:

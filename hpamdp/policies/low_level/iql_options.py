@@ -1,4 +1,4 @@
-"""Settings of `iql`."""
+"""The settings and the card of IQL."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Annotated
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from hpamdp.cards import ActionFeature
-from hpamdp.policies.shared.options import REPLAY_CARD, ActorCriticOptions, HeadOptions, ScaleOptions, TargetRateOptions
+from hpamdp.policies.shared.options import REPLAY_CARD, ActorCriticOptions, HeadOptions, ScaleOptions
 from hpamdp.settings import Expectile, LearningRate, OwnSteps, PositiveFraction, Widths
 
 
-class IQLOptions(HeadOptions, ActorCriticOptions, TargetRateOptions, ScaleOptions):
+class IQLOptions(HeadOptions, ActorCriticOptions, ScaleOptions):
     """Settings of `IQL`."""
 
     hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)

@@ -1,4 +1,4 @@
-"""Settings of `paddpg`."""
+"""The settings and the card of PADDPG."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from hpamdp.policies.shared.options import (
     EpsilonOptions,
     InitialParameters,
     TargetRateOptions,
-    TwinCriticOptions,
 )
 from hpamdp.settings import LearningRate, OnlyWith
 
 
-class PADDPGOptions(ActorCriticOptions, TargetRateOptions, TwinCriticOptions, EpsilonOptions):
+class PADDPGOptions(ActorCriticOptions, TargetRateOptions, EpsilonOptions):
     """Settings of `PADDPG`. Noise is in units where the bounds of scores and parameters are [-1, 1]."""
 
     twin: bool = False

@@ -1,4 +1,4 @@
-"""Settings of `pdqn`."""
+"""The settings and the card of P-DQN."""
 
 from __future__ import annotations
 

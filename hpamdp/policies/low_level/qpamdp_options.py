@@ -1,4 +1,4 @@
-"""Settings of `qpamdp`."""
+"""The settings and the card of Q-PAMDP."""
 
 from __future__ import annotations
 

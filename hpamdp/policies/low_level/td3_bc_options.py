@@ -1,4 +1,4 @@
-"""Settings of `td3_bc`."""
+"""The settings and the card of TD3+BC."""
 
 from __future__ import annotations
 
@@ -11,14 +11,11 @@ from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import (
     REPLAY_CARD,
     ActorCriticOptions,
-    ParameterNoiseOptions,
-    SmoothedTargetOptions,
-    TargetRateOptions,
 )
 from hpamdp.settings import LearningRate, OnlyWith, OwnSteps, PositiveFraction, Widths
 
 
-class TD3BCOptions(ActorCriticOptions, TargetRateOptions, SmoothedTargetOptions, ParameterNoiseOptions):
+class TD3BCOptions(ActorCriticOptions):
     """Settings of `TD3BC`. Noise is in units where the parameters' bounds are [-1, 1]."""
 
     hidden_dims: Widths = (128, 128)
@@ -32,6 +29,8 @@ class TD3BCOptions(ActorCriticOptions, TargetRateOptions, SmoothedTargetOptions,
     """
     discrete_threshold: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.3
     """Discrete actions are never taken if their probability in the data is below this fraction of the largest one."""
+    parameter_noise: NonNegativeFloat = 0.1
+    """Standard deviation of the exploring noise on the parameters."""
     target_smoothing: NonNegativeFloat = 0.05
     """Standard deviation of the noise on the parameters in the target."""
     target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("target_smoothing")] = 0.1

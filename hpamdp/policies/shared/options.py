@@ -17,7 +17,10 @@ class StackOptions(Settings):
     """Settings of a memory of the last observations."""
 
     memory: Literal["none", "stack"] = "none"
-    """What the networks see beside the observation. `none`: nothing; `stack`: the observations before it."""
+    """What the networks see beside the observation. `none`: nothing; `stack`: the observations before it.
+
+    A selector sees those at its decisions.
+    """
     stack_steps: Annotated[int, Field(ge=2, le=1000), OnlyWith("memory", "stack")] = 4
     """With `memory=stack`: number of observations that the networks see, the current one included.
 
@@ -38,7 +41,8 @@ class MemoryOptions(StackOptions):
     memory: Literal["none", "stack", "gru"] = "none"  # type: ignore[assignment]
     """What the networks see beside the observation. `none`: nothing; `stack`: the observations before it.
 
-    `gru`: the state of a GRU that has seen all observations since the memory was reset.
+    `gru`: the state of a GRU that has seen all observations since the memory was reset. A selector sees those at its
+    decisions.
     """
     memory_size: Annotated[PositiveInt, OnlyWith("memory", "gru")] = 64
     """With `memory=gru`: units of the GRU."""
@@ -54,27 +58,6 @@ class ReplayMemoryOptions(MemoryOptions):
 
     From them the current GRU computes the state in which the sequence starts.
     """
-
-
-class SelectorStackOptions(StackOptions):
-    """Settings of a selector's memory of the last decisions."""
-
-    memory: Literal["none", "stack"] = "none"
-    """What the networks see beside the observation. `none`: nothing; `stack`: observations at the last decisions."""
-
-
-class SelectorMemoryOptions(MemoryOptions):
-    """Settings of a selector's memory."""
-
-    memory: Literal["none", "stack", "gru"] = "none"
-    """What the networks see beside the observation. `none`: nothing; `stack`: observations at the last decisions.
-
-    `gru`: the state of a GRU that has seen the observations at all decisions of the episode.
-    """
-
-
-class SelectorReplayMemoryOptions(ReplayMemoryOptions, SelectorMemoryOptions):
-    """Settings of a selector's memory that learns from a replay buffer."""
 
 
 class OnPolicyOptions(Settings):
@@ -160,16 +143,11 @@ class ScaleOptions(Settings):
 InitialParameters = Literal["domain", "none"]
 
 
-class ParameterNoiseOptions(Settings):
-    """Exploration by noise on the parameters."""
+class EpsilonOptions(Settings):
+    """Exploration by noise on the parameters and by random actions."""
 
     parameter_noise: NonNegativeFloat = 0.1
     """Standard deviation of the exploring noise on the parameters, in units where their bounds are [-1, 1]."""
-
-
-class EpsilonOptions(ParameterNoiseOptions):
-    """Exploration by noise on the parameters and by random actions."""
-
     epsilon_final: Annotated[Fraction, OwnSteps()] = 0.05
     """Probability of a random action after `epsilon_steps`; it falls linearly from 1 to this value."""
     epsilon_steps: Annotated[NonNegativeInt, OwnSteps()] = 40_000
@@ -233,27 +211,17 @@ class TargetRateOptions(Settings):
     """Fraction of the way to the learned networks that the target networks move in an update of theirs."""
 
 
-class SmoothedTargetOptions(Settings):
-    """Target policy smoothing and the delayed actor of TD3 (Fujimoto, van Hoof and Meger 2018, arXiv 1802.09477)."""
+class SearchingActorOptions(EpsilonOptions, ActorCriticOptions):
+    """Settings of a deterministic actor that may search for better actions, and of its critics."""
 
+    twin: bool = True
+    """Learn two critics and use the lower of their values. A single critic overestimates."""
     target_smoothing: NonNegativeFloat = 0.1
     """Standard deviation of the noise on the target actor's output, in units where its bounds are [-1, 1]."""
     target_smoothing_clip: Annotated[NonNegativeFloat, OnlyWith("target_smoothing")] = 0.2
     """Largest size of this noise."""
     policy_delay: PositiveInt = 2
     """Critic updates for each update of the actor."""
-
-
-class TwinCriticOptions(SmoothedTargetOptions):
-    """The three changes that turn DDPG into TD3."""
-
-    twin: bool = True
-    """Learn two critics and use the lower of their values. A single critic overestimates."""
-
-
-class AnnealedRateOptions(Settings):
-    """Learning rates that fall linearly."""
-
     lr_final_fraction: Annotated[PositiveFraction, OwnSteps()] = 1.0
     """Fraction of the learning rates that is left after `lr_steps`; 1 keeps them constant."""
     lr_steps: Annotated[NonNegativeInt, OwnSteps()] = 100_000
@@ -261,11 +229,6 @@ class AnnealedRateOptions(Settings):
 
     With `mode=offline` the learner makes no steps of its own, so the rates stay constant.
     """
-
-
-class SearchingActorOptions(EpsilonOptions, AnnealedRateOptions, TwinCriticOptions, ActorCriticOptions):
-    """Settings of a deterministic actor that may search for better actions, and of its critics."""
-
     layer_norm: bool = False
     """Normalise the critics' layers, which bounds the values of actions far from all that were tried."""
     preactivation_penalty: NonNegativeFloat = 0.0

@@ -1,4 +1,4 @@
-"""Settings of DLPA."""
+"""The settings and the card of DLPA."""
 
 from __future__ import annotations
 
@@ -13,24 +13,7 @@ from hpamdp.policies.shared.options import REPLAY_CARD, PlanningOptions, ReplayM
 from hpamdp.settings import PositiveFraction, Widths
 
 
-class PlannerOptions(PlanningOptions):
-    """Settings of a `Planner`."""
-
-    momentum: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
-    """Weight of the old distribution in the new one."""
-    pessimism: NonNegativeFloat = 0.0
-    """Standard deviations between the members' returns that are subtracted from their mean.
-
-    With two members, 1 gives their minimum.
-    """
-
-    @model_validator(mode="after")
-    def _check_planner(self) -> Self:
-        self._check_search(("num_samples",), ("horizon", "num_iterations"))
-        return self
-
-
-class DLPAOptions(ReplayMemoryOptions, PlannerOptions):
+class DLPAOptions(ReplayMemoryOptions, PlanningOptions):
     """Settings of `DLPA`."""
 
     form: Literal["parallel", "masking", "sequential"] = "masking"
@@ -58,6 +41,18 @@ class DLPAOptions(ReplayMemoryOptions, PlannerOptions):
     """Windows in an update."""
     updates_per_step: PositiveFloat = 1.0
     """Updates for each step that the learner collects; the first ones make up for the warm-up."""
+    momentum: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
+    """Weight of the old distribution in the new one."""
+    pessimism: NonNegativeFloat = 0.0
+    """Standard deviations between the members' returns that are subtracted from their mean.
+
+    With two members, 1 gives their minimum.
+    """
+
+    @model_validator(mode="after")
+    def _check_dlpa(self) -> Self:
+        self._check_search(("num_samples",), ("horizon", "num_iterations"))
+        return self
 
 
 CARDS = {

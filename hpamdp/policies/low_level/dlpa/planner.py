@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.policies.base import Bonus
-from hpamdp.policies.low_level.dlpa.options import PlannerOptions
+from hpamdp.policies.low_level.dlpa.options import DLPAOptions
 from hpamdp.policies.shared.gradients import matmul_precision
 from hpamdp.policies.shared.planning import Prediction, absolute_temperature, discounted_return, elite_weights
 from hpamdp.specs import PAMDPSpecs
@@ -45,12 +45,12 @@ class Planner:
         self,
         model: Callable[[Tensor, Tensor, Tensor], Prediction],
         specs: PAMDPSpecs,
-        options: PlannerOptions | None = None,
+        options: DLPAOptions | None = None,
         end_value: Callable[[Tensor], Tensor] | None = None,
         imagined: Callable[[Tensor, Tensor], Tensor] | None = None,
         **settings: Any,
     ) -> None:
-        self.options: PlannerOptions = PlannerOptions.of(options, settings)
+        self.options: DLPAOptions = DLPAOptions.of(options, settings)
         self.model = model
         self.specs = specs
         self.components = specs.components

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from hpamdp.policies.low_level.pets.options import PETSModelOptions
+from hpamdp.policies.low_level.pets.options import PETSOptions
 from hpamdp.policies.shared.canonical_frame import CanonicalFrame, joined
 from hpamdp.policies.shared.joint_choice import JointChoice
 from hpamdp.policies.shared.networks import EnsembleLinear, in_float32
@@ -90,7 +90,7 @@ class PETSModel(nn.Module):
     slot_number: Tensor
 
     def __init__(
-        self, specs: PAMDPSpecs, options: PETSModelOptions, context_dim: int = 0, *, is_revealed: bool = False
+        self, specs: PAMDPSpecs, options: PETSOptions, context_dim: int = 0, *, is_revealed: bool = False
     ) -> None:
         super().__init__()
         dim = specs.observation_dim

@@ -1,4 +1,4 @@
-"""Settings of PETS."""
+"""The settings and the card of PETS."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveIn
 from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import (
     REPLAY_CARD,
-    ParameterNoiseOptions,
     PlanningOptions,
     ReplayMemoryOptions,
     SequenceSearchOptions,
@@ -18,9 +17,23 @@ from hpamdp.policies.shared.options import (
 from hpamdp.settings import Fraction, Widths
 
 
-class PETSModelOptions(PlanningOptions):
-    """Settings of a `PETSModel`."""
+class PETSOptions(SequenceSearchOptions, PlanningOptions, ReplayMemoryOptions):
+    """Settings of `PETS`."""
 
+    weight_decay: NonNegativeFloat = 1.0
+    """Weight decay of AdamW. With much less, the networks overfit a few hundred steps, with overconfident errors."""
+    weight_decay_steps: PositiveInt = 256
+    """With more stored steps than these, the decay falls as 1 / steps, so that it blurs no edges of targets."""
+    transition_weight: PositiveFloat = 2.0
+    """Weight of the change's error in the loss; those of termination and rewards are 1."""
+    warmup_steps: PositiveInt = 64
+    """Random steps of a learner before its first update; there are more until two rewards differ."""
+    updates_per_step: PositiveFloat = 10.0
+    """Updates for each step that the learner collects; the first ones make up for the warm-up."""
+    batch_size: PositiveInt = 64
+    """Steps in a member's minibatch."""
+    buffer_size: PositiveInt = 20_000
+    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
     augment: Literal["auto"] | bool = "auto"
     """Use the symmetry and the geometry that the problem declares: `auto` if there are any; true requires them."""
     num_members: PositiveInt = 5
@@ -37,11 +50,6 @@ class PETSModelOptions(PlanningOptions):
     The linear model knows where steps lead after some hundred steps. `auto` uses it unless the problem declares a
     geometry that makes its discrete actions alike.
     """
-
-
-class PETSPolicyOptions(SequenceSearchOptions, ParameterNoiseOptions, PETSModelOptions):
-    """Settings of a `PETSPolicy`."""
-
     posterior_sampling: Literal["auto"] | bool = "auto"
     """Let each exploring environment follow the plans of one member until its episode or option ends.
 
@@ -71,25 +79,6 @@ class PETSPolicyOptions(SequenceSearchOptions, ParameterNoiseOptions, PETSModelO
 
     If no member has seen a reward, all of them predict none, and planning alone never finds it.
     """
-
-
-class PETSOptions(PETSPolicyOptions, ReplayMemoryOptions):
-    """Settings of `PETS`."""
-
-    weight_decay: NonNegativeFloat = 1.0
-    """Weight decay of AdamW. With much less, the networks overfit a few hundred steps, with overconfident errors."""
-    weight_decay_steps: PositiveInt = 256
-    """With more stored steps than these, the decay falls as 1 / steps, so that it blurs no edges of targets."""
-    transition_weight: PositiveFloat = 2.0
-    """Weight of the change's error in the loss; those of termination and rewards are 1."""
-    warmup_steps: PositiveInt = 64
-    """Random steps of a learner before its first update; there are more until two rewards differ."""
-    updates_per_step: PositiveFloat = 10.0
-    """Updates for each step that the learner collects; the first ones make up for the warm-up."""
-    batch_size: PositiveInt = 64
-    """Steps in a member's minibatch."""
-    buffer_size: PositiveInt = 20_000
-    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
 
 
 CARDS = {

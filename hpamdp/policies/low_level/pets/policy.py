@@ -12,7 +12,7 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Bonus, States
 from hpamdp.policies.low_level.pets.model import PETSModel
-from hpamdp.policies.low_level.pets.options import PETSPolicyOptions
+from hpamdp.policies.low_level.pets.options import PETSOptions
 from hpamdp.policies.shared.contingent_planning import ContingentSearch
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.exploration import with_exploring_noise
@@ -54,7 +54,7 @@ class PETSPolicy(PlanningPolicy):
         model: PETSModel,
         specs: PAMDPSpecs,
         entries: list[int],
-        options: PETSPolicyOptions,
+        options: PETSOptions,
         perception: Perception,
         end_value: EndValues | None,
     ) -> None:
