@@ -11,7 +11,19 @@ import pytest
 import yaml
 from conftest import CONF, choices
 
-from hpamdp.config.components import CALLBACK, GROUPS, card_named, load_class, takes_settings_model
+from hpamdp.config.components import (
+    CALLBACK,
+    GROUPS,
+    card_named,
+    check_base_class,
+    load_class,
+    name_of_passed,
+    takes_settings_model,
+)
+from hpamdp.config.errors import ConfigError
+from hpamdp.policies.low_level.random import Random
+from hpamdp.run.callbacks import Callback
+from hpamdp.run.train import check_callbacks
 
 CHOICES = [(group, name) for group in (*GROUPS, CALLBACK) for name in choices(group)]
 TARGETS = {yaml.safe_load((CONF / group / f"{name}.yaml").read_text())["_target_"] for group, name in CHOICES} - {None}
@@ -41,6 +53,19 @@ def test_each_class_has_its_card_and_the_settings_on_it():
         cls, card = load_class(target), card_named(target)
         assert cls.card is card, target
         assert card.options is (cls.Options if takes_settings_model(cls) else None), target
+
+
+def test_a_class_of_a_user_that_declares_something_outside_its_card_is_refused():
+    class Old(Random):
+        takes_pictures = True
+
+    class OldCallback(Callback):
+        needs_evaluations = True
+
+    with pytest.raises(ConfigError, match=r"Old: takes_pictures .* write card = LearnerCard\(takes_pictures=\.\.\.\)"):
+        check_base_class("low", "old", name_of_passed(Old))
+    with pytest.raises(ConfigError, match=r"OldCallback: needs_evaluations .* write card = CallbackCard\("):
+        check_callbacks([OldCallback()])
 
 
 MISTAKES = (

@@ -17,19 +17,7 @@ from typing import Any, TypeAlias, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, PydanticUserError, create_model
 
-from hpamdp.cards import (
-    CallbackCard,
-    Card,
-    CollectorCard,
-    DataCard,
-    EncoderCard,
-    ExplorationCard,
-    LearnerCard,
-    LoggerCard,
-    ProblemCard,
-    SelectorCard,
-    outside_card,
-)
+from hpamdp import cards
 from hpamdp.complaints import as_json
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.limits import is_about_memory
@@ -60,28 +48,17 @@ RUN_VALUES: dict[str, tuple[str, ...]] = {
 }
 # Returns where a setting with this name in messages, such as `low.lr`, was set; None if that is not known.
 PlaceOf: TypeAlias = Callable[[str], "str | None"]
-# The base class that a group's classes must have. If it is a protocol, a class only needs its methods.
-_BASE_CLASSES = {
-    "env": "hpamdp.env.base.PAMDPEnv",
-    "high": "hpamdp.policies.base.Selector",
-    "low": "hpamdp.policies.base.Learner",
-    "encoder": "hpamdp.policies.encoders.base.Encoder",
-    "exploration": "hpamdp.policies.exploration.base.Exploration",
-    "data": "hpamdp.data.demonstrations.Demonstrations",
-    "logger": "hpamdp.run.loggers.Logger",
-    "collector": "hpamdp.run.collection.base.Collection",
-    CALLBACK: "hpamdp.run.callbacks.Callback",
-}
-_CARDS: dict[str, type[Card]] = {
-    "env": ProblemCard,
-    "high": SelectorCard,
-    "low": LearnerCard,
-    "encoder": EncoderCard,
-    "exploration": ExplorationCard,
-    "data": DataCard,
-    "logger": LoggerCard,
-    "collector": CollectorCard,
-    CALLBACK: CallbackCard,
+# The base class that a group's classes must have, and their card. If the base is a protocol, a class needs its methods.
+_BASES: dict[str, tuple[str, type[cards.Card]]] = {
+    "env": ("hpamdp.env.base.PAMDPEnv", cards.ProblemCard),
+    "high": ("hpamdp.policies.base.Selector", cards.SelectorCard),
+    "low": ("hpamdp.policies.base.Learner", cards.LearnerCard),
+    "encoder": ("hpamdp.policies.encoders.base.Encoder", cards.EncoderCard),
+    "exploration": ("hpamdp.policies.exploration.base.Exploration", cards.ExplorationCard),
+    "data": ("hpamdp.data.demonstrations.Demonstrations", cards.DataCard),
+    "logger": ("hpamdp.run.loggers.Logger", cards.LoggerCard),
+    "collector": ("hpamdp.run.collection.base.Collection", cards.CollectorCard),
+    CALLBACK: ("hpamdp.run.callbacks.Callback", cards.CallbackCard),
 }
 _CAN_BE_NONE = ("high", "exploration", "data")
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, protected_namespaces=())
@@ -123,7 +100,7 @@ class Component:
     def card(self) -> Any:
         """What the class declares; if it has no card or there is no class, an empty card."""
         card = card_named(self.target) if isinstance(self.target, str) else getattr(self.target, "card", None)
-        return card or _CARDS[self.group]()
+        return card or _BASES[self.group][1]()
 
     @property
     def model(self) -> type[BaseModel] | None:
@@ -235,10 +212,11 @@ def check_base_class(group: str, name: str, target: object) -> None:
     Raises:
         ConfigError: the message names what the class lacks.
     """
-    if (target is None and group in _CAN_BE_NONE) or isinstance(card_named(str(target)), _CARDS[group]):
+    base_name, card = _BASES[group]
+    if (target is None and group in _CAN_BE_NONE) or isinstance(card_named(str(target)), card):
         return
     file = file_of(group, name)
-    cls, base = _load_target(group, target, file), load_class(_BASE_CLASSES[group])
+    cls, base = _load_target(group, target, file), load_class(base_name)
     named_base = f"{base.__name__} ({base.__module__})"
     given = f"{group}={name}: {cls.__name__}"
     if getattr(base, "_is_protocol", False):
@@ -252,13 +230,13 @@ def check_base_class(group: str, name: str, target: object) -> None:
     if left or cls is base:
         missing = f", which have {', '.join(left)}" if left else ""
         raise ConfigError(f"{given} is abstract; choose one of its subclasses{missing} ({file})")
-    outside = outside_card(cls, _CARDS[group])
+    outside = cards.outside_card(cls, card)
     if outside is not None:
         raise ConfigError(f"{given}: {outside} ({file})")
 
 
 @cache
-def card_named(dotted: str) -> Card | None:
+def card_named(dotted: str) -> cards.Card | None:
     """Return the card of a class of this package without importing the class; None for other classes.
 
     The card of `package.module.Class` is `CARDS["Class"]` of the module `package.module_options` or `package.options`.
@@ -269,11 +247,11 @@ def card_named(dotted: str) -> Card | None:
         return None
     for place in (f"{module}_options", f"{package}.options"):
         try:
-            cards = getattr(importlib.import_module(place), "CARDS", {})
+            known = getattr(importlib.import_module(place), "CARDS", {})
         except ModuleNotFoundError:
             continue
-        if name in cards:
-            return cards[name]
+        if name in known:
+            return known[name]
     return None
 
 

@@ -1,4 +1,4 @@
-"""The settings of callbacks."""
+"""The settings and the cards of callbacks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of loggers."""
+"""The settings and the cards of loggers."""
 
 from __future__ import annotations
 

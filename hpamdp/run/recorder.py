@@ -219,12 +219,9 @@ class Recorder:
     def _one_option(self) -> list[str]:
         """Return a line if the selector cannot tell states apart, in which another option may be better."""
         selector = self.parts.agent.selector
-        if (
-            selector is None
-            or not selector.card.is_bandit
-            or selector.card.sees_state
-            or selector.memory_key is not None
-        ):
+        if selector is None or selector.memory_key is not None:
+            return []
+        if not selector.card.is_bandit or selector.card.sees_state:
             return []
         learners = [each for each in self.parts.agent.learners if isinstance(each, Learner)]
         have_value = all(each.card.has_value and each.card.value_setting is None for each in learners)

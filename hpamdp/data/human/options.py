@@ -1,4 +1,4 @@
-"""The settings of people's recorded actions."""
+"""The settings and the cards of people's recorded actions."""
 
 from __future__ import annotations
 

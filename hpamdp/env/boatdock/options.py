@@ -1,4 +1,4 @@
-"""The settings of the boats, which the batched environment and those of Gymnasium share; nothing here needs torch."""
+"""The settings and the card of the boats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of the boats with the rules of the released code."""
+"""The settings and the card of the boats with the rules of the released code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of sessions with unknown boats."""
+"""The settings and the card of sessions with unknown boats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of Catch Point."""
+"""The settings and the card of Catch Point."""
 
 from __future__ import annotations
 

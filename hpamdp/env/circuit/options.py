@@ -1,4 +1,4 @@
-"""The settings of quantum circuits."""
+"""The settings and the card of quantum circuits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of Goal and Hard Goal."""
+"""The settings and the cards of Goal and Hard Goal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of Moving and Sliding."""
+"""The settings and the cards of Moving and Sliding."""
 
 from __future__ import annotations
 

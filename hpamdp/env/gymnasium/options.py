@@ -1,4 +1,4 @@
-"""The settings of environments made with Gymnasium."""
+"""The settings and the card of environments made with Gymnasium."""
 
 from __future__ import annotations
 

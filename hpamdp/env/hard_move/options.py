@@ -1,4 +1,4 @@
-"""The settings of Hard Move."""
+"""The settings and the card of Hard Move."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of Hybrid LunarLander."""
+"""The settings and the card of Hybrid LunarLander."""
 
 from __future__ import annotations
 

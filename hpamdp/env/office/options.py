@@ -1,4 +1,4 @@
-"""The settings of the office."""
+"""The settings and the card of the office."""
 
 from __future__ import annotations
 

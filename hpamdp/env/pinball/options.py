@@ -1,4 +1,4 @@
-"""The settings of pinball."""
+"""The settings and the card of pinball."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of Platform."""
+"""The settings and the card of Platform."""
 
 from __future__ import annotations
 

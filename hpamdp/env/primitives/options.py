@@ -1,4 +1,4 @@
-"""The settings of primitives."""
+"""The settings and the card of primitives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of rooms."""
+"""The settings and the card of rooms."""
 
 from __future__ import annotations
 

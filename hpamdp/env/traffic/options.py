@@ -1,4 +1,4 @@
-"""The settings of traffic lights."""
+"""The settings and the card of traffic lights."""
 
 from __future__ import annotations
 

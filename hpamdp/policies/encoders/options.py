@@ -1,4 +1,4 @@
-"""Settings of encoders."""
+"""The settings and the cards of encoders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of explorations."""
+"""The settings and the cards of explorations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The learners that have no settings."""
+"""The cards of the learners that have no settings."""
 
 from __future__ import annotations
 

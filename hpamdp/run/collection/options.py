@@ -1,4 +1,4 @@
-"""The settings of collectors."""
+"""The settings and the cards of collectors."""
 
 from __future__ import annotations
 
