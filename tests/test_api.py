@@ -966,7 +966,7 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.train("platfrom"), r"did you mean platform\? conf/env has "),
         (lambda: hpamdp.train("platform", num_envs=0), r"num_envs=0: .* \(conf/config.yaml, given as an argument\)"),
         (lambda: hpamdp.train("platform", progress="no"), "progress='no': must be True or False"),
-        (lambda: hpamdp.load("hppo_platform", max_stps=5), r"did you mean env\.max_steps\?"),
+        (lambda: hpamdp.load("hppo_platform", max_stps=5), r"did you mean env\.max_steps"),
         (
             lambda: hpamdp.load("hppo_platform").evaluate(episodes=2, grouping={"x": [0]}),
             "grouping: a trained agent keeps the options",

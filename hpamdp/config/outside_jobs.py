@@ -136,7 +136,7 @@ def _change(cfg: DictConfig, settings: Iterable[tuple[str, Any]], conf: Path) ->
         has_entries = isinstance(before, DictConfig)  # of which a mapping changes some
         words += [f"{one}={as_json(each)}" for one, each in (singles if has_entries else {name: plain}).items()]
         try:
-            OmegaConf.update(cfg, name, _as_node(plain), merge=True, force_add=is_new)
+            OmegaConf.update(cfg, name, plain, merge=True, force_add=is_new)
         except OmegaConfBaseException as error:
             raise ConfigError(f"{name}={as_code(value)}: {first_line(error)}") from error
     cfg.hydra.overrides.task.extend(words)
@@ -162,7 +162,7 @@ def _single_values(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def plain_value(name: str, value: Any) -> Any:
-    """Return the value of a setting from Python code as a yaml file could hold it.
+    """Return the value of a setting from Python code as a yaml file could hold it. A `${` in it stays text.
 
     Raises:
         ConfigError: the value is no number, text, list or mapping of these.
@@ -172,7 +172,7 @@ def plain_value(name: str, value: Any) -> Any:
     elif hasattr(value, "tolist") and getattr(value, "ndim", None) == 1 and not name.startswith(_OF_CONSTRUCTOR):
         value = value.tolist()
     if isinstance(value, str | Path):
-        return str(value)
+        return escaped(str(value))
     if value is None or isinstance(value, bool | int | float):
         return value
     if isinstance(value, list | tuple | range):
@@ -185,15 +185,6 @@ def plain_value(name: str, value: Any) -> Any:
                 )
         return {entry: plain_value(name, item) for entry, item in value.items()}
     raise ConfigError(f"{name}={as_code(value)}: must be a number, a text, or a list or mapping of these")
-
-
-def _as_node(value: Any) -> Any:
-    """Return a plain value for a config, in which `${` would begin an interpolation."""
-    if isinstance(value, list):
-        return [_as_node(each) for each in value]
-    if isinstance(value, dict):
-        return {name: _as_node(each) for name, each in value.items()}
-    return escaped(value) if isinstance(value, str) else value
 
 
 def check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
