@@ -161,8 +161,8 @@ def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(
     collected = parts.env.rollout(20, parts.agent.policy, break_when_any_done=False).contiguous()
     parts.agent.learn(collected)
     file = tmp_path / checkpoint.FILE_NAME
-    states = {"collection": {"env": parts.env.env_state()}, "recorder": {}}
-    progress = {"frames": 320, "config": {}, "wall_s": 1.0, "cpu_s": 1.0, "last_score": None}
+    states = {"collection": {"env": parts.env.env_state()}, "recorder": {}, "callbacks": {}}
+    progress = {"frames": 320, "config": {}, "option_names": [], "wall_s": 1.0, "cpu_s": 1.0, "last_score": None}
     checkpoint.save(file, parts.agent, states, progress)
 
     other = make(high, low, tmp_path)
