@@ -60,7 +60,8 @@ class TensorRows:
     @property
     def floats(self) -> np.ndarray:
         """The float32 columns of the state."""
-        return np.stack([to_numpy(column) for column in self._env.state if column.is_floating_point()])
+        columns = [to_numpy(column) for column in self._env.state if column.is_floating_point()]
+        return np.stack(columns) if columns else np.empty((0, self._env.num_envs), np.float32)
 
     @property
     def integers(self) -> np.ndarray:
