@@ -277,7 +277,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
     def final_infos(self, floats: np.ndarray, integers: Any) -> dict[str, Any]:
         """Return `score` and `success`, the fraction of trips that docked, of sessions `[N]`."""
         trips = np.float32(self.options.trips)
-        return {"score": floats[kernel.TOTAL_SCORE] / trips, "success": integers[kernel.DOCKED] / trips}
+        return {"score": floats[kernel.TOTAL_SCORE] / trips, "success": integers[kernel.DOCKED] / self.options.trips}
 
     def played(self) -> dict[str, Tensor]:
         """Return `trip_score` and `trip_presses` `[N, trips]` of the sessions of an evaluation."""
