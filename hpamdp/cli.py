@@ -27,7 +27,7 @@ from hpamdp.config.command_line import CommandLine, completed, parse, saved_run
 from hpamdp.config.compose import conf_dir, job_overrides, read
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import explained, not_understood
-from hpamdp.config.schema import RESUME_AUTO
+from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError
 from hpamdp.limits import limit_in
 from hpamdp.messages import (
@@ -237,13 +237,13 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
         _exit_with("hydra.run.dir: the working directory; give a folder of the run's own, or leave hydra.run.dir out")
     try:
         with locked(output_dir):
-            _refuse_early(cfg)
+            config = _checked(cfg)
             from hpamdp.run import train  # takes seconds, which a wrong setting need not wait for
 
             if cfg.resume == RESUME_AUTO:
                 code = _go_on(cfg, output_dir)
             else:
-                code = train.run(cfg, output_dir, job_overrides())
+                code = train.run(cfg, output_dir, job_overrides(), config=config)
     except ConfigError as error:
         # If the error were raised further, Hydra would print another line about it.
         with suppress(OSError):
@@ -280,21 +280,23 @@ def _go_on(cfg: DictConfig, output_dir: Path) -> int:
     return train.run(cfg, output_dir, words, source or start, config=config, may_overwrite=True)
 
 
-def _refuse_early(cfg: DictConfig) -> None:
-    """Refuse wrong settings before torch is imported. The run checks its config again.
+def _checked(cfg: DictConfig) -> Config | None:
+    """Check the config before torch is imported, and return it; None if a saved run completes it.
 
     Raises:
         ConfigError: a value is wrong, or values do not go together.
     """
-    if cfg.resume is not None or cfg.mode == "eval":  # the saved run has the config
-        return
-    config = read(cfg)
+    if cfg.resume is not None or cfg.mode == "eval":
+        return None
+    config, words = read(cfg), job_overrides()
     compatibility.check_saved_run(config.run)
     problem = compatibility.facts_of(config)
     if problem is not None:
-        config = compatibility.with_selector(config, problem, job_overrides())
-        compatibility.check_effects_on(problem, config, job_overrides())
+        config = compatibility.with_selector(config, problem, words)
+        compatibility.check_effects_on(problem, config, words)
     compatibility.check(config)
+    compatibility.check_effects(config.run.mode, words)
+    return config
 
 
 def _stay(directory: str) -> None:

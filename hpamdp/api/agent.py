@@ -275,7 +275,7 @@ class Agent:
             if other.env.cls is own.cls and other.env.name == own.name:
                 left_out = {*SOURCE_SETTINGS, *(name.removeprefix("env.") for name, _ in given)}
                 kept = {name: value for name, value in own.settings.items() if name not in left_out}
-                other = other.with_problem(replace(other.env, settings={**other.env.settings, **kept}))
+                other = other.with_problem(other.env.with_settings({**other.env.settings, **kept}))
         return self._fitting(other.env)
 
     def _fitting(self, env: Component) -> Config:

@@ -75,6 +75,7 @@ class Component:
             `high=none`, `exploration=none` and `data=none`.
         settings: checked values by name.
         objects: further arguments of the constructor, from Python code. No file holds them.
+        options: the settings as a checked instance of the class's `Options`; None if it has no model.
     """
 
     group: str
@@ -82,6 +83,7 @@ class Component:
     target: str | type | None
     settings: Mapping[str, Any]
     objects: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    options: Any = dataclasses.field(default=None, compare=False)
 
     def __str__(self) -> str:
         return f"{self.group}={self.name}"
@@ -109,10 +111,10 @@ class Component:
             return self.card.options
         return settings_model(self.target) if self.target is not None and takes_settings_model(self.target) else None
 
-    @property
-    def as_model(self) -> Any:
-        """The settings as an instance of the class's `Options`; None if it has no model."""
-        return None if self.model is None else self.model(**self.settings)
+    def with_settings(self, settings: Mapping[str, Any]) -> Component:
+        """Return the component with other, allowed settings."""
+        options = None if self.options is None else type(self.options)(**settings)
+        return dataclasses.replace(self, settings=settings, options=options)
 
     def is_guarded(self, name: str, value: object) -> bool:
         """Return whether a saved config needs the user's permission to give a setting this value.
@@ -138,8 +140,7 @@ class Component:
             return None
         accepted = constructor_arguments(cls)
         supplied = {name: value for name, value in {**context, **self.objects}.items() if name in accepted}
-        model = self.as_model
-        settings = self.settings if model is None else {"options": model}
+        settings = self.settings if self.options is None else {"options": self.options}
         try:
             return cls(**supplied, **settings)
         except SettingError as error:
@@ -203,7 +204,8 @@ def component(
         return _name_of(chosen) if place is None else f"{_name_of(chosen)}, {place}"
 
     checked = validated(model, settings, prefix or f"{group}.", f"setting of {_name_of(chosen)}", where)
-    return Component(group, name, chosen, dict(checked))
+    made = Component(group, name, chosen, dict(checked))
+    return made if made.model is None else dataclasses.replace(made, options=checked)
 
 
 def check_base_class(group: str, name: str, target: object) -> None:

@@ -228,7 +228,7 @@ def with_acting_learners(config: Config, facts: ProblemFacts) -> Config:
 
 def facts_of(config: Config) -> ProblemFacts | None:
     """Return the facts about the problem that follow from its settings; None if only a built environment has them."""
-    options = config.env.as_model
+    options = config.env.options
     if isinstance(config.env.target, str):
         return options.facts(config.env.class_name) if isinstance(options, ProblemOptions) else None
     facts = getattr(config.env.target, "facts", None)
@@ -760,7 +760,7 @@ def encoder_has_pictures(config: Config, problem: ProblemFacts) -> str | None:
         return None
     if encoder.name != AUTO_ENCODER:
         return f"{encoder}: {config.env} observes no pictures; use encoder={AUTO_ENCODER}"
-    model = encoder.as_model
+    model = encoder.options
     for name, value in encoder.settings.items():
         if model is not None and value != type(model).model_fields[name].default:
             return f"encoder.{name}={as_json(value)}: {config.env} observes no pictures; leave it out"

@@ -17,7 +17,7 @@ from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError, fault_of
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, first_line, say, warn
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import assemble, facts_about
+from hpamdp.run.assemble import assemble, choose_selector, facts_about
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, raised_by
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import CollectionError
@@ -65,6 +65,7 @@ def run(
             source = stopped_at
             if config is None:
                 config, source = resolve(cfg, overrides)
+            config = choose_selector(config, overrides)
             with memory_errors_explained(config):
                 trainer = begin(config, source, output_dir, overrides, may_overwrite=may_overwrite)
                 return _run_to_the_end(trainer, output_dir, tell)
