@@ -175,7 +175,7 @@ def test_jobs_get_their_config_folder_and_overrides(command, tmp_path, monkeypat
 
 @pytest.mark.parametrize("bug", [ZeroDivisionError("bug"), ValueError("bug"), ConfigAttributeError("bug")])
 def test_a_bug_keeps_its_traceback(command, monkeypatch, bug):
-    def run(cfg, folder, overrides):
+    def run(cfg, folder, overrides, **known):
         raise bug
 
     monkeypatch.setattr(train, "run", run)

@@ -112,7 +112,7 @@ def test_actor_and_critic_see_products_of_vectors():
     state = torch.randn(1, 4)
     turned = state[:, [1, 0, 3, 2]] * torch.tensor([-1.0, 1.0, -1.0, 1.0])  # both vectors, by a right angle
     other = state * torch.tensor([1.0, 1.0, -1.0, -1.0])
-    for output in (learner.value, lambda seen: learner.actor(seen).mean):
+    for output in (lambda seen: learner.value(States(seen)), lambda seen: learner.actor(seen).mean):
         torch.testing.assert_close(output(turned), output(state))
         assert not torch.allclose(output(other), output(state), atol=1e-3)
     assert learner.exported() is None, "the actors of pages have no products"

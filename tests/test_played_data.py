@@ -130,7 +130,7 @@ def test_the_commands_of_the_recording_work_on_the_file(file, tmp_path, capsys):
         (None, "there is no such file"),
         ("", "no episode"),
         ("{}\n", "line 1"),
-        ("no json\n[]\n", "line 1: no JSON; no line is an episode"),
+        ("no json\n[]\n", "line 1: no JSON: .*; no line is an episode"),
         (
             json.dumps({**EPISODES[0], "outcome": "too_fast", "score": -1.0}) + "\n",
             "line 1: outcome: too_fast, but the presses lead to success",

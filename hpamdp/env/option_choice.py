@@ -37,7 +37,6 @@ class OptionChoiceEnv(PAMDPEnv):
         super().__init__(device=env.device, batch_size=env.batch_size)
         # In a tuple: as attributes, the modules' parameters would be registered as the environment's own.
         self._wrapped = (low_policy, env)
-        self.num_envs = env.num_envs
         self.gamma = gamma
         self.option_names = env.option_names
         self.parameter_dims = env.parameter_dims

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 from torch import Tensor
 
 from hpamdp.env import point_pictures
 from hpamdp.env.batched_env import GOING_ON, SUCCESS, BatchedEnv, EpisodeColumns
-from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.point_agent import Located
 
 
@@ -38,11 +37,6 @@ class PointEnv(BatchedEnv[PointEpisode], Generic[PointEpisode]):
 
     target_radius: ClassVar[float]  # the distance that counts as a hit
     has_walls: ClassVar[bool] = False  # whether the agent must stay within the square
-
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return the facts about the problem under these settings."""
-        return ProblemFacts(title=cls.__name__, has_oracle=True)
 
     def draw(self, track: Sequence[PointEpisode]) -> np.ndarray:
         """Return a picture of the agent's path to the target, uint8 `[480, 480, 3]`."""

@@ -207,7 +207,7 @@ def checked_optimizer(where: str, saved: Any, optimizer: torch.optim.Optimizer) 
     for number, moments in state.state.items():
         check_like(f"{where}.{number}", moments, own["state"].get(number, {}))
         for name, value in moments.items():
-            check_values(f"{where}.{number}.{name}", value, torch.zeros(()))
+            check_values(f"{where}.{number}.{name}", value, torch.zeros((), dtype=torch.float32))
     return {"state": state.state, "param_groups": groups}
 
 

@@ -64,7 +64,8 @@ def run(
         with exits_explained(), problems_explained():
             source = stopped_at
             if config is None:
-                config, source = resolve(cfg, overrides)
+                config, given = resolve(cfg, overrides)
+                source = stopped_at or given
             config = choose_selector(config, overrides)
             with memory_errors_explained(config):
                 trainer = begin(config, source, output_dir, overrides, may_overwrite=may_overwrite)

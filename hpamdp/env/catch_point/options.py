@@ -30,7 +30,7 @@ class CatchPointOptions(ProblemOptions):
 
     def facts(self, title: str) -> ProblemFacts:
         """Return what these settings tell of the problem, which errors call `title`."""
-        return ProblemFacts(title=title, has_pictures=self.observation == "picture")
+        return ProblemFacts(title=title, has_oracle=True, has_pictures=self.observation == "picture")
 
 
 CARDS = {

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import PositiveInt
 
 from hpamdp.cards import ProblemCard
-from hpamdp.env.facts import ProblemOptions
+from hpamdp.env.facts import ProblemFacts, ProblemOptions
 
 PUBLISHED_STEPS = 201
 
@@ -24,6 +24,10 @@ class VehicleOptions(ProblemOptions):
     """
     compile_rules: bool = False
     """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
+
+    def facts(self, title: str) -> ProblemFacts:
+        """Return what these settings tell of the problem, which errors call `title`."""
+        return ProblemFacts(title=title, has_oracle=True)
 
 
 CARDS = {name: ProblemCard(options=VehicleOptions) for name in ("MovingEnv", "SlidingEnv")}

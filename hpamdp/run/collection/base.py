@@ -44,10 +44,11 @@ def checked_state(saved: Any, parts: AssembledRun) -> CollectionState:
     if state.env:
         own = env.env_state()
         if env.keeps_episodes:
-            sizes = {len(column) if column.ndim else 0 for column in state.env.values()} - {env.num_envs}
+            num_envs = env.batch_size.numel()
+            sizes = {len(column) if column.ndim else 0 for column in state.env.values()} - {num_envs}
             if sizes:
                 raise ValueError(
-                    f"num_envs={env.num_envs}: the state is of {sizes.pop()} environments; leave num_envs out when you "
+                    f"num_envs={num_envs}: the state is of {sizes.pop()} environments; leave num_envs out when you "
                     "resume"
                 )
         check_like("env", state.env, own)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn, TypeVar
@@ -256,7 +256,7 @@ class WorkerCollection(Collection):
             return self._last_known()
         state: dict[str, Any] = {"generators": [each["generator"] for each in states]}
         for name in states[0].keys() & {"env", "root"}:
-            state[name] = TensorDict.cat([_rows(each[name]) for each in states]).to_dict()
+            state[name] = _side_by_side([each[name] for each in states])
         if not self._keeps_episodes:
             state["env"] = self._problem.env_state()
         if self._coming:
@@ -354,6 +354,13 @@ def modules_here_last() -> Iterator[None]:
         yield
     finally:
         unprotect_children()
+
+
+def _side_by_side(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Concatenate nested columns. A worker that has just begun has no actions yet, so only what all have is kept."""
+    rows = [_rows(each) for each in states]
+    shared = set.intersection(*({*each.keys(include_nested=True, leaves_only=True)} for each in rows))
+    return TensorDict.cat([each.select(*shared) for each in rows]).to_dict()
 
 
 def _rows(columns: Mapping[str, Any]) -> TensorDict:
