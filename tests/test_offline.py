@@ -13,7 +13,7 @@ from hpamdp import keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.released_file import read
-from hpamdp.data.human.rest_to_rest import MIN_DISTANCE, to_rest_to_rest
+from hpamdp.data.human.rest_to_rest import MAX_ERROR, MIN_DISTANCE, to_rest_to_rest
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
@@ -46,7 +46,7 @@ def overrides(path: str, low: str, high: str = "human") -> list[str]:
     return [*SMALL, f"data.path={path}", f"low={low}", f"high={high}"]
 
 
-@pytest.mark.parametrize("low", ["bc", "iql", "td3_bc", "pdqn", "hsac"])
+@pytest.mark.parametrize("low", ["bc", "iql", "td3_bc", "pdqn", "hsac", "pets"])
 def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, path, tmp_path):
     given = overrides(path, low)
     assert run(compose_config(given), tmp_path, given) == 0
@@ -228,6 +228,22 @@ def test_a_rest_to_rest_press_brings_a_gliding_boat_to_where_the_next_one_began(
     assert (moved_presses["press"] == torch.arange(len(first)) - first).all()
 
 
+def test_clean_presses_are_those_that_end_where_such_a_press_leads(path):
+    data = read(path, checksum=None, one_frame=True)
+    presses, is_final = data.presses.clone(), data.presses["is_final"]
+    is_pushed = ~is_final & (torch.arange(len(presses)) % 2 == 0)
+    presses["next_position"][is_pushed] += 20.0  # as if unlogged presses had moved the boat
+    kept = to_rest_to_rest(type(data)(data.episodes, presses), clean=True).presses
+    assert 0 < (~kept["is_final"]).sum() <= (~is_final & ~is_pushed).sum()
+    episodes = data.episodes[kept["episode"]]
+    heading = torch.stack(
+        harbour.direction(episodes["controller"].int(), episodes["keymap"].int(), kept["key"].int()), 1
+    )
+    led_to = kept["position"] + physics.total_distance(kept["duration"]).unsqueeze(1) * heading
+    off = (kept["next_position"] - led_to).norm(dim=1)[~kept["is_final"]]
+    assert (off < MAX_ERROR + 1e-3).all()
+
+
 def test_an_episode_without_its_final_press_is_truncated_and_not_terminated(path):
     batch = human_batch(path, rest_to_rest=True)[0]
     trajectory = batch["collector", "traj_ids"]
@@ -277,6 +293,13 @@ def test_demonstrations_are_stored_in_the_replay_buffers(path):
     parts = assemble(make_config(given))
     parts.agent.add_demonstrations(parts.data.batch, parts.data.decisions)
     assert sum(len(learner.buffer) for learner in parts.agent.learners) == parts.data.batch.numel()
+
+
+def test_a_buffer_that_drops_steps_of_the_data_says_so(path, capsys):
+    given = ["low=pdqn", "data=human", "data.checksum=null", f"data.path={path}", "eval.layouts=4", "num_envs=4"]
+    parts = assemble(make_config([*given, "low.buffer_size=32", "low.batch_size=8"]))
+    parts.agent.add_demonstrations(parts.data.batch, parts.data.decisions)
+    assert "low.buffer_size=32 keeps the last 32 of " in capsys.readouterr().err
 
 
 # One step, three discrete actions with a parameter each. The best is action 1 with half its range; in the data three in

@@ -100,7 +100,7 @@ def _as_returned(
     )
     recorded = decisions(data, reward=rules.reward, observation=rules.observation) if env.has_choice else None
     if options.rest_to_rest and len(data.presses):
-        data = to_rest_to_rest(data)
+        data = to_rest_to_rest(data, clean=options.rest_to_rest == "clean")
         if not len(data.presses):
             raise DataError("no press is left as a rest-to-rest press; use rest_to_rest=false")
     if isinstance(rules.keymap, int):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import PositiveInt
 
 from hpamdp.cards import DataCard
@@ -17,8 +19,12 @@ class PeoplesOptions(Settings):
     """Take only episodes that ended in the dock."""
     best_people: PositiveInt | None = None
     """Take only episodes of this many people with the highest mean scores. If null, of all people."""
-    rest_to_rest: bool = True
-    """Convert interrupted presses to rest-to-rest presses, the only presses that the environment has."""
+    rest_to_rest: Literal["clean"] | bool = True
+    """Convert interrupted presses to rest-to-rest presses, the only presses that the environment has.
+
+    `clean` takes only presses after which the boat was within 3 px of where such a press leads. Other presses of the
+    log were followed by presses that are not in the log.
+    """
 
 
 class HumanOptions(PeoplesOptions):

@@ -11,6 +11,10 @@ A rest-to-rest press starts from rest and lasts until the boat has come to rest 
 - Presses that moved the boat by less than `MIN_DISTANCE` are left out.
 - Final presses are left out if, by our physics, they would not have ended their episode as recorded.
 
+More than half of the converted presses do not end where such a press leads, because unlogged presses moved the boat
+between two logged ones. `clean` leaves these out, and keeps presses of any length. Each press then has its own end,
+which need not be the start of the next one.
+
 If the final press is left out, the last remaining press leads to the start of the final one. The episode is then
 truncated, not terminated.
 """
@@ -25,16 +29,18 @@ from hpamdp.data.human.released_file import FULL_TANK, TICKS_PER_SECOND, HumanDa
 from hpamdp.env.boatdock import harbour, physics
 
 MIN_DISTANCE = 4.0  # px
+MAX_ERROR = 3.0  # px, with `clean`
 _CENTRE = torch.tensor(harbour.CENTRE, dtype=torch.float32)
 
 
-def to_rest_to_rest(data: HumanData) -> HumanData:
+def to_rest_to_rest(data: HumanData, *, clean: bool = False) -> HumanData:
     """Return the recording with rest-to-rest presses.
 
     Each episode's `tank` is a full tank less these presses.
 
     Args:
         data: the recording, read with `one_frame=True`.
+        clean: whether to take only presses after which the boat was where such a press leads.
     """
     presses = data.presses
     is_final = presses["is_final"]
@@ -45,7 +51,12 @@ def to_rest_to_rest(data: HumanData) -> HumanData:
     moved = ((presses["next_position"] - presses["position"]) * heading).sum(1).nan_to_num()
     reach = torch.minimum(moved.clamp(min=0.0), physics.total_distance(presses["duration"]))
     duration = torch.where(is_final, presses["duration"], physics.press_for(reach))
-    is_kept = torch.where(is_final, _ends_as_recorded(presses, episodes, heading), reach >= MIN_DISTANCE)
+    if clean:
+        led_to = presses["position"] + reach.unsqueeze(1) * heading
+        is_right = (presses["next_position"] - led_to).norm(dim=1) < MAX_ERROR
+    else:
+        is_right = reach >= MIN_DISTANCE
+    is_kept = torch.where(is_final, _ends_as_recorded(presses, episodes, heading), is_right)
 
     kept = presses[is_kept].clone()
     kept["duration"] = duration[is_kept]
@@ -53,8 +64,9 @@ def to_rest_to_rest(data: HumanData) -> HumanData:
     episode = kept["episode"]
     first = torch.searchsorted(episode, episode)
     kept["press"] = torch.arange(len(episode)) - first
-    has_next = episode[:-1] == episode[1:]
-    kept["next_position"][:-1][has_next] = kept["position"][1:][has_next]
+    if not clean:
+        has_next = episode[:-1] == episode[1:]
+        kept["next_position"][:-1][has_next] = kept["position"][1:][has_next]
 
     pressed = torch.zeros(len(data.episodes), dtype=torch.float32).index_add(0, episode, kept["duration"])
     converted = data.episodes.clone()

@@ -15,6 +15,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.devices import checked_device
+from hpamdp.messages import warn
 from hpamdp.observation_entries import packed, unpacked
 from hpamdp.policies.base import Bonus, Learner, States, step_discounts
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
@@ -128,8 +129,11 @@ class ReplayLearner(Learner):
         return self.update(int(steps * rate) - int(before * rate))
 
     def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
-        """Store the transitions in `mask`, if there are any."""
-        if mask.any():
+        """Store the transitions in `mask`, if there are any; warn if the buffer is too small for all."""
+        num, capacity = int(mask.sum()), self.options.buffer_size
+        if num > capacity:
+            warn(f"low.buffer_size={capacity} keeps the last {capacity:,} of {num:,} steps of the data set")
+        if num:
             self.store(batch, mask)
 
     def update(self, num_updates: int) -> dict[str, float]:

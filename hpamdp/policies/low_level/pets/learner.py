@@ -143,6 +143,10 @@ class PETS(ReplayLearner):
         self.policy.bonus = bonus.scaled(self.options.reward_scale)
         self.policy.samples_posterior = False
 
+    def start(self) -> None:
+        """Let the policy plan, if the rewards or terminations of a data set differ."""
+        self.on_progress(0)
+
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update every member from its own minibatch of a sample `[num_members, batch_size]`.
 

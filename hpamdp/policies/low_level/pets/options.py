@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
@@ -14,7 +14,7 @@ from hpamdp.policies.shared.options import (
     ReplayMemoryOptions,
     SequenceSearchOptions,
 )
-from hpamdp.settings import Fraction, Widths
+from hpamdp.settings import Fraction, OwnSteps, Widths
 
 
 class PETSOptions(SequenceSearchOptions, PlanningOptions, ReplayMemoryOptions):
@@ -26,13 +26,13 @@ class PETSOptions(SequenceSearchOptions, PlanningOptions, ReplayMemoryOptions):
     """With more stored steps than these, the decay falls as 1 / steps, so that it blurs no edges of targets."""
     transition_weight: PositiveFloat = 2.0
     """Weight of the change's error in the loss; those of termination and rewards are 1."""
-    warmup_steps: PositiveInt = 64
+    warmup_steps: Annotated[PositiveInt, OwnSteps()] = 64
     """Random steps of a learner before its first update; there are more until two rewards differ."""
-    updates_per_step: PositiveFloat = 10.0
+    updates_per_step: Annotated[PositiveFloat, OwnSteps()] = 10.0
     """Updates for each step that the learner collects; the first ones make up for the warm-up."""
     batch_size: PositiveInt = 64
     """Steps in a member's minibatch."""
-    buffer_size: PositiveInt = 20_000
+    buffer_size: PositiveInt = 50_000
     """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
     augment: Literal["auto"] | bool = "auto"
     """Use the symmetry and the geometry that the problem declares: `auto` if there are any; true requires them."""
@@ -85,7 +85,6 @@ CARDS = {
     "PETS": replace(
         REPLAY_CARD,
         options=PETSOptions,
-        modes=("train",),
         takes=frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS}),
         has_value=True,
         remembers_directions=True,
