@@ -23,7 +23,7 @@ from toy_environments import Toy
 
 import hpamdp
 from hpamdp import keys
-from hpamdp.env.gymnasium_adapter import GymnasiumVectorAdapter
+from hpamdp.env.boatdock.gymnasium_adapter import BoatDockVector
 from hpamdp.run_files import CHECKPOINT_NAME, METRICS_NAME
 
 USAGE = Path(__file__).resolve().parent.parent / "docs" / "usage.md"
@@ -380,7 +380,7 @@ def test_the_loop_of_the_page_starts_no_episode_with_an_option_of_the_one_before
     (code,) = re.findall(r"### Act in a vector\n.*?^```python\n(.*?)^```", USAGE.read_text(), re.MULTILINE | re.DOTALL)
     assert "next_step=restarts_next_step" in code
     starts, seen = [], []
-    act, step = hpamdp.Agent.act, GymnasiumVectorAdapter.step
+    act, step = hpamdp.Agent.act, BoatDockVector.step
 
     def noted_act(agent, observation):
         action = act(agent, observation)
@@ -394,7 +394,7 @@ def test_the_loop_of_the_page_starts_no_episode_with_an_option_of_the_one_before
         return result
 
     monkeypatch.setattr(hpamdp.Agent, "act", noted_act)
-    monkeypatch.setattr(GymnasiumVectorAdapter, "step", noted_step)
+    monkeypatch.setattr(BoatDockVector, "step", noted_step)
     exec(code, {"hpamdp": hpamdp})
     begins = np.array(starts[:-1])  # with the observation that follows each step
     assert begins.sum() > 8 and np.array(seen)[1:][begins].all()

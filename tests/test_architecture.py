@@ -88,8 +88,8 @@ def test_the_physics_imports_only_the_constants_of_the_task():
     assert ours and all(is_in(name, "hpamdp.env.boatdock.task") for name in ours)
 
 
-def test_the_rules_in_numbers_import_no_torch():
-    for module in ("task", "layouts", "kernel"):
+def test_what_a_boat_for_gymnasium_runs_through_imports_no_torch():
+    for module in ("task", "layouts", "kernel", "numpy_boats", "gymnasium_adapter"):
         loaded = loaded_with(f"hpamdp.env.boatdock.{module}")
         assert not [name for name in loaded if any(is_in(name, library) for library in TORCH)], module
 
@@ -104,7 +104,7 @@ def test_settings_and_cards_import_no_slow_library():
 
 def test_imports_through_other_modules_are_found():
     assert "torch" in loaded_with("hpamdp.env.boatdock.environment")
-    assert any(is_in(name, "numba") for name in loaded_with("hpamdp.env.gymnasium_adapter"))
+    assert any(is_in(name, "numba") for name in loaded_with("hpamdp.env.boatdock.gymnasium_adapter"))
 
 
 # The table of Gymnasium ids names all problems.

@@ -22,6 +22,7 @@ from torchrl.envs.utils import check_env_specs
 import hpamdp
 from hpamdp import keys
 from hpamdp.env import counter_rng, point_pictures
+from hpamdp.env.batched_adapter import BatchedEnvAdapter
 from hpamdp.env.batched_env import GOING_ON, BatchedEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
@@ -30,7 +31,6 @@ from hpamdp.env.errors import ProblemError
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
-from hpamdp.env.gymnasium_adapter import GymnasiumAdapter
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.office.environment import OfficeEnv
 from hpamdp.env.pinball.environment import PinballEnv
@@ -426,7 +426,7 @@ def test_bad_actions_and_options_of_a_adapter_are_refused_in_one_line():
         with pytest.raises(ValueError, match=message):
             adapter.step(bad)
     with pytest.raises(ValueError, match="render_mode='human', but must be None or rgb_array"):
-        GymnasiumAdapter("hpamdp.env.catch_point.environment:CatchPointEnv", render_mode="human")
+        BatchedEnvAdapter("hpamdp.env.catch_point.environment:CatchPointEnv", render_mode="human")
 
 
 def test_a_closed_environment_needs_a_reset_before_the_next_step():

@@ -14,6 +14,7 @@ from hpamdp.config.compose import read
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import episode, harbour, physics, planner, rendering
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.gymnasium_adapter import BoatDock, BoatDockVector
 from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Rules
 from hpamdp.env.state_columns import where
@@ -265,20 +266,20 @@ def test_gymnasium_has_the_boats_and_their_changes():
         assert info["controller"] == option and one.observation_space.contains(observation)
     assert info["fuel"] == pytest.approx(1.0 - 0.7 / 6.0)
     assert one.render().shape == (480, 480, 3)
-    many = gymnasium.make_vec("hpamdp/BoatDock-v0", 3, vectorization_mode="vector_entry_point", **settings)
+    many = BoatDockVector(3, **settings)
     many.reset(seed=0, options={"start": [[600, 512]] * 3, "goal": [[700, 512]] * 3})
     _, _, _, _, infos = many.step({"option": [0, 2, 3], "key": [0] * 3, "duration": np.full((3, 3), 0.1)})
     assert infos["controller"].tolist() == [0, 2, 3]
     with pytest.raises(ValueError, match="no controller upwards"):
-        gymnasium.make("hpamdp/BoatDock-v0", boats=["congruent", "upwards"])
+        BoatDock(boats=["congruent", "upwards"])
 
 
 def test_compiled_adapters_take_other_boats():
     options = BoatDockOptions(
         boats=["congruent", "sideways"], switch_cost=0.5, controllers=SIDEWAYS, compile_rules=True
     )
-    boats = gymnasium.make_vec("hpamdp/BoatDock-v0", 2, vectorization_mode="vector_entry_point", options=options)
-    assert boats.single_observation_space.shape == (16,) and boats.single_action_space["option"].n == 2
+    boats = BoatDockVector(2, options=options)._problem
+    assert boats.rows._env.rules == options.rules and boats.observation_space.shape == (16,)
 
 
 def test_the_fuel_of_a_change_is_not_drawn_as_a_press():

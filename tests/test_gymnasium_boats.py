@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 import warnings
-from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -20,19 +19,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import hpamdp
 from hpamdp.env import counter_rng
+from hpamdp.env.boatdock.gymnasium_adapter import BoatDock, BoatDockVector
 from hpamdp.env.boatdock.rendering import Leg, Scene, draw
-from hpamdp.env.gymnasium_adapter import GymnasiumAdapter, GymnasiumVectorAdapter
 
-ID, BOATS = "hpamdp/BoatDock-v0", "hpamdp.env.boatdock.environment:BoatDockEnv"
-BoatDock = partial(GymnasiumAdapter, BOATS)
+ID = "hpamdp/BoatDock-v0"
 START, GOAL = np.array([640.0, 512.0]), np.array([640.0, 452.0])  # 60 px straight up, the congruent controller's key 1
 NOISE = {"motor_noise": 0.2, "sensor_noise": 4.0, "slip": 0.2}
 # Gymnasium recommends actions scaled to [-1, 1]; ours are seconds on purpose.
 RECOMMENDATION = "we recommend using a symmetric and normalized space"
-
-
-def BoatDockVector(num_envs: int, **settings) -> GymnasiumVectorAdapter:  # noqa: N802
-    return GymnasiumVectorAdapter(BOATS, num_envs=num_envs, **settings)
 
 
 def press(key: int, seconds: float, **option: int) -> dict:

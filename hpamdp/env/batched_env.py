@@ -13,7 +13,7 @@ import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -27,14 +27,10 @@ from hpamdp.env import counter_rng
 from hpamdp.env.base import PAMDPEnv, ProblemError
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
-from hpamdp.env.gymnasium_form import DictForm, GymnasiumForm
-from hpamdp.env.kernel_rows import Advance, KernelRows, Results
-from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW
+from hpamdp.env.kernel_rows import Advance, KernelRows, Results, invalid_choice
+from hpamdp.env.kernels import OUTCOME_ROW
 from hpamdp.env.state_columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
-from hpamdp.messages import invalid_action
 from hpamdp.settings import SettingError, Settings
-
-ActionFormat = Literal["dict", "tuple"]  # of Gymnasium's actions, see `hpamdp.env.gymnasium_adapter`
 
 # If a tensordict has only these keys and the problem's extra ones, there is nothing else to carry into its next root.
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
@@ -56,6 +52,18 @@ class EpisodeColumns(Columns, Protocol):
     @property
     def episode(self) -> Tensor:
         """Number of the environment's episode."""
+
+
+class StateArrays(Protocol):
+    """The columns of a state as arrays, in their order."""
+
+    @property
+    def floats(self) -> np.ndarray:
+        """The float32 columns, `[F, N]`."""
+
+    @property
+    def integers(self) -> np.ndarray:
+        """The int32 columns, `[I, N]`."""
 
 
 EpisodeState = TypeVar("EpisodeState", bound=EpisodeColumns)
@@ -115,12 +123,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     outcomes: ClassVar[tuple[str, ...]]  # names: going on, success, ..., time limit
     observation_names: tuple[str, ...]
     extra_names: tuple[str, ...] = ()  # of values `[N, 1]` beside the observation and the outcome, see `extra_spec`
-    # What `reset` takes to start from, in a tensordict or as Gymnasium's options: the shape of one environment's value.
-    # A value of shape () is an integer.
-    start_shapes: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    # What errors, and the dicts of Gymnasium, call an action.
-    action_names: ClassVar[tuple[str, str]] = ("discrete", "parameters")
-    action_format: ClassVar[ActionFormat] = "tuple"  # of Gymnasium's actions, unless the user says otherwise
+    start_keys: frozenset[str] = frozenset()  # keys of a tensordict that `reset` takes, to start from
+    action_names: ClassVar[tuple[str, str]] = ("discrete", "parameters")  # what errors call an action
     # Bounds of the parameters of all discrete actions, side by side.
     parameter_low: Sequence[float]
     parameter_high: Sequence[float]
@@ -278,7 +282,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         """Check what `reset` was given to start from, and return the columns `[N]` of the state that it sets.
 
         Args:
-            given: some of the `start_shapes`, with the values of all environments, `[N, ...]`.
+            given: the values of some of the `start_keys`.
 
         Raises:
             ValueError: an entry is missing, or has another shape or a value that is not allowed.
@@ -344,25 +348,13 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         """Return `success` bool `[M]`."""
         return {"success": last.get(keys.OUTCOME) == SUCCESS}
 
-    def infos(self, floats: np.ndarray, integers: Any) -> dict[str, Any]:
-        """Return what Gymnasium's infos tell of all episodes beside the outcome: the number of steps.
+    def trip_ends(self, rows: StateArrays) -> np.ndarray:
+        """Return whether a trip ended with the last step, bool `[N]`, for Gymnasium's infos."""
+        raise NotImplementedError(f"{type(self).__name__} has no trips")
 
-        Args:
-            floats: the float32 columns of the state in their order, `[F, N]`, or `[F]` for one environment.
-            integers: the int32 columns, `[I, N]`; for one environment, a list of Python's integers.
-
-        Returns:
-            Arrays `[N]`, or numbers for one environment.
-        """
-        return {"steps": integers[STEPS_ROW]}
-
-    def final_infos(self, floats: np.ndarray, integers: Any) -> dict[str, Any]:
-        """Return what the infos tell of episodes that are over, see `infos`: whether they succeeded."""
-        return {"is_success": integers[OUTCOME_ROW] == SUCCESS}
-
-    def gymnasium_form(self) -> GymnasiumForm:
-        """Return how one environment looks to Gymnasium, with actions in the problem's own format."""
-        return super().gymnasium_form() if self.action_format == "tuple" else DictForm(self)
+    def final_infos(self, rows: StateArrays) -> dict[str, np.ndarray]:
+        """Return what Gymnasium's infos tell of episodes that are over, `[N]` each: whether they succeeded."""
+        return {"is_success": rows.integers[OUTCOME_ROW] == SUCCESS}
 
     def masks(self) -> dict[str, Tensor]:
         """Return what the current states allow, `action_mask` or `option_mask`, bool `[N, K]`; by default nothing.
@@ -565,7 +557,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _given_columns(self, tensordict: TensorDictBase | None) -> dict[str, Tensor]:
         """Return the columns of the state that `reset` was given."""
-        names = () if tensordict is None else self.start_shapes.keys() & set(tensordict.keys())
+        names = () if tensordict is None else self.start_keys & set(tensordict.keys())
         if tensordict is None or not names:
             return {}
         columns = self.start_columns({name: tensordict.get(name).cpu().numpy() for name in names})
@@ -642,16 +634,15 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def invalid_action(self, row: int, option: Any, discrete: Any, parameters: Any) -> ValueError:
         """Return the error for the action of a row, given tensors or arrays of all rows."""
-        values: dict[str, tuple[object, str]] = {}
-        if option is not None:
-            values["option"] = option[row].item(), f"allowed 0 to {len(self.option_names) - 1}"
-        chosen, dims = discrete[row].item(), self.parameter_dims
-        values[self.action_names[0]] = chosen, f"allowed 0 to {len(dims) - 1}"
-        if 0 <= chosen < len(dims):
-            first = sum(dims[:chosen])
-            own = parameters[row].tolist()[first : first + dims[chosen]]
-            values[self.action_names[1]] = own, "those of the chosen action must be finite"
-        return invalid_action(row, values)
+        return invalid_choice(
+            row,
+            option=None if option is None else option[row].item(),
+            discrete=discrete[row].item(),
+            parameters=parameters[row].tolist(),
+            parameter_dims=self.parameter_dims,
+            num_options=len(self.option_names),
+            names=self.action_names,
+        )
 
     def read(self) -> TensorDict:
         """Return what is seen of the states, without a reward."""

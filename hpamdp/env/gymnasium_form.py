@@ -21,7 +21,6 @@ from hpamdp.messages import as_code
 
 if TYPE_CHECKING:
     from hpamdp.env.base import PAMDPEnv
-    from hpamdp.env.batched_env import BatchedEnv
 
 
 @dataclass(frozen=True)
@@ -239,34 +238,6 @@ class VectorForm(GymnasiumForm):
             return action
         option = acted.get(keys.OPTION).cpu().numpy()
         return (option if is_batch else option[0]), *action
-
-
-class DictForm(VectorForm):
-    """The form of a problem whose actions are dicts of its `action_names` and, if the agent chooses one, `option`.
-
-    Args:
-        env: the problem.
-    """
-
-    def __init__(self, env: BatchedEnv) -> None:
-        super().__init__(env)
-        low, high = (np.array(side, np.float32) for side in env.observation_bounds)
-        self.observation_space = spaces.Box(low, high, dtype=np.float32)
-        low, high = (np.array(side, np.float32) for side in (env.parameter_low, env.parameter_high))
-        leaves = (spaces.Discrete(len(env.parameter_dims)), spaces.Box(low, high, dtype=np.float32))
-        parts: dict[str, spaces.Space] = dict(zip(env.action_names, leaves, strict=True))
-        if self._has_option:
-            parts["option"] = spaces.Discrete(len(env.option_names))
-        self.action_space = spaces.Dict(parts)
-        self._names = env.action_names
-
-    def write(self, acted: TensorDictBase, *, is_batch: bool) -> Any:
-        """Return the action of `GymnasiumForm.write`."""
-        leaves = dict(zip(self._names, (acted.get(keys.DISCRETE), acted.get(keys.PARAMETERS)), strict=True))
-        if self._has_option:
-            leaves["option"] = acted.get(keys.OPTION)
-        arrays = {name: leaf.cpu().numpy() for name, leaf in leaves.items()}
-        return arrays if is_batch else {name: array[0] for name, array in arrays.items()}
 
 
 def checked_mask(name: str, mask: np.ndarray, component_sizes: Sequence[int] = ()) -> Tensor:

@@ -10,6 +10,7 @@ import numpy as np
 from hpamdp.env import kernels
 from hpamdp.env.kernels import ACT, ACT_AND_RESTART, ACT_OR_RESTART, RESTART
 from hpamdp.env.rng_streams import NOISE, TRAINING, folded
+from hpamdp.messages import invalid_action
 
 # A kernel `advance(state, option, discrete, parameters, mask, settings, mode, results)` that moves all rows:
 # - state: the float32 columns `[F, N]` and the int32 columns `[I, N]`, changed in place.
@@ -171,3 +172,33 @@ class KernelRows:
             results,
         )
         return Results(*results) if invalid < 0 else invalid
+
+
+def invalid_choice(
+    row: int,
+    *,
+    option: int | None,
+    discrete: int,
+    parameters: Sequence[float],
+    parameter_dims: Sequence[int],
+    num_options: int,
+    names: tuple[str, str],
+) -> ValueError:
+    """Return the error for an invalid action of a row.
+
+    Args:
+        row: number of the row.
+        option, discrete, parameters: the action, with the parameters of all discrete actions.
+        parameter_dims: number of parameters of each discrete action.
+        num_options: number of options.
+        names: names of `discrete` and `parameters` in the message.
+    """
+    values: dict[str, tuple[object, str]] = {}
+    if option is not None:
+        values["option"] = option, f"allowed 0 to {num_options - 1}"
+    values[names[0]] = discrete, f"allowed 0 to {len(parameter_dims) - 1}"
+    if 0 <= discrete < len(parameter_dims):
+        first = sum(parameter_dims[:discrete])
+        own = list(parameters[first : first + parameter_dims[discrete]])
+        values[names[1]] = own, "those of the chosen action must be finite"
+    return invalid_action(row, values)

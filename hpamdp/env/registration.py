@@ -10,7 +10,6 @@ import gymnasium
 #
 # For each id `hpamdp/NAME-v0` of a `BatchedEnv`, its class and the settings that the id fixes.
 _BATCHED: dict[str, tuple[str, dict[str, Any]]] = {
-    "BoatDock": ("boatdock.environment:BoatDockEnv", {}),
     "BoatDockUnseen": ("boatdock_unseen.environment:UnseenBoatsEnv", {"family": "turned"}),
     "BoatDockUnseenAny": ("boatdock_unseen.environment:UnseenBoatsEnv", {"family": "any"}),
     "BoatDockUnseenStrength": ("boatdock_unseen.environment:UnseenBoatsEnv", {"family": "strength"}),
@@ -35,6 +34,10 @@ _BATCHED: dict[str, tuple[str, dict[str, Any]]] = {
 # have no `max_episode_steps`.
 _MANIPULATION, _LIGHTS = "primitives.manipulation:Manipulation", "traffic.lights:TrafficLights"
 _OTHERS: dict[str, dict[str, Any]] = {
+    "BoatDock": {
+        "entry_point": "boatdock.gymnasium_adapter:BoatDock",
+        "vector_entry_point": "hpamdp.env.boatdock.gymnasium_adapter:BoatDockVector",
+    },
     "LunarLander": {"entry_point": "lunar_lander.lander:HybridLunarLander", "max_episode_steps": 1000},
     "DrawerClose": {"entry_point": _MANIPULATION, "kwargs": {"task": "drawer_close"}},
     "Soccer": {"entry_point": _MANIPULATION, "kwargs": {"task": "soccer"}},
@@ -49,11 +52,12 @@ _OTHERS: dict[str, dict[str, Any]] = {
 
 def register() -> None:
     """Register the Gymnasium ids of all problems; calling it again changes nothing."""
+    adapter = "hpamdp.env.batched_adapter:BatchedEnv"
     table = {name: {**rest, "entry_point": f"hpamdp.env.{rest['entry_point']}"} for name, rest in _OTHERS.items()}
     for name, (problem, settings) in _BATCHED.items():
         table[name] = {
-            "entry_point": "hpamdp.env.gymnasium_adapter:GymnasiumAdapter",
-            "vector_entry_point": "hpamdp.env.gymnasium_adapter:GymnasiumVectorAdapter",
+            "entry_point": f"{adapter}Adapter",
+            "vector_entry_point": f"{adapter}VectorAdapter",
             "kwargs": {"problem": f"hpamdp.env.{problem}", **settings},
         }
     for name, arguments in table.items():

@@ -23,6 +23,7 @@ from hpamdp.env.base import Metric
 from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.boatdock import episode as episode_rules
 from hpamdp.env.boatdock import harbour, kernel, planner, task
+from hpamdp.env.boatdock.form import BoatForm
 from hpamdp.env.boatdock.human_choices import choice_probabilities, human_spec
 from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.options import CARDS, BoatDockOptions
@@ -42,8 +43,6 @@ if TYPE_CHECKING:
     from hpamdp.env.boatdock.play.boat_page import BoatPage
 
 _PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
-_TANK = np.float32(task.TANK)
-_LARGEST_NORMAL = 6.0  # Gaussian numbers from 23-bit uniform ones stay within 5.8 standard deviations
 _MOST_SWAPPED = 4  # controllers; if there are more, symmetries swap none
 
 _CONTROLLER_ENTRY = task.OBSERVATION_NAMES.index("controller")
@@ -88,14 +87,8 @@ class BoatDockEnv(BatchedEnv[BoatState]):
     outcomes = task.OUTCOMES
     extra_names = (task.FUEL,)
     result_keys = (keys.OUTCOME, task.FUEL)
-    start_shapes: ClassVar[Mapping[str, tuple[int, ...]]] = {
-        "start": (2,),
-        "goal": (2,),
-        "controller": (),
-        "keymap": (),
-    }
-    action_names = ("key", "duration")
-    action_format = "dict"
+    start_keys = frozenset({"start", "goal", "controller", "keymap"})
+    action_names = ("key", "durations")
     row_kernel = staticmethod(kernel.advance)
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score"),
@@ -169,48 +162,9 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         """Check a layout and return the columns of the state that it sets."""
         return layout_columns(given, self.num_envs, self.rules)
 
-    @property
-    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
-        """The lowest and the highest observation that layouts, motion and noise can reach, `[16]` or `[14]` each."""
-        is_pixels = self.rules.observation == "pixels"
-        unit = 1.0 if is_pixels else 1.0 / task.HARBOUR_RADIUS
-        top_speed = 1.01 * (task.SPEED_SCALE if is_pixels else 1.0)
-        # The extra px allows for rounding.
-        reach = task.HARBOUR_RADIUS + 1.0 + _LARGEST_NORMAL * self.rules.sensor_noise
-        bounds = {
-            "radius": (0.0, 2.0 * task.HARBOUR_RADIUS * unit),
-            "controller": (-1.0, len(self.rules.names) - 1.0),
-            "fuel": (0.0, 1.0),
-            # The unit is the distance at the start, which counts as at least the radius of the dock.
-            "distance": (0.0, 2.0 * 2.0**0.5 * reach / task.DOCK_RADIUS),
-        }
-        for axis, centre in zip("xy", task.CENTRE if is_pixels else (0.0, 0.0), strict=True):
-            for point in ("start", "goal", "centre", "boat"):
-                bounds[f"{point}_{axis}"] = (centre - reach * unit, centre + reach * unit)
-            bounds[f"velocity_{axis}"] = (-top_speed, top_speed)
-            bounds[f"to_goal_{axis}"] = (-2.0 * reach * unit, 2.0 * reach * unit)
-        low, high = zip(*(bounds[name] for name in self.observation_names), strict=True)
-        return low, high
-
-    def infos(self, floats: np.ndarray, integers: Any) -> dict[str, Any]:
-        """Return `fuel` (fraction of the tank), `presses` and `controller` (its number, -1 before one is chosen)."""
-        return {
-            "fuel": floats[kernel.FUEL] / _TANK,
-            "presses": integers[kernel.PRESSES],
-            "controller": integers[kernel.CONTROLLER],
-        }
-
-    def final_infos(self, floats: np.ndarray, integers: Any) -> dict[str, Any]:
-        """Return the `score`."""
-        fuel, is_success = np.float64(floats[kernel.FUEL] / _TANK), integers[kernel.OUTCOME] == task.SUCCESS
-        # By arithmetic, which takes both arrays and numbers: `np.where` takes 1 us for a number.
-        return {"score": is_success * (task.SUCCESS_REWARD * fuel) + (1 - is_success) * task.FAILURE_REWARD}
-
-    def draw(self, track: Sequence[BoatState]) -> np.ndarray:
-        """Return a picture of the harbour and the boat's track, uint8 `[480, 480, 3]`."""
-        from hpamdp.env.boatdock import rendering
-
-        return rendering.draw(rendering.scene_of(track, self.rules))
+    def gymnasium_form(self) -> BoatForm:
+        """Return the form of `hpamdp/BoatDock-v0`."""
+        return BoatForm(self, self.rules)
 
     @property
     def symmetries(self) -> Symmetries:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -14,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics
-from hpamdp.env.boatdock.task import Boats, BoatState, Rules
+from hpamdp.env.boatdock.task import Boats, BoatState
 from hpamdp.env.canvas import BACKGROUND, BAD, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, Canvas, Point
 
 _WATER = "#d6e7ec"
@@ -69,26 +67,6 @@ class Scene:
     outcome: str = physics.OUTCOMES[physics.SAILING]
     score: float | None = None
     boats: Boats | None = None
-
-
-def scene_of(track: Sequence[BoatState], rules: Rules) -> Scene:
-    """Return the scene of one boat, given its states from the start on, columns `[1]`."""
-    state, outcome = track[-1], int(track[-1].outcome)
-    fuel = state.fuel / physics.TANK
-    return Scene(
-        start=(state.start_x.item(), state.start_y.item()),
-        goal=(state.goal_x.item(), state.goal_y.item()),
-        boat=(state.x.item(), state.y.item()),
-        heading=(state.velocity_x.item(), state.velocity_y.item()),
-        legs=tuple(leg(*pair, rules.switch_cost) for pair in itertools.pairwise(track)),
-        fuel=fuel.item(),
-        presses=int(state.presses),
-        controller=int(state.controller),
-        keymap=int(state.keymap),
-        outcome=physics.OUTCOMES[outcome],
-        score=harbour.score(state.outcome, fuel).item() if outcome != physics.SAILING else None,
-        boats=rules.boats,
-    )
 
 
 def draw(scene: Scene, size: int = 480) -> np.ndarray:

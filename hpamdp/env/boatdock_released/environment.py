@@ -12,7 +12,7 @@ Differs from the source:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -74,7 +74,7 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
     parameter_dims = (1, 1, 1)
     parameter_low = (-1.0,) * 3
     parameter_high = (1.0,) * 3
-    start_shapes: ClassVar[Mapping[str, tuple[int, ...]]] = {"start": (2,), "goal": (2,), "keymap": ()}
+    start_keys = frozenset({"start", "goal", "keymap"})
     action_names = ("key", "durations")
     position = None  # evaluations keep no paths
 

@@ -8,7 +8,7 @@ a session a trial.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torchrl.data import Binary, Bounded, TensorSpec, Unbounded
 from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.base import Metric
-from hpamdp.env.batched_env import Action, BatchedEnv
+from hpamdp.env.batched_env import Action, BatchedEnv, StateArrays
 from hpamdp.env.boatdock import harbour, task
 from hpamdp.env.boatdock_unseen import fleet, kernel, planner, rules
 from hpamdp.env.boatdock_unseen.options import CARDS, FAMILIES, UnseenBoatsOptions
@@ -260,9 +260,9 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         limits |= {"boat": (-1, boats), "last_boat": (-1, boats), "last_key": (-1, task.NUM_KEYS), "trip_ended": (0, 2)}
         check_range(columns, limits)
 
-    def infos(self, floats: np.ndarray, integers: Any) -> dict[str, Any]:
-        """Return the number of presses, and whether a trip ended with the last one."""
-        return {**super().infos(floats, integers), keys.TRIP_ENDED: integers[kernel.TRIP_ENDED] != 0}
+    def trip_ends(self, rows: StateArrays) -> np.ndarray:
+        """Return whether a trip ended with the last press, bool `[N]`."""
+        return rows.integers[kernel.TRIP_ENDED] != 0
 
     def describe(self) -> dict[str, Tensor]:
         """Return `optimum` `[N, trips]` of the sessions that have just begun: the best score of a plan in each trip.
@@ -274,10 +274,10 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         layouts = (harbour.sample_layout(self._session_rng(state.episode, trip)) for trip in range(self.options.trips))
         return {"optimum": torch.stack([planner.best_scores(layout, boats, shortest) for layout in layouts], -1)}
 
-    def final_infos(self, floats: np.ndarray, integers: Any) -> dict[str, Any]:
+    def final_infos(self, rows: StateArrays) -> dict[str, np.ndarray]:
         """Return `score` and `success`, the fraction of trips that docked, of sessions `[N]`."""
         trips = np.float32(self.options.trips)
-        return {"score": floats[kernel.TOTAL_SCORE] / trips, "success": integers[kernel.DOCKED] / self.options.trips}
+        return {"score": rows.floats[kernel.TOTAL_SCORE] / trips, "success": rows.integers[kernel.DOCKED] / trips}
 
     def played(self) -> dict[str, Tensor]:
         """Return `trip_score` and `trip_presses` `[N, trips]` of the sessions of an evaluation."""
