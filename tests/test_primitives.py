@@ -112,7 +112,7 @@ def test_without_the_simulator_one_line_says_what_to_install(monkeypatch):
 
 
 def test_a_wrong_task_is_refused_with_those_that_exist():
-    with pytest.raises(SettingError, match="task=pick_place, but must be one of drawer_close, soccer"):
+    with pytest.raises(SettingError, match="task='pick_place': must be 'drawer_close', 'soccer'"):
         Manipulation("pick_place")
     with pytest.raises(SettingError, match="drawer_close"):
         PrimitivesEnv(1, task="pick_place")
@@ -121,12 +121,12 @@ def test_a_wrong_task_is_refused_with_those_that_exist():
 @pytest.mark.parametrize(
     ("settings", "line"),
     [
-        ({"decisions": 0}, "decisions=0, but must be a whole number of at least 1"),
-        ({"reach": float("nan")}, "reach=nan, but must be above 0 and at most 1"),
+        ({"decisions": 0}, "decisions=0: must be greater than 0"),
+        ({"reach": float("nan")}, "reach=nan: must be a finite number"),
     ],
 )
 def test_a_wrong_number_is_refused_in_one_line(settings, line):
-    with pytest.raises(SettingError, match=f"^Manipulation: {line}$"):
+    with pytest.raises(SettingError, match=f"^{line}$"):
         Manipulation(**settings)
 
 

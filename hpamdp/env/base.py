@@ -80,6 +80,7 @@ class PAMDPEnv(EnvBase):
     figures show it. All of them have defaults.
     """
 
+    options: Any = None  # the problem's settings, if its class lists them
     # The entries of the observation, in their order, if any of them is a picture. Pixels are integers from 0 to 255.
     # Empty if the constructor gets `flatten_pictures=True`, since pictures are then part of the vector.
     observation_entries: tuple[ObservationEntry, ...] = ()
@@ -142,7 +143,8 @@ class PAMDPEnv(EnvBase):
     @property
     def default_options(self) -> Mapping[str, Sequence[int | str]]:
         """Options to begin with, as for `group_actions`; empty if the problem suggests none."""
-        return {}
+        facts = None if self.options is None else self.facts(self.options)
+        return {} if facts is None else facts.default_options
 
     def group_actions(self, options: Mapping[str, Sequence[int | str]]) -> None:
         """Let the agent choose among options that allow some of the discrete actions each.

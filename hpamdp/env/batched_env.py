@@ -119,7 +119,6 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     """
 
     Options: ClassVar[type[Settings]]
-    options: Any  # of the class Options
     outcomes: ClassVar[tuple[str, ...]]  # names: going on, success, ..., time limit
     observation_names: tuple[str, ...]
     extra_names: tuple[str, ...] = ()  # of values `[N, 1]` beside the observation and the outcome, see `extra_spec`
@@ -182,11 +181,6 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     def facts(cls, options: Any) -> ProblemFacts:
         """Return what these settings tell of the problem; by default that all its facts are the usual ones."""
         return super().facts(options) or ProblemFacts(title=cls.__name__)
-
-    @property
-    def default_options(self) -> Mapping[str, Sequence[int | str]]:
-        """Options to begin with."""
-        return self.facts(self.options).default_options
 
     def _prepare(self) -> None:
         """Set what follows from the settings, such as the bounds of the parameters, before the specs are made."""

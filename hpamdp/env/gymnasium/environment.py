@@ -6,6 +6,7 @@ import itertools
 import math
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial, update_wrapper
 from typing import Any, ClassVar
 
 import gymnasium
@@ -25,7 +26,7 @@ from hpamdp.env.gymnasium.copies import Copies, Reading
 from hpamdp.env.gymnasium.form import NativeForm, joined
 from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.masks import as_leaf
-from hpamdp.env.gymnasium.options import CARDS, GymnasiumOptions
+from hpamdp.env.gymnasium.options import CARDS, GymnasiumOptions, SimulatorOptions
 from hpamdp.env.gymnasium.parameter_bounds import agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics
@@ -92,7 +93,6 @@ class GymnasiumEnv(PAMDPEnv):
         flatten_pictures: bool = False,
         **settings: Any,
     ) -> None:
-        self._flattens_pictures = flatten_pictures
         options = self.options = GymnasiumOptions.of(options, settings)
         for name in NAMING_SETTINGS:
             value = getattr(options, name)
@@ -109,6 +109,7 @@ class GymnasiumEnv(PAMDPEnv):
         self.first_env = first_env
         self._name = f"GymnasiumEnv: {options.entry_point or options.id or getattr(make, '__name__', 'environment')}"
         maker = Maker(self._name, options.id, options.entry_point or make, options.kwargs, options.max_steps)
+        self._reading = _reading_of(options, flatten_pictures)
         self._copies = self._make_copies(maker)
         self.is_closed = False  # TorchRL's flag: from here on there are copies to close
         with closed_on_error(self):
@@ -148,7 +149,7 @@ class GymnasiumEnv(PAMDPEnv):
     def _make_copies(self, make: Maker) -> Copies | ProcessCopies:
         num_workers = self.options.num_workers
         if num_workers == 0:
-            return Copies(make, self.num_envs, self._reading(), self._name)
+            return Copies(make, self.num_envs, self._reading, self._name)
         if multiprocessing.current_process().daemon:
             raise SettingError(f"{self._name}: {num_workers=}: a worker process cannot start others; use 0")
         why = why_unsendable(make)
@@ -157,22 +158,7 @@ class GymnasiumEnv(PAMDPEnv):
                 f"{self._name}: {num_workers=}: cannot be sent to processes ({why}); create what it refers to in its "
                 "constructor or function, or use 0"
             )
-        return ProcessCopies(make, self.num_envs, self._reading(), self._name, num_workers)
-
-    def _reading(self) -> Reading:
-        given = self.options
-        return Reading(
-            max_steps=given.max_steps,
-            action_form=given.action_form,
-            parameter_dims=None if given.parameter_dims is None else tuple(given.parameter_dims),
-            option_key=given.option_key,
-            action_mask=given.action_mask,
-            pair_mask=given.pair_mask,
-            parameter_bounds=given.parameter_bounds,
-            observation_keys=None if given.observation_keys is None else tuple(given.observation_keys),
-            out_of_bounds=given.out_of_bounds,
-            flattens_pictures=self._flattens_pictures,
-        )
+        return ProcessCopies(make, self.num_envs, self._reading, self._name, num_workers)
 
     @property
     def envs(self) -> list[gymnasium.Env]:
@@ -213,7 +199,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     def gymnasium_form(self) -> NativeForm:
         """Return the form of the environment itself."""
-        return NativeForm(self._copies, self.scaling, self._reading())
+        return NativeForm(self._copies, self.scaling, self._reading)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `success` bool `[M]` if any info so far had it."""
@@ -476,6 +462,65 @@ class GymnasiumEnv(PAMDPEnv):
         # Every leaf has its final shape and device. TensorDict's own check of that takes several times as long.
         td = TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=device)
         return self.check_masks(td) if results.masks else td
+
+
+class SimulatorEnv(GymnasiumEnv):
+    """A problem with settings of its own, whose copies are Gymnasium environments of the class `simulator`.
+
+    See `GymnasiumEnv` for the arguments and the errors.
+    """
+
+    Options: ClassVar[type[Settings]]
+    options: SimulatorOptions
+    simulator: ClassVar[Callable[..., gymnasium.Env]]
+    simulator_options: ClassVar[type[Settings]]  # the model of the settings that the simulator takes
+    reading: ClassVar[Mapping[str, Any]] = {}  # settings of `GymnasiumEnv` that differ from its defaults
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        options: SimulatorOptions | None = None,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+        **settings: Any,
+    ) -> None:
+        given: Any = self.Options.of(options, settings)
+        rules = {name: getattr(given, name) for name in self.simulator_options.model_fields}
+        make = partial(self.simulator, render_mode="rgb_array" if given.render else None, **rules)
+        update_wrapper(make, self.simulator)  # so that errors name the simulator
+        super().__init__(
+            num_envs,
+            make=make,
+            device=device,
+            seed=seed,
+            first_env=first_env,
+            max_steps=getattr(given, "max_steps", None),
+            reward_scaling=given.reward_scaling,
+            num_workers=given.num_workers,
+            **self.reading,
+        )
+        self.options = given
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Set what follows from the settings, such as the names of the actions."""
+
+
+def _reading_of(options: GymnasiumOptions, flattens_pictures: bool) -> Reading:
+    return Reading(
+        max_steps=options.max_steps,
+        action_form=options.action_form,
+        parameter_dims=None if options.parameter_dims is None else tuple(options.parameter_dims),
+        option_key=options.option_key,
+        action_mask=options.action_mask,
+        pair_mask=options.pair_mask,
+        parameter_bounds=options.parameter_bounds,
+        observation_keys=None if options.observation_keys is None else tuple(options.observation_keys),
+        out_of_bounds=options.out_of_bounds,
+        flattens_pictures=flattens_pictures,
+    )
 
 
 def _fitted(picture: np.ndarray) -> np.ndarray:

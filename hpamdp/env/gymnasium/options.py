@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from pydantic import NonNegativeInt, PositiveInt
 
 from hpamdp.cards import ProblemCard
-from hpamdp.env.facts import SOURCE_SETTINGS
+from hpamdp.env.facts import SOURCE_SETTINGS, ProblemFacts, ProblemOptions
 from hpamdp.settings import PositiveFraction, Settings
 
 ActionForm = Literal["auto", "components"]
@@ -71,6 +72,38 @@ class GymnasiumOptions(Settings):
     """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""
     num_workers: NonNegativeInt = 0
     """Processes that step the copies at the same time, for slow environments. If 0, this process steps them."""
+
+
+class SimulatorOptions(ProblemOptions):
+    """Settings of every `SimulatorEnv`.
+
+    Tables begin with the settings of the simulator if its model is named second, as in
+    `class TrafficOptions(SimulatorOptions, TrafficRules)`.
+    """
+
+    render: bool = False
+    """Draw the environment, for films; steps then take longer."""
+    reward_scaling: PositiveFraction | None = None
+    """Divide rewards in training by the running standard deviation of the return with this discount.
+
+    If null, rewards are not scaled.
+    """
+    num_workers: NonNegativeInt = 0
+    """Processes that step the environments in parallel. If 0, this process steps them."""
+
+    @property
+    def default_options(self) -> Mapping[str, Sequence[int | str]]:
+        """Options to begin with; none unless a subclass suggests some."""
+        return {}
+
+    def facts(self, title: str) -> ProblemFacts:
+        """Return what these settings tell of the problem, which errors call `title`."""
+        return ProblemFacts(
+            title=title,
+            is_shardable=self.num_workers == 0,
+            has_statistics=self.reward_scaling is not None,
+            default_options=self.default_options,
+        )
 
 
 CARDS = {"GymnasiumEnv": ProblemCard(options=GymnasiumOptions, guarded_settings=SOURCE_SETTINGS)}

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveInt
 
 from hpamdp.cards import ProblemCard
-from hpamdp.env.facts import ProblemFacts, ProblemOptions
-from hpamdp.settings import OnlyWith, PositiveFraction, Settings
+from hpamdp.env.gymnasium.options import SimulatorOptions
+from hpamdp.settings import OnlyWith, Settings
 
 
 class LanderRules(Settings):
@@ -24,26 +24,11 @@ class LanderRules(Settings):
     """With `enable_wind`: largest torque of the wind."""
 
 
-class LunarLanderOptions(LanderRules, ProblemOptions):
+class LunarLanderOptions(SimulatorOptions, LanderRules):
     """Settings of `LunarLanderEnv`."""
 
     max_steps: PositiveInt = 1000
     """Steps after which an episode is truncated."""
-    render: bool = False
-    """Draw the lander, for films; steps then take longer."""
-    reward_scaling: PositiveFraction | None = None
-    """Divide rewards in training by the running standard deviation of the return with this discount.
-
-    If null, rewards are not scaled.
-    """
-    num_workers: NonNegativeInt = 0
-    """Processes that step the environments in parallel. If 0, this process steps them."""
-
-    def facts(self, title: str) -> ProblemFacts:
-        """Return what these settings tell of the problem, which errors call `title`."""
-        return ProblemFacts(
-            title=title, is_shardable=self.num_workers == 0, has_statistics=self.reward_scaling is not None
-        )
 
 
 CARDS = {

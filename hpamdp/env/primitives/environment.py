@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial, update_wrapper
-from typing import Any, ClassVar
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.env.gymnasium.environment import GymnasiumEnv
-from hpamdp.env.gymnasium.options import GymnasiumOptions
+from hpamdp.env.gymnasium.environment import SimulatorEnv
 from hpamdp.env.primitives.manipulation import HIGHEST, LOWEST, OBSERVED, Manipulation
-from hpamdp.env.primitives.options import ACTIONS, CARDS, PrimitivesOptions
+from hpamdp.env.primitives.options import ACTIONS, CARDS, ManipulationRules, PrimitivesOptions
 from hpamdp.env.primitives.players import MEASURED, RING_FROM_HANDLE_M
 from hpamdp.env.primitives.primitives import AXES, PRIMITIVES
-from hpamdp.settings import Settings
 
 # In assembly the hand holds a handle, and the ring beside it has to go over a peg. Lifts and drops end so far past it.
 _CLEARANCE_M = 0.05
@@ -24,7 +20,7 @@ _CLEARANCE_M = 0.05
 _OBJECT, _GOAL = (slice(first, first + 3) for first in map(OBSERVED.index, ("object_x", "goal_x")))
 
 
-class PrimitivesEnv(GymnasiumEnv):
+class PrimitivesEnv(SimulatorEnv):
     """Let `num_envs` arms manipulate objects at once.
 
     Action leaves, with the ten primitives:
@@ -39,44 +35,15 @@ class PrimitivesEnv(GymnasiumEnv):
     arguments and the errors.
     """
 
-    Options: ClassVar[type[Settings]] = PrimitivesOptions
+    Options = PrimitivesOptions
     card = CARDS["PrimitivesEnv"]
+    options: PrimitivesOptions
+    simulator = Manipulation
+    simulator_options = ManipulationRules
     observation_names = OBSERVED
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        options: PrimitivesOptions | None = None,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-        **settings: Any,
-    ) -> None:
-        given = PrimitivesOptions.of(options, settings)
-        reading = GymnasiumOptions(
-            reward_scaling=given.reward_scaling,
-            num_workers=given.num_workers,
-        )
-        make = partial(
-            Manipulation,
-            given.task,
-            actions=given.actions,
-            reward=given.reward,
-            decisions=given.decisions,
-            reach=given.reach,
-            has_negative_distances=given.negative_distances,
-            render_mode="rgb_array" if given.render else None,
-        )
-        update_wrapper(make, Manipulation)  # so that errors name Manipulation
-        super().__init__(num_envs, make=make, options=reading, device=device, seed=seed, first_env=first_env)
-        self._given = given
-        self.discrete_names = tuple(action.name for action in ACTIONS[given.actions])
-
-    @property
-    def default_options(self) -> Mapping[str, Sequence[int | str]]:
-        """The kinds of primitives, or with `actions=all` the ways of steering."""
-        return self._given.default_options
+    def _prepare(self) -> None:
+        self.discrete_names = tuple(action.name for action in ACTIONS[self.options.actions])
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
         """Return the linear map from observations to initial arguments: to the object, and as far as the goal.
@@ -90,13 +57,13 @@ class PrimitivesEnv(GymnasiumEnv):
         bias = torch.zeros(sum(self.parameter_dims), dtype=torch.float32)
         ring = torch.tensor(RING_FROM_HANDLE_M, dtype=torch.float32)
         row = 0
-        for action in ACTIONS[self._given.actions]:
+        for action in ACTIONS[self.options.actions]:
             if action in PRIMITIVES and action.num_arguments == 3:
                 weights[row : row + 3, _OBJECT] = torch.eye(3, dtype=torch.float32)
             elif action.num_arguments == 1:
                 axis = torch.tensor(AXES[action.name], dtype=torch.float32)
                 weights[row, _GOAL] = axis
-                if self._given.task == "assembly":
+                if self.options.task == "assembly":
                     bias[row] = _CLEARANCE_M * axis[2].abs() - axis @ ring
             row += action.num_arguments
         # Offsets are observed in [-1, 1], with 0 in the middle, so they need no bias.
@@ -108,7 +75,7 @@ class PrimitivesEnv(GymnasiumEnv):
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return what the hand-written player of the task reaches in an episode of five primitives."""
-        if self._given.decisions != PrimitivesOptions().decisions:
+        if self.options.decisions != PrimitivesOptions().decisions:
             return {}
-        reached = MEASURED[self._given.task]
-        return {"player of primitives": {"score": reached[self._given.reward], "success": reached["success"]}}
+        reached = MEASURED[self.options.task]
+        return {"player of primitives": {"score": reached[self.options.reward], "success": reached["success"]}}

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
 from hpamdp.env.gymnasium_checks import check_render_mode, reset_options, single_action
-from hpamdp.env.primitives.options import ACTIONS, Actions, Reward, Task
+from hpamdp.env.primitives.options import ACTIONS, ManipulationRules, Task
 from hpamdp.env.primitives.primitives import (
     STEPS,
     phases,
@@ -44,7 +44,8 @@ class Manipulation(gymnasium.Env):
     - Action: `Tuple(Discrete(K), Tuple(K Boxes))`, distances in metres. See `hpamdp.env.primitives.primitives`.
     - Observation: float32 `[15]`, see `OBSERVED`. `object` is the object's offset from the hand, `goal` is the goal's
       offset from the object. Numbers beyond the bounds are clipped.
-    - Reward: see `reward`. A return is at most 10 times `decisions` if it is dense, and `decisions` if not.
+    - Reward: that of the setting `reward`, multiplied by the time that the action takes, in primitives. A return is at
+      most 10 times `decisions` if it is dense, and `decisions` if not.
     - An episode terminates after `decisions` primitives; 60 small or 6 large position steps take as long as one.
 
     The info of a step has `is_success`: whether any low-level step of the episode so far was a success. It also has
@@ -52,13 +53,8 @@ class Manipulation(gymnasium.Env):
 
     Args:
         task: the task.
-        actions: what the agent chooses from.
-        reward: `dense`: the mean of Meta-World's rewards over the action's low-level steps, 0 to 10; `sparse`: 1 if any
-            of them was a success, otherwise 0. Both are multiplied by the time that the action takes, in primitives.
-        decisions: number of primitives in an episode.
-        reach: largest absolute value of a primitive's argument, in metres.
-        has_negative_distances: whether primitives along one axis also take distances below 0, which count as 0.
         render_mode: None or `rgb_array`.
+        settings: the others of `ManipulationRules`, by name.
 
     Attributes:
         own_time_limit: most actions of an episode.
@@ -71,39 +67,25 @@ class Manipulation(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012
 
     def __init__(
-        self,
-        task: Task = "drawer_close",
-        *,
-        actions: Actions = "primitives",
-        reward: Reward = "sparse",
-        decisions: int = 5,
-        reach: float = 1.0,
-        has_negative_distances: bool = True,
-        render_mode: str | None = None,
+        self, task: Task = "drawer_close", *, render_mode: Literal["rgb_array"] | None = None, **settings: Any
     ) -> None:
-        for name, given, allowed in (("task", task, Task), ("actions", actions, Actions), ("reward", reward, Reward)):
-            if given not in get_args(allowed):
-                raise SettingError(f"Manipulation: {name}={given}, but must be one of {', '.join(get_args(allowed))}")
-        if not isinstance(decisions, int | np.integer) or decisions < 1:
-            raise SettingError(f"Manipulation: decisions={decisions}, but must be a whole number of at least 1")
-        if not isinstance(reach, int | float | np.floating) or not 0.0 < reach <= 1.0:
-            raise SettingError(f"Manipulation: reach={reach}, but must be above 0 and at most 1")
+        rules = ManipulationRules.of(None, {"task": task, **settings})
         check_render_mode("Manipulation", render_mode)
         self.render_mode = render_mode
-        self.actions = ACTIONS[actions]
+        self.actions = ACTIONS[rules.actions]
         self._parameter_dims = [each.num_arguments for each in self.actions]
-        self._is_dense = reward == "dense"
-        self._ticks = decisions * STEPS
-        self._arm = _make_arm(task, render_mode)
+        self._is_dense = rules.reward == "dense"
+        self._ticks = rules.decisions * STEPS
+        self._arm = _make_arm(rules.task, render_mode)
         self.observation_space = spaces.Box(LOWEST, HIGHEST, dtype=np.float32)
         boxes = []
         for action in self.actions:
-            largest = reach if action.reach is None else action.reach
-            is_one_sided = action.num_arguments == 1 and not has_negative_distances
+            largest = rules.reach if action.reach is None else action.reach
+            is_one_sided = action.num_arguments == 1 and not rules.negative_distances
             low = 0.0 if is_one_sided else -largest
             boxes.append(spaces.Box(low, largest, (action.num_arguments,), np.float32))
         self._boxes = boxes
-        self.own_time_limit = decisions * STEPS // min(action.ticks for action in self.actions)
+        self.own_time_limit = self._ticks // min(action.ticks for action in self.actions)
         self.action_space = spaces.Tuple([spaces.Discrete(len(boxes)), spaces.Tuple(boxes)])
         self.on_low_level_step: Callable[[], None] | None = None
         self._ticks_left = 0

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeInt, PositiveInt
+from pydantic import Field, PositiveInt
 
 from hpamdp.cards import ProblemCard
-from hpamdp.env.facts import ProblemFacts, ProblemOptions
+from hpamdp.env.gymnasium.options import SimulatorOptions
 from hpamdp.env.primitives.primitives import LARGE_POSITION_STEPS, PRIMITIVES, SMALL_POSITION_STEPS, Action
-from hpamdp.settings import OnlyWith, PositiveFraction
+from hpamdp.settings import OnlyWith, Settings
 
 Task = Literal["drawer_close", "soccer", "peg_unplug_side", "sweep_into", "assembly", "disassemble"]
 Actions = Literal["primitives", "small_steps", "large_steps", "all"]
@@ -27,8 +27,8 @@ _GROUPED_PRIMITIVES = {
 }
 
 
-class PrimitivesOptions(ProblemOptions):
-    """Settings of `PrimitivesEnv`."""
+class ManipulationRules(Settings):
+    """Settings of `Manipulation`."""
 
     task: Task = "drawer_close"
     """Meta-World's task."""
@@ -42,15 +42,13 @@ class PrimitivesOptions(ProblemOptions):
     """Largest absolute value of a primitive's argument, in metres."""
     negative_distances: Annotated[bool, OnlyWith("actions", "primitives", "all")] = True
     """Whether primitives along one axis also take distances below 0, which count as 0, as in the source."""
+
+
+class PrimitivesOptions(SimulatorOptions, ManipulationRules):
+    """Settings of `PrimitivesEnv`."""
+
     render: bool = False
     """Draw the arm, for films; without a display MuJoCo needs MUJOCO_GL=egl or osmesa."""
-    reward_scaling: PositiveFraction | None = None
-    """Divide rewards in training by the running standard deviation of the return with this discount.
-
-    If null, rewards are not scaled.
-    """
-    num_workers: NonNegativeInt = 0
-    """Processes that step the environments in parallel. If 0, this process steps them."""
 
     @property
     def default_options(self) -> dict[str, list[int | str]]:
@@ -60,15 +58,6 @@ class PrimitivesOptions(ProblemOptions):
             return {way: [action.name for action in ACTIONS[way]] for way in ways}
         groups = _GROUPED_PRIMITIVES if self.actions == "primitives" else {}
         return {name: [*members] for name, members in groups.items()}
-
-    def facts(self, title: str) -> ProblemFacts:
-        """Return what these settings tell of the problem, which errors call `title`."""
-        return ProblemFacts(
-            title=title,
-            is_shardable=self.num_workers == 0,
-            has_statistics=self.reward_scaling is not None,
-            default_options=self.default_options,
-        )
 
 
 CARDS = {

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial, update_wrapper
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,23 +13,21 @@ from torchrl.data import Unbounded
 
 from hpamdp import keys
 from hpamdp.env.base import Metric
-from hpamdp.env.gymnasium.environment import GymnasiumEnv
-from hpamdp.env.gymnasium.options import GymnasiumOptions
+from hpamdp.env.gymnasium.environment import SimulatorEnv
 from hpamdp.env.traffic.demand import HELD_OUT
 from hpamdp.env.traffic.lights import TrafficLights
 from hpamdp.env.traffic.network import ARMS, MAX_GREEN, MIN_GREEN, NETWORKS, lanes_of
-from hpamdp.env.traffic.options import CARDS, PHASES, PLAYERS, TrafficOptions
+from hpamdp.env.traffic.options import CARDS, PHASES, PLAYERS, TrafficOptions, TrafficRules
 from hpamdp.env.traffic.players import START_S, VEHICLE_S
 from hpamdp.env.traffic.simulation import VEHICLES, observation_names
 from hpamdp.geometry import Symmetries, make_symmetries
-from hpamdp.settings import Settings
 
 _RESULTS = ("delay", "queue", "stops", "throughput")
 _DURATION_S = 10.0  # for which a discount stands
 _INITIAL_GREEN_S = 15.0  # in the corridor
 
 
-class TrafficEnv(GymnasiumEnv):
+class TrafficEnv(SimulatorEnv):
     """Set the traffic lights of `num_envs` networks, each simulated by SUMO in a process of its own.
 
     Action leaves:
@@ -43,8 +40,12 @@ class TrafficEnv(GymnasiumEnv):
     `TrafficLights`, and `GymnasiumEnv` for the arguments and the errors.
     """
 
-    Options: ClassVar[type[Settings]] = TrafficOptions
+    Options = TrafficOptions
     card = CARDS["TrafficEnv"]
+    options: TrafficOptions
+    simulator = TrafficLights
+    simulator_options = TrafficRules
+    reading: ClassVar[dict[str, Any]] = {"observation_scaling": "none"}
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score"),
         Metric("delay", "delay, s a vehicle"),
@@ -58,32 +59,10 @@ class TrafficEnv(GymnasiumEnv):
         Metric("queue", "Vehicles that wait"),
     )
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        options: TrafficOptions | None = None,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-        **settings: Any,
-    ) -> None:
-        given = TrafficOptions.of(options, settings)
-        names = ("network", "demand", "minutes", "traffic", "reward", "whole_seconds", "strategies")
-        self._given = given
-        self._is_single = len(NETWORKS[given.network]) == 1
-        # Names before the base class reads them.
-        self.discrete_names = (*PHASES, *(PLAYERS if given.strategies else ()))
-        self.observation_names = tuple(observation_names(given.network))
-        reading = GymnasiumOptions(
-            observation_scaling="none",
-            reward_scaling=given.reward_scaling,
-            num_workers=given.num_workers,
-        )
-        chosen = {name: getattr(given, name) for name in names}
-        make = partial(TrafficLights, render_mode="rgb_array" if given.render else None, **chosen)
-        update_wrapper(make, TrafficLights)  # so that errors name TrafficLights
-        super().__init__(num_envs, make=make, options=reading, device=device, seed=seed, first_env=first_env)
+    def _prepare(self) -> None:
+        self._is_single = len(NETWORKS[self.options.network]) == 1
+        self.discrete_names = (*PHASES, *(PLAYERS if self.options.strategies else ()))
+        self.observation_names = tuple(observation_names(self.options.network))
 
     def _make_specs(self) -> None:
         super()._make_specs()
@@ -94,11 +73,6 @@ class TrafficEnv(GymnasiumEnv):
         seconds = [0] * self.num_envs if reward is None else self._copies.call("last_seconds")
         duration = torch.tensor(seconds, dtype=torch.float32, device=self.device).unsqueeze(-1) / _DURATION_S
         return super()._read(reward).set(keys.DURATION, duration)
-
-    @property
-    def default_options(self) -> Mapping[str, Sequence[int | str]]:
-        """With `strategies`, each of them, and all phases for the learner."""
-        return self._given.default_options
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
         """Return the greens of the player `longest_queue`; in the corridor 15 s.

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
 from hpamdp.env.gymnasium_checks import check_render_mode, reset_options, single_action
-from hpamdp.env.traffic.demand import HELD_OUT, KINDS, NUM_DEMANDS
+from hpamdp.env.traffic.demand import HELD_OUT, NUM_DEMANDS
 from hpamdp.env.traffic.network import MAX_GREEN, MIN_GREEN, NETWORKS, network_file
-from hpamdp.env.traffic.options import MOST_TRAFFIC, PHASES, PLAYERS, Reward
+from hpamdp.env.traffic.options import PHASES, PLAYERS, TrafficRules
 from hpamdp.env.traffic.process import SimulationProcess
 from hpamdp.env.traffic.simulation import Seen, Task, observation_names
-from hpamdp.settings import SettingError
 
 _NONE = spaces.Box(0.0, 1.0, (0,), np.float32)
 
@@ -33,14 +32,8 @@ class TrafficLights(gymnasium.Env):
     so all others are unknown in training. The info of the last step has `delay`, `queue`, `stops` and `throughput`.
 
     Args:
-        network: `crossing` or `corridor`.
-        demand: `light`, `rush` or `shifting`.
-        minutes: length of an episode.
-        traffic: factor on the flows of all arms.
-        reward: `queue` or `waiting`.
-        whole_seconds: whether greens are whole numbers.
-        strategies: whether the strategies are actions.
         render_mode: None or `rgb_array`.
+        settings: those of `TrafficRules`, by name.
 
     Attributes:
         own_time_limit: most decisions of an episode.
@@ -52,37 +45,20 @@ class TrafficLights(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 (Gymnasium's own declaration)
 
-    def __init__(
-        self,
-        *,
-        network: str = "crossing",
-        demand: str = "rush",
-        minutes: int = 60,
-        traffic: float = 1.0,
-        reward: str = "queue",
-        whole_seconds: bool = False,
-        strategies: bool = False,
-        render_mode: str | None = None,
-    ) -> None:
-        choices = (("network", network, (*NETWORKS,)), ("demand", demand, KINDS), ("reward", reward, get_args(Reward)))
-        for name, given, allowed in choices:
-            if given not in allowed:
-                raise SettingError(f"TrafficLights: {name}={given}, but must be one of {', '.join(allowed)}")
-        if not isinstance(minutes, int | np.integer) or minutes < 1:
-            raise SettingError(f"TrafficLights: minutes={minutes}, but must be a whole number of at least 1")
-        if not isinstance(traffic, int | float | np.floating) or not 0.0 < traffic <= MOST_TRAFFIC:
-            raise SettingError(f"TrafficLights: traffic={traffic}, but must be above 0 and at most {MOST_TRAFFIC:g}")
+    def __init__(self, *, render_mode: Literal["rgb_array"] | None = None, **settings: Any) -> None:
+        rules = TrafficRules.of(None, settings)
+        network, seconds = rules.network, 60 * rules.minutes
         check_render_mode("TrafficLights", render_mode)
         self.render_mode = render_mode
         file = str(network_file(network))
-        self._task = Task(network, demand, file, 60 * minutes, traffic, reward, render_mode is not None)
-        green = spaces.Box(MIN_GREEN, MAX_GREEN, (1,), np.int64 if whole_seconds else np.float32)
-        boxes = (*(green for _ in PHASES), *(_NONE for _ in PLAYERS if strategies))
-        self._parameter_dims = [*(1 for _ in PHASES), *(0 for _ in PLAYERS if strategies)]
+        self._task = Task(network, rules.demand, file, seconds, rules.traffic, rules.reward, render_mode is not None)
+        green = spaces.Box(MIN_GREEN, MAX_GREEN, (1,), np.int64 if rules.whole_seconds else np.float32)
+        boxes = (*(green for _ in PHASES), *(_NONE for _ in PLAYERS if rules.strategies))
+        self._parameter_dims = [*(1 for _ in PHASES), *(0 for _ in PLAYERS if rules.strategies)]
         self.action_space = spaces.Tuple([spaces.Discrete(len(boxes)), spaces.Tuple(boxes)])
         num_entries = len(observation_names(network))
         self.observation_space = spaces.Box(-np.inf, np.inf, (num_entries,), np.float32)
-        self.own_time_limit = (60 * minutes // MIN_GREEN + 1) * len(NETWORKS[network])
+        self.own_time_limit = (seconds // MIN_GREEN + 1) * len(NETWORKS[network])
         self.results: dict[str, float] = {}
         self._last: Seen | None = None
         self._simulation: SimulationProcess | None = None

@@ -7,20 +7,18 @@ from typing import Annotated, Literal
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from hpamdp.cards import ProblemCard
-from hpamdp.env.facts import ProblemFacts, ProblemOptions
-from hpamdp.settings import PositiveFraction
+from hpamdp.env.gymnasium.options import SimulatorOptions
+from hpamdp.settings import Settings
 
 Kind = Literal["light", "rush", "shifting"]
-MOST_TRAFFIC = 3.0
-"""Largest factor of all flows."""
 Reward = Literal["queue", "waiting"]
 ACTUATED = "actuated"
 PLAYERS = ("webster", ACTUATED, "max_pressure", "longest_queue")
 PHASES = ("north-south", "north-south left", "east-west", "east-west left")
 
 
-class TrafficOptions(ProblemOptions):
-    """Settings of `TrafficEnv`."""
+class TrafficRules(Settings):
+    """Settings of `TrafficLights`."""
 
     network: Literal["crossing", "corridor"] = "crossing"
     """`crossing`: a single one; `corridor`: three in a row, whose signals the agent sets in turn."""
@@ -28,7 +26,7 @@ class TrafficOptions(ProblemOptions):
     """`light`: constant; `rush`: a peak, highest on one axis; `shifting`: one axis is busy first, then the other."""
     minutes: PositiveInt = 60
     """Length of an episode in minutes."""
-    traffic: Annotated[float, Field(gt=0.0, le=MOST_TRAFFIC)] = 1.0
+    traffic: Annotated[float, Field(gt=0.0, le=3.0)] = 1.0
     """Factor on the flows of all arms."""
     reward: Reward = "queue"
     """`queue`: minus the vehicle hours waited since the last decision. `waiting`: minus the change of the waiting time.
@@ -39,13 +37,11 @@ class TrafficOptions(ProblemOptions):
     """Whether greens are whole numbers. Otherwise they are continuous, and rounded to the simulator's step of 1 s."""
     strategies: bool = False
     """Whether the choices of the hand-written players are discrete actions, too."""
-    render: bool = False
-    """Draw the network, for films; steps then take longer."""
-    reward_scaling: PositiveFraction | None = None
-    """Divide rewards in training by the running standard deviation of the return with this discount.
 
-    If null, rewards are not scaled.
-    """
+
+class TrafficOptions(SimulatorOptions, TrafficRules):
+    """Settings of `TrafficEnv`."""
+
     num_workers: NonNegativeInt = 0
     """Worker processes that call the simulations. If 0, this process calls one after another.
 
@@ -56,15 +52,6 @@ class TrafficOptions(ProblemOptions):
     def default_options(self) -> dict[str, list[int | str]]:
         """With `strategies`: the hand-written players, and the phases as one option that is learned; else none."""
         return {**{player: [player] for player in PLAYERS}, "learned": [*PHASES]} if self.strategies else {}
-
-    def facts(self, title: str) -> ProblemFacts:
-        """Return what these settings tell of the problem, which errors call `title`."""
-        return ProblemFacts(
-            title=title,
-            is_shardable=self.num_workers == 0,
-            has_statistics=self.reward_scaling is not None,
-            default_options=self.default_options,
-        )
 
 
 CARDS = {
