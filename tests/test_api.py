@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import re
 import subprocess
 import sys
@@ -14,7 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-import yaml
+from conftest import global_generators_unmoved
 from gymnasium import spaces
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
@@ -209,15 +208,6 @@ def test_an_evaluation_that_was_cut_off_is_made_by_the_resumed_run(tmp_path):
     assert count.evaluated == 1
 
 
-def test_training_leaves_the_callers_random_numbers_alone(tmp_path):
-    hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **TINY)
-    np.random.seed(5)
-    random.seed(5)
-    states = np.random.get_state()[1].copy(), random.getstate()
-    hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 2048})
-    assert np.array_equal(np.random.get_state()[1], states[0]) and random.getstate() == states[1]
-
-
 def test_a_resumed_run_tells_that_schedules_have_ended(tmp_path, capsys):
     hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **{**TINY, "low.anneal_steps": 1024})
     hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 2048})
@@ -237,33 +227,9 @@ def test_the_environment_of_a_run_that_was_an_object_is_not_taken_for_the_same_i
     assert "whether it was the same one is not known" in capsys.readouterr().err
 
 
-def test_a_callback_sees_the_trainer_and_ends_the_training():
-    class Two(hpamdp.Callback):
-        batches, evaluated, ended = 0, 0, False
-
-        def on_batch(self, trainer):
-            self.batches += 1
-            if self.batches == 1:
-                trainer.stop()
-
-        def on_evaluation(self, trainer, row):
-            self.evaluated += "eval/score" in row
-
-        def on_end(self, trainer):
-            self.ended = True
-
-    callback = Two()
-    agent = hpamdp.train("platform", low="hppo", callbacks=[callback], **TINY)
-    assert (callback.batches, callback.ended) == (1, True)
-    assert callback.evaluated >= 1
-    assert agent.history[-1]["frames"] == 512
-
-
-@pytest.mark.parametrize("env", ["hpamdp/Platform-v0", {"name": "moving", "max_steps": 20}, Reach, lambda: Reach()])
-def test_a_problem_may_be_an_id_a_dict_a_class_or_a_function(env):
-    more = {} if isinstance(env, str | dict) else {"env.max_steps": 5}
-    agent = hpamdp.train(env, low="hppo", high=None, **{**TINY, **more})
-    assert agent.history[-1]["frames"] == 1024
+@pytest.mark.parametrize("env", ["hpamdp/Platform-v0", {"name": "moving", "max_steps": 20}])
+def test_a_problem_may_be_an_id_or_a_dict(env):
+    assert hpamdp.train(env, low="hppo", high=None, **TINY).history[-1]["frames"] == 1024
 
 
 def test_a_torchrl_problem_and_a_learners_class_are_trained():
@@ -275,18 +241,21 @@ def test_a_torchrl_problem_and_a_learners_class_are_trained():
     assert agent.observation_space.shape == (17,)
 
 
-def test_threads_train_at_the_same_time_and_get_their_own_agents():
+def test_threads_get_their_own_agents_and_a_line_says_that_no_seed_repeats_them(capsys):
     agents: dict[str, hpamdp.Agent] = {}
 
     def run(name: str) -> None:
         agents[name] = hpamdp.train(name, low="hppo", **TINY)
 
-    threads = [threading.Thread(target=run, args=(name,)) for name in ("platform", "moving")]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert {name: agent.specs.num_discrete for name, agent in agents.items()} == {"platform": 3, "moving": 3}
+    class Nested(hpamdp.Callback):
+        def on_end(self, trainer):
+            thread = threading.Thread(target=run, args=("moving",))
+            thread.start()
+            thread.join()
+
+    outer = hpamdp.train("platform", low="hppo", callbacks=[Nested()], **TINY)
+    assert (outer.specs.observation_dim, agents["moving"].specs.observation_dim) == (9, 10)
+    assert "no seed repeats them" in capsys.readouterr().err
 
 
 def test_training_gives_torch_its_threads_back():
@@ -304,12 +273,13 @@ def test_training_gives_torch_its_threads_back():
 
 def test_a_saved_agent_acts_as_before(platform_agent, tmp_path):
     platform_agent.save(tmp_path / "a.safetensors")
-    loaded = hpamdp.load(tmp_path / "a.safetensors")
     observation = np.linspace(-0.5, 0.5, 9, dtype=np.float32)
-    before, after = platform_agent.act(observation), loaded.act(observation)
-    assert before[0] == after[0]
-    for mine, theirs in zip(before[1], after[1], strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+    before = platform_agent.act(observation)
+    for loaded in (hpamdp.load(tmp_path / "a.safetensors"), hpamdp.load(tmp_path / "a.safetensors", "platform")):
+        after = loaded.act(observation)
+        assert before[0] == after[0]
+        for mine, theirs in zip(before[1], after[1], strict=True):
+            np.testing.assert_array_equal(mine, theirs)
 
 
 def test_a_saved_agent_keeps_the_learned_scale_of_its_observations(tmp_path):
@@ -341,20 +311,23 @@ def test_an_evaluation_returns_means_or_one_entry_for_each_episode(platform_agen
 
 
 @pytest.mark.parametrize(
-    ("observation", "message"),
+    ("observation", "more", "message"),
     [
-        (np.zeros(8), r"shape \[8\], but must have \[9\] or \[N, 9\]"),
-        (np.zeros((2, 3, 9)), r"shape \[2, 3, 9\]"),
-        (np.zeros((0, 9)), r"shape \[0, 9\]"),
-        (np.full(9, np.nan), "entry 0 of the observation is not finite"),
-        ("left", "must hold 9 numbers, but is 'left'"),
-        (None, "must hold 9 numbers"),
-        (TensorDict({"observation": torch.zeros(2, 9)}, [2]), "must hold 9 numbers, but is TensorDict"),
+        (np.zeros(8), {}, r"shape \[8\], but must have \[9\] or \[N, 9\]"),
+        (np.zeros((2, 3, 9)), {}, r"shape \[2, 3, 9\]"),
+        (np.zeros((0, 9)), {}, r"shape \[0, 9\]"),
+        (np.full(9, np.nan), {}, "entry 0 of the observation is not finite"),
+        ("left", {}, "must hold 9 numbers, but is 'left'"),
+        (["1"] * 9, {}, "must hold 9 numbers"),
+        (np.zeros(9, complex), {}, "must hold 9 numbers"),
+        (TensorDict({"observation": torch.zeros(2, 9)}, [2]), {}, "must hold 9 numbers, but is TensorDict"),
+        (np.zeros(9), {"greedy": "no"}, "must be True or False"),
+        (np.zeros(9), {"info": 3}, "must be a dict"),
     ],
 )
-def test_a_wrong_observation_is_refused_with_its_shape(platform_agent, observation, message):
+def test_wrong_arguments_of_act_are_refused(platform_agent, observation, more, message):
     with pytest.raises(ValueError, match=message):
-        platform_agent.act(observation)
+        platform_agent.act(observation, **more)
 
 
 def test_an_agent_scores_alike_in_vectors_that_restart_in_the_same_and_in_the_next_step(boat_agent):
@@ -400,22 +373,14 @@ def test_the_loop_of_the_page_starts_no_episode_with_an_option_of_the_one_before
     assert begins.sum() > 8 and np.array(seen)[1:][begins].all()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("Actor", "EpsilonGreedy", "Exp3", "LinThompson", "LinUCB", "MetaCritic", "OptionCritic", "Thompson", "UCB"),
-        *("DLPA", "PETS"),
-    ],
-)
+@pytest.mark.parametrize("name", ["UCB", "OptionCritic", "DLPA", "PETS"])
 def test_a_step_without_a_batch_dimension_is_refused_in_one_line(name, boat_agent):
     level = getattr(hpamdp, name)(boat_agent.specs)
     policy = level if isinstance(level, hpamdp.Selector) else level.policy
     step = {"observation": torch.zeros(boat_agent.specs.observation_dim), "is_decision": torch.ones(1, dtype=bool)}
-    with pytest.raises(
-        ValueError, match=r"the step has batch size \[\], but must have \[N\]; for one environment"
-    ) as raised:
+    line = r"the step has batch size \[\], but must have \[N\]; for one environment[^\n]*$"
+    with pytest.raises(ValueError, match=line):
         policy(TensorDict(step))
-    assert "\n" not in str(raised.value)
     policy(TensorDict(step).unsqueeze(0))
 
 
@@ -445,34 +410,53 @@ def test_another_batch_size_without_a_reset_is_refused(boat_agent):
         boat_agent.reset([True])
 
 
+WITHOUT_FOLDER = {"folder": None}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"low": "hpp"}, "low=hpp: no such choice"),
         ({"total_frame": 3}, "did you mean total_frames"),
-        ({"low.gama": 0.5}, "did you mean gamma"),
-        ({"seed": "x"}, "seed"),
         ({"low": 3}, "must be a name, a class, None, or a dict"),
-        ({"mode": "eval"}, r"use hpamdp.load\(...\).evaluate"),
-        ({"logger": "wandb"}, "writes files, so give the run a folder"),
-        ({"seed": object()}, "must be a number, a text, or a list or mapping"),
-        ({"high": "ucb"}, "has no options to choose"),
-        ({"env": 3}, "must be a name such as"),
-        ({"env": "nosuch"}, "env=nosuch: no such choice"),
-        ({"env": "toy_environments:Texting", "env.max_steps": 5}, r"action space Tuple\(Discrete\(2\), Text\("),
-        ({"env": lambda: 3}, "is no environment"),
-        ({"env": Reach}, "no time limit of its own; set env.max_steps"),
-        ({"config_dirs": ["nowhere"]}, "there is no folder nowhere"),
         ({"low": gymnasium.Env}, "is no Learner"),
+        ({"low.hidden_dims": np.zeros((2, 2))}, "must be a number, a text, or a list or mapping of these"),
+        ({"seed": object()}, "must be a number, a text, or a list or mapping"),
+        ({"mode": "eval"}, r"use hpamdp.load\(...\).evaluate"),
+        ({"env": 3}, "must be a name such as"),
+        ({"env": lambda: 3}, "is no environment"),
+        ({"env": lambda: Reach}, "returned the class Reach, not an environment; call it"),
+        ({"env": gymnasium.Env}, "has no action_space"),
+        ({"env": Reach}, "no time limit of its own; set env.max_steps"),
+        ({"env": {"name": Reach, "max_stepz": 5}}, "max_stepz"),
+        ({"config_dirs": ["nowhere"]}, "there is no folder nowhere"),
+        ({"config_dirs": [3]}, r"config_dirs=\[3\]: must be a list of folders"),
+        ({"callbacks": None}, "must be a list of objects of subclasses"),
+        ({"callbacks": [hpamdp.BestAgent]}, "not BestAgent, a class"),
+        ({"callbacks": [hpamdp.Patience(evaluations=1)], "eval.every": 0}, "callbacks: Patience needs evaluations"),
+        ({"hydra.run.dir": "other"}, "Hydra runs no job here"),
+        ({"folder": ""}, "folder='': must be a path"),
+        ({"folder": "file"}, "folder="),
+        ({"folder": "file/x"}, "folder="),
+        ({"folder": "n" * 300}, "folder="),
+        ({"resume": "auto", **WITHOUT_FOLDER}, "so give folder"),
+        ({"logger": "wandb", **WITHOUT_FOLDER}, "writes files, so give the run a folder"),
+        ({"save_best": True, **WITHOUT_FOLDER}, "save_best=true: writes files, so give the run a folder"),
+        ({"overwrite": True, **WITHOUT_FOLDER}, "overwrite=True: has no effect without a folder; give folder, or"),
+        ({"trust": True}, "trust=True: has no effect without a saved run; give resume, or leave it out"),
+        ({"low": {"name": "hppo", "gamma": 0.9}, "low.gamma": 0.9}, "low.gamma: given twice, as 0.9 and as 0.9"),
+        ({"low.per_option": {"a": "pets"}, "low.per_option.a.name": "hppo"}, "low.per_option.a: given twice"),
+        ({"env.grouping": None, "env.grouping.a": [0]}, "env.grouping: given twice, as None and as"),
     ],
 )
-def test_a_wrong_argument_is_one_config_error_and_nothing_is_written(tmp_path, arguments, message):
-    folder = tmp_path / "run"
-    given = {"env": "platform", **TINY, **arguments}
+def test_a_wrong_argument_of_train_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    given = {"env": "platform", "low": "hppo", **TINY, "folder": "p/q/r", **arguments}
     with pytest.raises(hpamdp.ConfigError, match=message) as raised:
-        hpamdp.train(given.pop("env"), folder=None if "logger" in given else folder, **given)
+        hpamdp.train(given.pop("env"), **given)
     assert "\n" not in str(raised.value)
-    assert not folder.exists()
+    assert [*tmp_path.iterdir()] == [tmp_path / "file"]
 
 
 def test_an_agent_whose_selector_alone_was_trained_comes_back_whole(tmp_path):
@@ -482,13 +466,6 @@ def test_an_agent_whose_selector_alone_was_trained_comes_back_whole(tmp_path):
     scores = agent.evaluate(episodes=3, seed=1, per_episode=True)["score"]
     agent.save(tmp_path / "policy.safetensors")
     assert np.array_equal(hpamdp.load(tmp_path).evaluate(episodes=3, seed=1, per_episode=True)["score"], scores)
-
-
-@pytest.mark.parametrize("word", ["checkpoint_every=64", "checkpoint_minutes=1.0", "film=true"])
-def test_a_run_without_a_folder_is_not_asked_for_files(word):
-    name, _, value = word.partition("=")
-    with pytest.raises(hpamdp.ConfigError, match=f"^{word}: writes files, so give the run a folder$"):
-        hpamdp.train("platform", low="random", total_frames=64, **{name: yaml.safe_load(value)})
 
 
 def test_a_folder_with_another_run_is_refused_and_stays(tmp_path):
@@ -502,11 +479,6 @@ def test_a_folder_with_another_run_is_refused_and_stays(tmp_path):
 def test_an_agent_is_refused_at_a_problem_of_other_sizes(platform_agent):
     with pytest.raises(hpamdp.ConfigError, match="env=goal has observation_dim=17, but the agent's problem 9"):
         platform_agent.evaluate("goal", episodes=2)
-
-
-def test_an_unknown_agent_is_refused_with_the_names_that_exist():
-    with pytest.raises(hpamdp.ConfigError, match="linucb_hppo"):
-        hpamdp.load("no_such_agent")
 
 
 @pytest.mark.parametrize(("name", "problem"), [("meta_critic_hppo_rooms", "rooms"), ("linucb_hppo", "boatdock")])
@@ -570,19 +542,10 @@ def dict_agent() -> hpamdp.Agent:
             "act: the entry time has the shape [3], but the entry pos holds one observation, so it must have []",
         ),
         (
-            {"pos": np.zeros((2, 2)), "time": np.zeros(3)},
-            "act: the entry time has the shape [3], but the entry pos holds 2 observations, so it must have [2]",
-        ),
-        (
             {"pos": np.zeros((0, 2)), "time": np.zeros(0)},
             "act: the entry pos has the shape [0, 2], but must have [2] or [N, 2], with N from 1 on",
         ),
-        (
-            {"pos": np.zeros((1, 2, 2)), "time": np.zeros(1)},
-            "act: the entry pos has the shape [1, 2, 2], but must have [2] or [N, 2], with N from 1 on",
-        ),
         ({"pos": np.zeros((2, 2))}, "act: the observation lacks the entry time"),
-        ({"time": np.zeros(2)}, "act: the observation lacks the entry pos"),
         (3.0, "act: the observation lacks the entry pos"),
     ],
 )
@@ -598,58 +561,13 @@ def test_a_batch_of_entries_of_a_dict_acts_as_its_rows_do(dict_agent):
     np.testing.assert_array_equal(both[0], [one[0], one[0]])
 
 
-def test_a_batch_of_no_boxes_is_refused():
-    agent = hpamdp.train(Reach, **OWN)
-    with pytest.raises(
-        ValueError, match=r"^act: the observation has the shape \[0, 3\], but must have \[3\] or \[N, 3\]"
-    ):
-        agent.act(np.zeros((0, 3)))
-
-
-def test_load_takes_the_problem_as_its_second_argument(platform_agent, tmp_path):
-    platform_agent.save(tmp_path / "a.safetensors")
-    assert hpamdp.load(tmp_path / "a.safetensors", "platform").specs == platform_agent.specs
-
-
 # Mistakes that a hostile user found: each is one line, or has the effect that one would expect.
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"folder": ""}, "folder='': must be a path"),
-        ({"folder": 3}, "folder=3: must be a path"),
-        ({"low.hidden_dims": np.zeros((2, 2))}, "must be a number, a text, or a list or mapping of these"),
-        ({"env": Reach, "env.kwargs": {"a": np.zeros(2)}}, "must be a number, a text, or a list or mapping of these"),
-        ({"callbacks": None}, "must be a list of objects of subclasses"),
-        ({"callbacks": [hpamdp.BestAgent]}, "not BestAgent, a class"),
-        ({"hydra.run.dir": "other"}, "Hydra runs no job here"),
-        ({"resume": "auto", "folder": None}, "so give folder"),
-        ({"config_dirs": [3]}, r"config_dirs=\[3\]: must be a list of folders"),
-        ({"env": lambda: Reach}, "returned the class Reach, not an environment; call it"),
-        ({"env": gymnasium.Env}, "has no action_space"),
-        ({"env": {"name": Reach, "max_stepz": 5}}, "max_stepz"),
-    ],
-)
-def test_a_mistake_in_an_argument_leaves_no_file_and_no_open_environment(tmp_path, monkeypatch, arguments, message):
-    monkeypatch.chdir(tmp_path)
-    given = {"env": "platform", "low": "hppo", **TINY, "folder": "p/q/r", **arguments}
-    with pytest.raises(hpamdp.ConfigError, match=message):
-        hpamdp.train(given.pop("env"), **given)
-    assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize("given", [np.array([16, 8]), range(16, 0, -8), torch.tensor([16, 8]), (16, 8)])
-def test_a_list_may_be_an_array_or_a_range(given):
+@pytest.mark.parametrize("given", [range(16, 0, -8), torch.tensor([16, 8])])
+def test_a_list_may_be_a_tensor_or_a_range(given):
     agent = hpamdp.train("platform", low={"name": "hppo", "hidden_dims": given}, **TINY)
     assert agent._config.low.settings["hidden_dims"] == (16, 8)
-
-
-def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("")
-    for folder in (tmp_path / "file", tmp_path / "file" / "x", tmp_path / ("n" * 300)):
-        with pytest.raises(hpamdp.ConfigError, match="folder="):
-            hpamdp.train("platform", low="hppo", folder=folder, **TINY)
 
 
 def test_a_factory_that_returns_the_same_environment_twice_is_refused():
@@ -688,12 +606,18 @@ def test_environments_of_a_refused_run_are_closed(open_envs):
 WRONG_OPTION = {"max_steps": 5, "grouping": {"all": [7]}}
 
 
+class FailsToClose(Counted):
+    def close(self):
+        super().close()
+        raise RuntimeError("window\nlost")
+
+
 @pytest.mark.parametrize(
     "call",
     [
         lambda agent: hpamdp.make(Counted, 3, **WRONG_OPTION),
+        lambda agent: hpamdp.make(FailsToClose, 3, **WRONG_OPTION),
         lambda agent: hpamdp.make(Counted, 3),  # without a limit of steps
-        lambda agent: hpamdp.make(Counted, 3, max_steps=5, observation_keys=["x"]),
         lambda agent: hpamdp.make(Counted, 3, max_steps=5, raw_observations=[7]),
         lambda agent: hpamdp.train({"name": Counted, **WRONG_OPTION}, low="hppo", **TINY),
         lambda agent: hpamdp.train(Counted, low={"name": "hppo", "value_symmetry": True}, **TINY, max_steps=5),
@@ -701,37 +625,19 @@ WRONG_OPTION = {"max_steps": 5, "grouping": {"all": [7]}}
         lambda agent: hpamdp.load(agent).evaluate({"name": Counted, "max_steps": 5}, 3),
     ],
 )
-def test_environments_are_closed_after_an_error(call, open_envs):
+def test_environments_are_closed_after_an_error_which_is_the_one_that_is_told(call, open_envs):
     with pytest.raises(ValueError):
         call("hppo_platform")
     assert not open_envs
 
 
 def test_an_environment_that_fails_to_close_costs_a_warning_and_no_agent(open_envs, capsys):
-    class Fails(Counted):
-        def close(self):
-            super().close()
-            raise RuntimeError("window\nlost")
-
-    env = hpamdp.make(Fails, 3, max_steps=5)
-    env.close()
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 3 and len({*lines}) == 1
-    assert re.fullmatch(
-        rf"Fails: close raised RuntimeError: window lost \({__file__}, line \d+\); the run goes on", lines[0]
-    )
-    agent = hpamdp.train(Fails, **OWN)
-    assert agent.evaluate(episodes=3)["steps"] > 0
+    hpamdp.make(FailsToClose, 3, max_steps=5).close()
+    (line,) = {*capsys.readouterr().err.splitlines()}
+    told = rf"FailsToClose: close raised RuntimeError: window lost \({__file__}, line \d+\); the run goes on"
+    assert re.fullmatch(told, line)
+    assert hpamdp.train(FailsToClose, **OWN).evaluate(episodes=3)["steps"] > 0
     assert not open_envs
-
-
-def test_an_error_is_told_even_if_closing_the_environment_fails_after_it():
-    class Fails(Reach):
-        def close(self):
-            raise RuntimeError("window lost")
-
-    with pytest.raises(hpamdp.ConfigError, match="grouping"):
-        hpamdp.make(Fails, 3, **WRONG_OPTION)
 
 
 def test_a_run_whose_end_failed_goes_on_with_the_same_call(tmp_path):
@@ -745,57 +651,43 @@ def test_a_run_whose_end_failed_goes_on_with_the_same_call(tmp_path):
     assert hpamdp.train("platform", resume="auto", **arguments).history[-1]["frames"] == 1024
 
 
-def test_torchs_random_numbers_stay_the_callers(platform_agent):
-    torch.manual_seed(5)
-    expected = torch.rand(3)
-    torch.manual_seed(5)
-    hpamdp.load("hppo_platform")
-    with torch.no_grad():
-        hpamdp.train("platform", low="hppo", **TINY)
-    torch.testing.assert_close(torch.rand(3), expected)
-
-
-def test_a_second_training_in_another_thread_is_told_of(capsys):
-    class Nested(hpamdp.Callback):
-        def on_end(self, trainer):
-            thread = threading.Thread(target=lambda: hpamdp.train("platform", low="hppo", **TINY))
-            thread.start()
-            thread.join()
-
-    hpamdp.train("platform", low="hppo", callbacks=[Nested()], **TINY)
-    assert "no seed repeats them" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("trust", ["false", 1, None])
-def test_trust_is_true_or_false_and_nothing_like_it(trust):
-    with pytest.raises(hpamdp.ConfigError, match="must be True or False"):
-        hpamdp.load("hppo_platform", trust=trust)
+def test_random_numbers_stay_the_callers(tmp_path):
+    hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **TINY)
+    with global_generators_unmoved(), torch.no_grad():
+        hpamdp.load("hppo_platform")
+        hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 2048})
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("source", "settings", "message"),
     [
-        *({"mode": "train"}, {"total_frames": 5}, {"checkpoint": "x"}, {"low": "hppo"}),
-        *({"eval.layouts": 3}, {"eval": {"seed": 1, "layouts": 3}}),
+        ("hppo_platform", {"mode": "train"}, "has no effect on a trained agent"),
+        ("hppo_platform", {"low": "hppo"}, "low: has no effect on a trained agent"),
+        ("hppo_platform", {"eval": {"seed": 1, "layouts": 3}}, "has no effect on a trained agent"),
+        ("hppo_platform", {"trust": "false"}, "must be True or False"),
+        ("hppo_platform", {"max_stps": 5}, r"did you mean env\.max_steps"),
+        ("no_such_agent", {}, "linucb_hppo"),
+        ("", {}, "must be a path"),
+        (["a"], {}, "must be a path"),
     ],
 )
-def test_settings_without_effect_on_a_loaded_agent_are_refused(settings):
-    with pytest.raises(hpamdp.ConfigError, match="has no effect on a trained agent"):
-        hpamdp.load("hppo_platform", **settings)
-
-
-@pytest.mark.parametrize("source", ["", None, 3, ["a"]])
-def test_a_source_that_is_no_path_is_refused(source):
-    with pytest.raises(hpamdp.ConfigError, match="must be a path"):
-        hpamdp.load(source)
+def test_wrong_arguments_of_load_are_refused(source, settings, message):
+    with pytest.raises(hpamdp.ConfigError, match=message):
+        hpamdp.load(source, **settings)
 
 
 def test_home_directories_are_written_and_read_by_the_same_rule(tmp_path, monkeypatch, platform_agent):
-    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    for folder in ("home", "./~"):
+        Path(folder).mkdir()
     platform_agent.save("~/a.safetensors")
     hpamdp.train("platform", low="hppo", folder="~/run", **TINY)
-    assert {"a.safetensors", "run"} == {path.name for path in tmp_path.iterdir()}
+    assert {"a.safetensors", "run"} == {path.name for path in (tmp_path / "home").iterdir()}
     assert hpamdp.load("~/a.safetensors").specs == hpamdp.load("~/run").specs
+    for path in ("./~a.safetensors", Path("~nobody.safetensors"), "./~/b.safetensors"):  # are no home directories
+        platform_agent.save(path)
+        assert (tmp_path / path).is_file() and hpamdp.load(path).specs == platform_agent.specs
 
 
 def test_an_object_takes_the_place_of_the_environment_of_a_saved_run(tmp_path):
@@ -813,15 +705,6 @@ def test_an_object_takes_the_place_of_the_environment_of_a_saved_run(tmp_path):
         hpamdp.load(tmp_path / "run", env=make, entry_point="toy_environments:Toy")
 
 
-def test_a_file_whose_name_begins_with_a_tilde_is_no_home_directory(tmp_path, monkeypatch, platform_agent):
-    monkeypatch.chdir(tmp_path)
-    for path in ("./~a.safetensors", Path("~nobody.safetensors"), "./~/b.safetensors"):
-        Path("./~").mkdir(exist_ok=True)
-        platform_agent.save(path)
-        assert (tmp_path / path).is_file()
-        assert hpamdp.load(path).specs == platform_agent.specs
-
-
 def test_an_agent_that_holds_nothing_takes_the_mask_of_a_vector_loop(platform_agent):
     observations = np.zeros((3, 9), np.float32)
     platform_agent.act(observations)
@@ -830,20 +713,6 @@ def test_an_agent_that_holds_nothing_takes_the_mask_of_a_vector_loop(platform_ag
     for junk in ("x", [0.5], np.zeros((2, 2), bool)):
         with pytest.raises(ValueError, match="starts must be bool"):
             platform_agent.reset(junk)
-
-
-@pytest.mark.parametrize(
-    ("observation", "more", "message"),
-    [
-        (np.zeros(9), {"greedy": "no"}, "must be True or False"),
-        (np.zeros(9), {"info": 3}, "must be a dict"),
-        (["1"] * 9, {}, "must hold 9 numbers"),
-        (np.zeros(9, complex), {}, "must hold 9 numbers"),
-    ],
-)
-def test_arguments_of_act_are_checked(platform_agent, observation, more, message):
-    with pytest.raises(ValueError, match=message):
-        platform_agent.act(observation, **more)
 
 
 class Masked(Reach):
@@ -889,7 +758,7 @@ def test_an_error_inside_a_property_of_an_agent_is_raised_as_it_is(monkeypatch):
 
 def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
     assert platform_agent.evaluate(episodes=np.int64(2), seed=np.int64(3))["steps"] > 0
-    for arguments in ({"episodes": 0}, {"episodes": 1.5}, {"episodes": "x"}, {"seed": -1}):
+    for arguments in ({"episodes": 0}, {"episodes": 1.5}, {"episodes": "x"}, {"episodes": 10**15}, {"seed": -1}):
         with pytest.raises(hpamdp.ConfigError, match=next(iter(arguments))):
             platform_agent.evaluate(**arguments)
 
@@ -898,120 +767,70 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
     ("make", "message"),
     [
         (lambda: hpamdp.make("platform", 1.5), "num_envs"),
+        (lambda: hpamdp.make("platform", num_envs=10**12), r"^num_envs=1000000000000: must be less than or equal to"),
         (lambda: hpamdp.make("platform", seed=-1), "seed"),
         (lambda: hpamdp.make("platform", oracle="x"), "oracle"),
         (lambda: hpamdp.make("platform", oracle=True), "oracle=True: env=platform has no planner to ask"),
         (lambda: hpamdp.make("office", human=True), "human=True: env=office has no human data"),
-        (lambda: hpamdp.make(Reach, oracle=True), "oracle=True: env=gymnasium has no planner to ask"),
-        (lambda: hpamdp.make("platform", device="gpu"), "device"),
         (lambda: hpamdp.make("platform", device="cuda:9"), "device"),
+        (lambda: hpamdp.make("hpamdp/Platform-v1"), r"no such problem .*; did you mean hpamdp/Platform-v0"),
+        (lambda: hpamdp.make("CartPole-v1", id="Acrobot-v1"), r"env\.id: given twice, as 'CartPole-v1' and as 'Acrob"),
+        (lambda: hpamdp.make("platform", grouping={"up": ["hop", "hop"]}), "option up has an action twice: hop, hop"),
+        (lambda: hpamdp.make("platform", grouping={"a b": [0]}), "the name 'a b' of an entry must be a text"),
+        (lambda: hpamdp.make("platform", grouping={"up": "hop"}), 'env.grouping.up="hop": must be a list'),
         (lambda: hpamdp.make_gymnasium(None), "must be the name of a problem"),
         (lambda: hpamdp.make_gymnasium("platform", 2, **{"env.num_envs": 3}), "give it as the argument num_envs"),
         (lambda: hpamdp.make_gymnasium("platform", **{"env.id": "CartPole-v1"}), "give it as the argument name"),
-        (lambda: hpamdp.make_gymnasium("platfom"), "did you mean hpamdp/Platform-v0?"),
-        (lambda: hpamdp.make_gymnasium("platform", seed=3), "seed=3: no setting of the environment; give it to reset"),
-        (lambda: hpamdp.make_gymnasium("platform", 2, seed=3), "seed=3: no setting of the environment; give it to"),
         (lambda: hpamdp.make_gymnasium("platform", problem="x:Y"), "problem: no setting of the problem; give it as"),
-        (
-            lambda: hpamdp.make("hpamdp/Platform-v1"),
-            r"no such problem .*; did you mean hpamdp/Platform-v0",
-        ),
-        (
-            lambda: hpamdp.make_gymnasium("BoatDockUnseen", render_mode="rgb_array"),
-            "has no pictures",
-        ),
-        (lambda: hpamdp.make_gymnasium("lunar_lander", enable_wind="no"), "enable_wind=.no.: must be a valid boolean"),
-        (
-            lambda: hpamdp.make_gymnasium("lunar_lander", wind_power=-1.0),
-            "wind_power=-1.0: must be greater than or equal to 0",
-        ),
-        (lambda: hpamdp.make_gymnasium("lunar_lander", gravity="a"), "gravity=.a.: must be a valid number"),
-        (
-            lambda: hpamdp.make_gymnasium("lunar_lander", render_mode="x"),
-            "render_mode='x', but must be None",
-        ),
-        (
-            lambda: hpamdp.make_gymnasium("lunar_lander").reset(options={"x": 1}),
-            "unknown options .'x'.",
-        ),
-        (
-            lambda: hpamdp.make_gymnasium("platform").reset(options={None: 1, "a": 2}),
-            r"unknown options \[None, 'a'\]",
-        ),
-        (lambda: hpamdp.make_gymnasium("no_such_module:Env"), "No module named 'no_such_module'"),
+        (lambda: hpamdp.make_gymnasium("platform", seed=3), "seed=3: no setting of the environment; give it to reset"),
         (lambda: hpamdp.make_gymnasium("platform", render_mode="ansi"), "must be None or rgb_array"),
         (lambda: hpamdp.make_gymnasium("platform", device="gpu"), 'device="gpu": must be auto, cpu, cuda or cuda:N'),
-        (lambda: hpamdp.make_gymnasium("boatdock", 2, device="cuda:9"), "device=cuda:9: this machine has "),
         (lambda: hpamdp.make_gymnasium("platform", options={}), "options: must be PlatformOptions, not dict$"),
-        (
-            lambda: hpamdp.make_gymnasium("platform", 2, autoreset_mode="x"),
-            "'x' is not a valid AutoresetMode",
-        ),
-        (
-            lambda: hpamdp.make_gymnasium("platform", 2, vectorization_mode="x"),
-            "Invalid vectorization mode: 'x'",
-        ),
-        (lambda: gymnasium.make("hpamdp/Office-v0", num_envs=3), "num_envs=3: this is one environment; use "),
-        (lambda: hpamdp.make_gymnasium("platform").reset(options=5), "reset: options must be a dict, but is a int"),
+        (lambda: hpamdp.make_gymnasium("platform", max_steps=-1), "max_steps=-1"),
+        (lambda: hpamdp.make_gymnasium("platform", 2, autoreset_mode="x"), "'x' is not a valid AutoresetMode"),
+        (lambda: hpamdp.make_gymnasium("platform", 2, vectorization_mode="x"), "Invalid vectorization mode: 'x'"),
+        (lambda: hpamdp.make_gymnasium("platform").reset(options={None: 1, "a": 2}), r"unknown options \[None, 'a'\]"),
         (lambda: hpamdp.make_gymnasium("office", 2).reset(options=5), "reset: options must be a dict, but is a "),
-        (lambda: hpamdp.make("platform", grouping={"up": ["hop", "hop"]}), "option up has an action twice: hop, hop"),
-        (
-            lambda: hpamdp.make("platform", grouping={"a b": [0]}),
-            "the name 'a b' of an entry must be a text",
-        ),
-        (lambda: hpamdp.make("platform", grouping={1: [0]}), "env.grouping: the name 1 of an entry must be a text"),
-        (lambda: hpamdp.make("platform", grouping={"up": "hop"}), 'env.grouping.up="hop": must be a list'),
+        (lambda: hpamdp.make_gymnasium("platfom"), "did you mean hpamdp/Platform-v0?"),
+        (lambda: hpamdp.make_gymnasium("no_such_module:Env"), "No module named 'no_such_module'"),
+        (lambda: hpamdp.make_gymnasium("BoatDockUnseen", render_mode="rgb_array"), "has no pictures"),
+        (lambda: hpamdp.make_gymnasium("lunar_lander", enable_wind="no"), "enable_wind=.no.: must be a valid boolean"),
+        (lambda: hpamdp.make_gymnasium("lunar_lander", gravty=-3.0), r"no such setting .*; did you mean gravity\? It"),
+        (lambda: hpamdp.make_gymnasium("lunar_lander", 2, max_step=3), r"no such setting .*; it has enable_wind, grav"),
+        (lambda: hpamdp.make_gymnasium("TrafficCrossing", minute=3), r"no such argument; did you mean minutes\?"),
+        (lambda: gymnasium.make("hpamdp/Office-v0", num_envs=3), "num_envs=3: this is one environment; use "),
         (lambda: hpamdp.train("platform", max_stps=5), r"did you mean env\.max_steps"),
         (lambda: hpamdp.train("platform", low="hppo", lr=1e-3), r"did you mean low\.lr\?"),
         (lambda: hpamdp.train("platfrom"), r"did you mean platform\? conf/env has "),
         (lambda: hpamdp.train("platform", num_envs=0), r"num_envs=0: .* \(conf/config.yaml, given as an argument\)"),
         (lambda: hpamdp.train("platform", progress="no"), "progress='no': must be True or False"),
-        (lambda: hpamdp.load("hppo_platform", max_stps=5), r"did you mean env\.max_steps"),
-        (
-            lambda: hpamdp.load("hppo_platform").evaluate(episodes=2, grouping={"x": [0]}),
-            "grouping: a trained agent keeps the options",
-        ),
-        (lambda: hpamdp.make("circuit", ion_costs=[0.03]), "env.ion_costs.1: missing"),
-        (lambda: hpamdp.load("hppo_platform", low="pdqn"), "low: has no effect on a trained agent"),
         (lambda: hpamdp.report(), "name the folder of a run"),
         (
             lambda: hpamdp.report(["runs", "more"]),
-            r"^report: folders in a list; give them one by one, such as report\(",
+            r"^report: folders in a list; give them one by one, such as ",
         ),
         (lambda: hpamdp.report(__file__), r"test_api\.py: a file; give the folder of a run, or one that contains runs"),
         (lambda: hpamdp.report(3), "folders=3: must be a path"),
         (lambda: hpamdp.report(".", metric=3), "metric=3: must be the name of a column"),
         (lambda: hpamdp.HPPO("platform"), r"specs='platform': must be PAMDPSpecs.from_env\(env\)"),
-        (lambda: hpamdp.UCB("rooms"), r"specs='rooms': must be PAMDPSpecs.from_env\(env\)"),
         (lambda: hpamdp.PAMDPSpecs.from_env("platform"), "'platform' is no PAMDPEnv; hpamdp.make makes one"),
-        (lambda: hpamdp.make_gymnasium("x-v3"), "x-v3"),
-        (lambda: hpamdp.make_gymnasium("platform", max_steps=-1), "max_steps=-1"),
-        (lambda: hpamdp.make_gymnasium("lunar_lander", gravty=-3.0), r"no such setting .*; did you mean gravity\? It"),
-        (lambda: hpamdp.make_gymnasium("lunar_lander", gravity=3.0), r"gravity=3\.0: must be less than 0"),
-        (
-            lambda: hpamdp.make_gymnasium("lunar_lander", 2, max_step=3),
-            r"no such setting .*; it has enable_wind, gravity",
-        ),
-        (lambda: hpamdp.make_gymnasium("soccer", decision=3), r"such argument; did you mean decisions\? It"),
-        (lambda: hpamdp.make_gymnasium("TrafficCrossing", minute=3), r"no such argument; did you mean minutes\?"),
         (lambda: hpamdp.Patience(evaluations=0), "evaluations=0: must be greater than 0"),
         (lambda: hpamdp.Patience(foo=1), "foo: no such setting of PatienceOptions; it has evaluations"),
         (lambda: hpamdp.OwnMetrics(3), "must be a function"),
     ],
 )
-def test_wrong_arguments_of_constructors_are_one_line(make, message):
+def test_wrong_arguments_are_one_line(make, message):
     with pytest.raises(ValueError, match=message) as raised:
         make()
     assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("name", ["platform", "lunar_lander"])
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep", gymnasium.vector.AutoresetMode.DISABLED, None])
-def test_the_vector_of_every_problem_restarts_as_autoreset_mode_says(name, mode):
-    env = hpamdp.make_gymnasium(name, 2, autoreset_mode=mode)
-    expected = gymnasium.vector.AutoresetMode("SameStep" if mode is None else mode)
-    assert env.metadata["autoreset_mode"] == expected
-    env.close()
+def test_the_vector_of_every_problem_restarts_as_autoreset_mode_says(name):
+    for mode in ("NextStep", "SameStep", gymnasium.vector.AutoresetMode.DISABLED, None):
+        env = hpamdp.make_gymnasium(name, 2, autoreset_mode=mode)
+        assert env.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode(mode or "SameStep")
+        env.close()
 
 
 def test_an_id_with_its_module_is_made_as_a_vector_and_its_arguments_are_named(tmp_path, monkeypatch):
@@ -1029,17 +848,11 @@ FIVE_STEPS = {"name": "platform", "max_steps": 5}
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: hpamdp.make(FIVE_STEPS, max_steps=7),
         lambda: hpamdp.make(FIVE_STEPS, **{"env.max_steps": 7}),
         lambda: hpamdp.make({"name": FIVE_STEPS, "max_steps": 7}),
-        lambda: hpamdp.make("platform", max_steps=5, **{"env.max_steps": 7}),
         lambda: hpamdp.make_gymnasium("platform", max_steps=5, **{"env.max_steps": 7}),
         lambda: hpamdp.train(FIVE_STEPS, max_steps=7),
-        lambda: hpamdp.train(FIVE_STEPS, **{"env.max_steps": 7}),
-        lambda: hpamdp.train("platform", max_steps=5, **{"env.max_steps": 7}),
         lambda: hpamdp.load("hppo_platform", env=FIVE_STEPS, max_steps=7),
-        lambda: hpamdp.load("hppo_platform", max_steps=5, **{"env.max_steps": 7}),
-        lambda: hpamdp.load("hppo_platform").evaluate(FIVE_STEPS, 2, max_steps=7),
         lambda: hpamdp.load("hppo_platform").evaluate("platform", 2, max_steps=5, **{"env.max_steps": 7}),
         lambda: hpamdp.load("hppo_platform").evaluate(None, 2, max_steps=5, **{"env.max_steps": 7}),
     ],
@@ -1047,27 +860,6 @@ FIVE_STEPS = {"name": "platform", "max_steps": 5}
 def test_a_setting_of_the_problem_that_is_given_twice_is_refused(call):
     with pytest.raises(hpamdp.ConfigError, match=r"^(env\.)?max_steps: given twice, as [57] and as [57]; leave"):
         call()
-
-
-@pytest.mark.parametrize(
-    ("settings", "refused"),
-    [
-        ({"low": {"name": "hppo", "gamma": 0.9}, "low.gamma": 0.8}, "low.gamma: given twice, as 0.9 and as 0.8"),
-        ({"low": {"name": "hppo", "gamma": 0.9}, "low.gamma": 0.9}, "low.gamma: given twice, as 0.9 and as 0.9"),
-        ({"eval": {"seed": 3}, "eval.seed": 4}, "eval.seed: given twice, as 3 and as 4"),
-        ({"agent": {"sharing": "shared"}, "agent.sharing": "none"}, "agent.sharing: given twice, as 'shared' and as"),
-        ({"low.per_option": {"a": "pets"}, "low.per_option.a.name": "hppo"}, "low.per_option.a: given twice"),
-        ({"env.grouping": None, "env.grouping.a": [0]}, "env.grouping: given twice, as None and as"),
-    ],
-)
-def test_a_setting_of_a_run_that_is_given_twice_is_refused(settings, refused):
-    with pytest.raises(hpamdp.ConfigError, match=re.escape(refused)):
-        hpamdp.train("platform", **settings)
-
-
-def test_a_gymnasium_id_that_is_given_twice_is_refused():
-    with pytest.raises(hpamdp.ConfigError, match=r"env\.id: given twice, as 'CartPole-v1' and as 'Acrobot-v1'"):
-        hpamdp.make("CartPole-v1", id="Acrobot-v1")
 
 
 def test_settings_change_those_that_a_built_problem_brings_along():
@@ -1080,7 +872,7 @@ def test_a_built_problem_brings_its_options_and_its_number_of_environments_along
     built = hpamdp.make("platform", num_envs=8, grouping="default", max_steps=7)
     again = hpamdp.make(built)
     assert (again.num_envs, again.max_steps) == (8, 7)
-    assert again.option_names == built.option_names and again.option_actions == built.option_actions
+    assert again.option_names == built.option_names == ("run", "jump") and again.option_actions == built.option_actions
     assert hpamdp.make(built, num_envs=2).num_envs == 2
     assert hpamdp.make(built, grouping={"all": [0, 1, 2]}).option_names == ("all",)
     assert hpamdp.make(hpamdp.make("platform", num_envs=2)).option_names == ()
@@ -1093,24 +885,6 @@ def test_a_built_problem_brings_its_options_and_its_number_of_environments_along
             hpamdp.load("hppo_platform").evaluate(other, episodes=2)
 
 
-@pytest.mark.parametrize(
-    ("settings", "line"),
-    [
-        ({"save_best": True}, "save_best=true: writes files, so give the run a folder"),
-        ({"overwrite": True}, "overwrite=True: has no effect without a folder; give folder, or leave it out"),
-        ({"trust": True}, "trust=True: has no effect without a saved run; give resume, or leave it out"),
-        (
-            {"callbacks": [hpamdp.Patience(evaluations=1)], "eval.every": 0},
-            "callbacks: Patience needs evaluations during training; set eval.every above 0",
-        ),
-    ],
-)
-def test_training_refuses_what_has_no_effect_without_a_folder_a_saved_run_or_evaluations(settings, line):
-    with pytest.raises(hpamdp.ConfigError) as error:
-        hpamdp.train("platform", low="random", total_frames=32, progress=False, **settings)
-    assert str(error.value) == line
-
-
 def test_training_has_as_many_environments_as_a_built_problem_unless_told_otherwise():
     built = hpamdp.make("platform", num_envs=3)
     short = {"low": "random", "steps_per_batch": 2, "total_frames": 12, "progress": False, "eval.layouts": 4}
@@ -1120,16 +894,13 @@ def test_training_has_as_many_environments_as_a_built_problem_unless_told_otherw
     assert hpamdp.load("hppo_platform", env=built).evaluate(episodes=3)["steps"] > 0.0
 
 
-def test_an_empty_mapping_gives_nothing_that_could_be_given_twice():
-    agent = hpamdp.train("platform", **{**TINY, "low": "random", "eval": {}})
-    assert agent._config.run.eval.layouts == TINY["eval.layouts"]
-
-
-def test_different_entries_of_a_mapping_may_come_in_two_ways():
+def test_different_entries_of_a_mapping_may_come_in_two_ways_and_an_empty_one_gives_nothing():
     agent = hpamdp.train("platform", low={"name": "hppo", "gamma": 0.9}, eval={"seed": 3}, **{**TINY, "low.lr": 1e-4})
     low = agent._config.low.settings
     assert (low["gamma"], low["lr"]) == (0.9, 1e-4)
     assert (agent._config.run.eval.seed, agent._config.run.eval.layouts) == (3, TINY["eval.layouts"])
+    agent = hpamdp.train("platform", **{**TINY, "low": "random", "eval": {}})
+    assert agent._config.run.eval.layouts == TINY["eval.layouts"]
 
 
 @pytest.mark.parametrize("name", ["max_steps", "env.max_steps"])
@@ -1161,19 +932,11 @@ def test_make_takes_numpys_whole_numbers():
     assert hpamdp.make_gymnasium("platform", np.int64(2)).num_envs == 2
 
 
-def test_make_groups_actions_as_train_does():
-    assert hpamdp.make("platform", grouping="default").option_names == ("run", "jump")
-
-
 @pytest.mark.parametrize(("name", "ours"), [("predict", "act\\(observation\\)"), ("learn", "hpamdp.train")])
 def test_a_method_of_another_library_names_ours(name, ours, platform_agent):
     with pytest.raises(AttributeError, match=f"no attribute '{name}'; use {ours} \\(docs/coming-from.md\\)"):
         getattr(platform_agent, name)
     assert not hasattr(platform_agent, "no_such_thing")
-
-
-def test_make_takes_what_train_takes():
-    assert hpamdp.make(lambda: Reach(), num_envs=2, max_steps=5).num_envs == 2
 
 
 def test_an_experiment_that_is_a_sweep_is_refused_until_each_swept_setting_has_a_value():
@@ -1192,12 +955,3 @@ def test_a_folder_of_experiments_is_named_with_what_is_in_it():
     complaint = "experiment=domains: a folder; choose one of domains/catch_point, domains/goal, "
     with pytest.raises(hpamdp.ConfigError, match=complaint):
         hpamdp.train(experiment="domains", low="random")
-
-
-def test_more_episodes_or_environments_than_fit_into_memory_are_refused(platform_agent):
-    with pytest.raises(hpamdp.ConfigError, match=r"^episodes=1000000000000000: must be less than or equal to \d+"):
-        platform_agent.evaluate(episodes=10**15)
-    with pytest.raises(hpamdp.ConfigError, match=r"^num_envs=1000000000000: must be less than or equal to \d+"):
-        hpamdp.make("platform", num_envs=10**12)
-    with pytest.raises(hpamdp.ConfigError, match=r"^num_envs=1000000000000: must be less than or equal to \d+"):
-        hpamdp.make_gymnasium("hpamdp/Platform-v0", num_envs=10**12)
