@@ -102,14 +102,6 @@ def test_option_sums_start_anew_with_every_episode(gamma):
     assert set(rows.keys(True, True)) == set(given.keys(True, True))  # its argument is left as it was
 
 
-def test_demonstrations_are_one_batch_with_option_sums():
-    rows = episodes(2, 2)
-    batch = Demonstrations(rows, torch.device("cpu")).batch
-    assert batch.shape == (1, 4)
-    assert batch["next", keys.OPTION_STEPS].flatten().tolist() == [1, 2, 1, 2]
-    assert batch[0][keys.PARAMETERS].equal(rows[keys.PARAMETERS])
-
-
 def test_demonstrations_hold_the_decisions_that_they_are_given_and_name_missing_keys():
     rows = episodes(2, 2)
     assert Demonstrations(rows).decisions is None
@@ -122,6 +114,7 @@ def test_demonstrations_hold_the_decisions_that_they_are_given_and_name_missing_
 def test_demonstrations_are_discounted_as_a_selector_asks():
     rows = episodes(2, 2)
     demonstrations = Demonstrations(rows)
+    assert demonstrations.batch.shape == (1, 4)
     reward = demonstrations.batch[0]["next", keys.REWARD].squeeze(-1)
     demonstrations.discount(0.5)
     total = demonstrations.batch["next", keys.OPTION_RETURN].flatten()
@@ -169,8 +162,6 @@ def timed(row=slice(None), value=2.5):
     ("rows", "specs", "said"),
     [
         (spoilt(keys.OBSERVATION, (3, 1), np.nan), SPECS, r"row 3: observation[1] is nan, but must be finite"),
-        (spoilt(("next", keys.OBSERVATION), (0, 0), np.inf), SPECS, "row 0: next.observation[0] is inf, but must be"),
-        (spoilt(("next", keys.REWARD), 4, np.nan), SPECS, "row 4: next.reward is nan, but must be finite"),
         (spoilt(("next", keys.REWARD), slice(None), 2e38), SPECS, "row 1: next.option_return is inf, but must be"),
         (spoilt(keys.PARAMETERS, (2, 3), np.nan), SPECS, "row 2: action.parameters[3] is nan, but must be finite"),
         (
@@ -184,7 +175,6 @@ def timed(row=slice(None), value=2.5):
             "row 2: action.parameters[3] is -0.5, but must be 0 to 1, or 0 as it is another action's",
         ),
         (spoilt(keys.DISCRETE, 1, 3), SPECS, "row 1: action.discrete is 3, but must be 0 to 2"),
-        (spoilt(keys.DISCRETE, 4, -1), SPECS, "row 4: action.discrete is -1, but must be 0 to 2"),
         (spoilt(("next", keys.DONE), 0, True), SPECS, "row 0: next.done is true, but must be true if the row is term"),
         (
             spoilt(("next", keys.DONE), 2, True, spoilt(("next", keys.TERMINATED), 2, True)),
@@ -194,14 +184,12 @@ def timed(row=slice(None), value=2.5):
         (spoilt(keys.IS_DECISION, 2, False), SPECS, "row 2: is_decision is false, but must be true in an episode's"),
         (spoilt(("next", keys.IS_DECISION), 0, True), SPECS, "row 0: next.is_decision is true, but must be the same"),
         (episodes(2).set(keys.OBSERVATION, torch.zeros(2, 3)), SPECS, "observation has 3 numbers a row, but the"),
-        (episodes(2).set(keys.PARAMETERS, torch.zeros(2, 9)), SPECS, "parameters has 9 numbers a row, but the"),
         (episodes(2).set(keys.DISCRETE, torch.zeros(2)), SPECS, "discrete is float32 [N], but must be int64 [N]"),
         (
             episodes(2).set(("next", keys.REWARD), torch.zeros(2)),
             SPECS,
             "next.reward is float32 [N], but must be float32 [N, 1]",
         ),
-        (episodes(2).set(keys.OBSERVATION, torch.zeros(2, 2).half()), SPECS, "float16 [N, 2], but must be float32 [N,"),
         (episodes(2)[:0], SPECS, "shape [0], but must be [N], of at least one row"),
         (dict(episodes(2)), SPECS, "of class dict, but must be a TensorDict"),
         (episodes(2), WITH_OPTIONS, "lack option, which the agent chooses here, of left, right"),
@@ -213,13 +201,6 @@ def timed(row=slice(None), value=2.5):
             "row 3: action.discrete is 1, but must be an action of the row's option",
         ),
         (timed(3, -2.0), SPECS, "row 3: next.duration is -2, but must be finite and at least 0"),
-        (timed(4, np.nan), SPECS, "row 4: next.duration is nan, but must be finite and at least 0"),
-        (timed(1, np.inf), SPECS, "row 1: next.duration is inf, but must be finite and at least 0"),
-        (
-            episodes(2).set(("next", "duration"), torch.ones(2)),
-            SPECS,
-            "next.duration is float32 [N], but must be float32 [N, 1]",
-        ),
         (masked(2), MASKED, "allowed by the row's action_mask"),
         (masked(3, ("next", keys.ACTION_MASK)), MASKED, "row 3: next.action_mask[0] is false, but must be true for"),
     ],
@@ -234,8 +215,7 @@ def test_a_mask_after_the_end_of_an_episode_may_allow_nothing_and_then_allows_ev
     rows = masked(2, ("next", keys.ACTION_MASK)).set(keys.OPTION, torch.tensor([0, 0, 1, 1, 1]))
     rows["next", keys.ACTION_MASK] = torch.tensor([[1, 0, 1], [0, 0, 0], [1, 1, 0], [1, 1, 1], [0, 0, 1]]).bool()
     rows["next", keys.OPTION_MASK] = torch.zeros(5, 2, dtype=torch.bool)
-    for name, value in ((keys.TERMINATED, True), (keys.TRUNCATED, False)):
-        rows["next", name][[1, 4]] = value
+    rows["next", keys.TERMINATED][1], rows["next", keys.TRUNCATED][1] = True, False  # the other one is truncated
     given = rows.clone()
     demonstrations = Demonstrations(rows, decisions=with_option_sums(rows)[[1, 4]])
     demonstrations.check(replace(MASKED, option_names=("left", "right"), has_option_mask=True))
@@ -249,26 +229,24 @@ def test_a_mask_after_the_end_of_an_episode_may_allow_nothing_and_then_allows_ev
     assert np.isfinite(learner.update(3)["critic"])
 
 
-def test_a_mask_after_the_end_that_leaves_one_component_without_actions_allows_everything():
-    specs = replace(MASKED, component_sizes=(2, 1))
-    rows = masked([], ("next", keys.ACTION_MASK)).set(keys.DISCRETE, torch.zeros(5, 2, dtype=torch.int64))
+OF_OPTIONS = {"option_names": ("any", "last"), "option_actions": ((True, True, True), (False, False, True))}
+
+
+@pytest.mark.parametrize(
+    ("specs", "name", "chosen"),
+    [
+        (replace(MASKED, component_sizes=(2, 1)), keys.DISCRETE, torch.zeros(5, 2, dtype=torch.int64)),
+        (replace(MASKED, **OF_OPTIONS), keys.OPTION, torch.zeros(5, dtype=torch.int64)),
+    ],
+    ids=["component", "option"],
+)
+def test_a_mask_after_the_end_that_leaves_a_part_without_actions_allows_everything(specs, name, chosen):
+    rows = masked([], ("next", keys.ACTION_MASK)).set(name, chosen)
     rows["next", keys.TERMINATED][[1, 4]] = True
     rows["next", keys.TRUNCATED][[1, 4]] = False
     rows["next", keys.ACTION_MASK][[1, 4]] = torch.tensor([[True, True, False], [False, True, True]])
     demonstrations = Demonstrations(rows)
     demonstrations.check(specs)
-    after = demonstrations.batch[0]["next", keys.ACTION_MASK]
-    assert after[1].all() and after[4].tolist() == [False, True, True]
-
-
-def test_a_mask_after_the_end_that_leaves_an_option_without_actions_allows_everything():
-    options = ((True, True, True), (False, False, True))
-    rows = masked([], ("next", keys.ACTION_MASK)).set(keys.OPTION, torch.zeros(5, dtype=torch.int64))
-    rows["next", keys.TERMINATED][[1, 4]] = True
-    rows["next", keys.TRUNCATED][[1, 4]] = False
-    rows["next", keys.ACTION_MASK][[1, 4]] = torch.tensor([[True, True, False], [False, True, True]])
-    demonstrations = Demonstrations(rows)
-    demonstrations.check(replace(MASKED, option_names=("any", "last"), option_actions=options))
     after = demonstrations.batch[0]["next", keys.ACTION_MASK]
     assert after[1].all() and after[4].tolist() == [False, True, True]
 
@@ -284,18 +262,6 @@ def test_a_mask_after_a_truncation_that_leaves_the_held_option_nothing_opens_its
     demonstrations.check(specs)
     after = demonstrations.batch[0]["next", keys.ACTION_MASK]
     assert after[[1, 4]].tolist() == [[True, False, False], [True, False, True]]
-
-
-def test_a_mask_may_allow_nothing_after_a_truncation_as_after_a_termination():
-    rows = masked(4, ("next", keys.ACTION_MASK))
-    assert rows["next", keys.TRUNCATED][4]
-    demonstrations = Demonstrations(rows)
-    demonstrations.check(MASKED)
-    assert demonstrations.batch[0]["next", keys.ACTION_MASK].all()
-
-
-def test_a_step_may_take_no_time_as_where_two_signals_of_a_corridor_are_due_at_once():
-    Demonstrations(timed(1, 0.0)).check(SPECS)
 
 
 class OwnRows(Demonstrations):
@@ -424,6 +390,7 @@ def test_right_rows_pass_the_check():
     Demonstrations(with_option(0, 0, 1, 1, 1)).check(WITH_OPTIONS)
     Demonstrations(masked([])).check(MASKED)
     Demonstrations(timed()).check(SPECS)
+    Demonstrations(timed(1, 0.0)).check(SPECS)  # two signals of a corridor may be due at once
 
 
 def test_wrong_decisions_are_refused_with_their_row():
@@ -475,24 +442,6 @@ def test_a_failed_write_leaves_nothing_behind(tmp_path):
     assert not list((tmp_path / "folder").iterdir())
 
 
-def test_minari_returns_the_transitions_of_a_problem_without_options(workshop_id, tmp_path, monkeypatch):
-    library = pytest.importorskip("minari")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    batch = episodes(3, 1, 2)
-    dataset = minari.export(
-        batch, "test/tools-v0", LAYOUT, env_id=workshop_id, env_kwargs={"size": 2}, description="Tools."
-    )
-    assert dataset.total_episodes == 3 and dataset.total_steps == 6
-    assert set(dataset[0].actions) == {"tool", "force"} and set(dataset[0].infos) == {"heat"}
-    assert library.load_dataset("test/tools-v0").recover_environment().unwrapped.size == 2
-    loaded = minari.load("test/tools-v0", LAYOUT)
-    assert set(loaded.keys(True, True)) == set(batch.keys(True, True))
-    for name, value in batch.items(True, True):
-        assert loaded[name].dtype == value.dtype and loaded[name].equal(value), name
-    with pytest.raises(DataError, match="test/tools-v0: cannot be read as transitions"):
-        minari.load("test/tools-v0", minari.MinariLayout())
-
-
 def with_what_learners_read(rows):
     """Return transitions with all that an environment may write beside the observation and learners read."""
     num, generator = len(rows), torch.Generator().manual_seed(1)
@@ -511,18 +460,25 @@ def with_what_learners_read(rows):
     return rows
 
 
-def test_minari_returns_all_that_learners_read_of_a_state(workshop_id, tmp_path, monkeypatch):
-    pytest.importorskip("minari")
+@pytest.mark.parametrize("rows", [episodes(3, 1, 2), with_what_learners_read(episodes(3, 1, 2))], ids=["few", "all"])
+def test_minari_returns_all_that_learners_read_of_a_state(rows, workshop_id, tmp_path, monkeypatch):
+    library = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    batch = with_what_learners_read(episodes(3, 1, 2))
-    minari.export(batch, "test/tools-v0", LAYOUT, env_id=workshop_id, env_kwargs={"size": 2})
+    more = {"env_id": workshop_id, "env_kwargs": {"size": 2}}
+    dataset = minari.export(rows, "test/tools-v0", LAYOUT, **more, description="Tools.")
+    assert dataset.total_episodes == 3 and dataset.total_steps == 6
+    assert set(dataset[0].actions) == {"tool", "force"} and "heat" in dataset[0].infos
+    assert library.load_dataset("test/tools-v0").recover_environment().unwrapped.size == 2
     loaded = minari.load("test/tools-v0", LAYOUT)
-    assert set(loaded.keys(True, True)) == set(batch.keys(True, True))
-    for name, value in batch.items(True, True):
+    assert set(loaded.keys(True, True)) == set(rows.keys(True, True))
+    for name, value in rows.items(True, True):
         assert loaded[name].dtype == value.dtype and loaded[name].equal(value), name
-    for name in (keys.ACTION_MASK, keys.PAIR_MASK, keys.PARAMETER_LOW):
-        with pytest.raises(DataError, match=f"have {name}, but lack next.{name}, which Minari keeps, too"):
-            minari.export(batch.exclude(("next", name)), "test/half-v0", LAYOUT, env_id=workshop_id)
+    with pytest.raises(DataError, match="test/tools-v0: cannot be read as transitions"):
+        minari.load("test/tools-v0", minari.MinariLayout())
+    if keys.ACTION_MASK in rows.keys():
+        for name in (keys.ACTION_MASK, keys.PAIR_MASK, keys.PARAMETER_LOW):
+            with pytest.raises(DataError, match=f"have {name}, but lack next.{name}, which Minari keeps, too"):
+                minari.export(rows.exclude(("next", name)), "test/half-v0", LAYOUT, **more)
 
 
 def exported(tmp_path, monkeypatch, workshop_id):
@@ -577,7 +533,6 @@ SPOILS = {
     "its metadata have no action_space": spec_that_runs,
     "its format is arrow, but must be hdf5": lambda folder: with_metadata(folder, data_format="arrow"),
     "cannot be read as transitions (no JSON": lambda folder: (folder / "metadata.json").write_text("[" * 9999),
-    "cannot be read as transitions ('list' object": lambda folder: (folder / "metadata.json").write_text("[]"),
     "is a named pipe": lambda folder: ((folder / "metadata.json").unlink(), os.mkfifo(folder / "metadata.json")),
     "No such file": lambda folder: (folder / "main_data.hdf5").unlink(),
     "cannot be read as transitions (Unable to": lambda folder: (folder / "main_data.hdf5").write_bytes(b"\x89HDF" * 99),
@@ -589,9 +544,6 @@ SPOILS = {
         "rewards",
         lambda group, name, old: group.create_dataset(name, (2,), "f4", external=[("/etc/passwd", 0, 8)]),
     ),
-    "which stand for 40000": lambda folder: with_values(
-        folder, "rewards", lambda group, name, old: group.create_dataset(name, (10**10,), "f4")
-    ),
     "the transitions, row 3: next.reward is nan, but must be finite": lambda folder: with_values(
         folder, "rewards", lambda group, name, old: group.create_dataset(name, data=old * np.nan)
     ),
@@ -601,19 +553,10 @@ SPOILS = {
     "episode_2 in its file of episodes is there twice": lambda folder: in_file(
         folder, lambda file: file.__setitem__("episode_2", file["episode_0"])
     ),
-    "episode_1/more in its file of episodes is there twice": lambda folder: in_file(
-        folder, lambda file: file["episode_1"].__setitem__("more", file["/"])
-    ),
     "has episode_7, but must have episode_0 to episode_1 alone": lambda folder: in_file(
         folder, lambda file: file.move("episode_1", "episode_7")
     ),
-    "has notes, but must have episode_0 to episode_2 alone": lambda folder: in_file(
-        folder, lambda file: file.create_group("notes")
-    ),
     "say total_episodes=1, but its file has 2": lambda folder: with_metadata(folder, total_episodes=1),
-    "say total_episodes=200000000, but its file has 2": lambda folder: with_metadata(folder, total_episodes=2 * 10**8),
-    "say total_episodes=2.0, but its file has 2": lambda folder: with_metadata(folder, total_episodes=2.0),
-    "say total_episodes=None, but its file has 2": lambda folder: with_metadata(folder, total_episodes=None),
     "its observation_space has pictures, but transitions hold vectors alone": in_pictures,
     "cannot be read as transitions (": lambda folder: with_values(
         folder, "rewards", lambda group, name, old: group.create_dataset(name, data=old[:1])
@@ -632,8 +575,7 @@ def test_a_foreign_minari_data_set_runs_no_code_and_is_refused_in_one_line(works
     assert not is_lit
 
 
-@pytest.mark.parametrize("size", [0, 1000])
-def test_a_full_disk_stops_every_export_in_a_line_and_leaves_nothing(workshop_id, tmp_path, monkeypatch, size):
+def test_a_full_disk_stops_every_export_in_a_line_and_leaves_nothing(workshop_id, tmp_path, monkeypatch):
     pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     rows = episodes(*[5] * 99)
@@ -646,7 +588,7 @@ def test_a_full_disk_stops_every_export_in_a_line_and_leaves_nothing(workshop_id
     ]
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     for write in writes:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
         try:
             with pytest.raises(DataError, match="File too large"):
                 write()
