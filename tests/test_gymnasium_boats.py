@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
-import time
 import warnings
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import global_generators_unmoved
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-import hpamdp
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock.gymnasium_adapter import BoatDock, BoatDockVector
-from hpamdp.env.boatdock.rendering import Leg, Scene, draw
+from hpamdp.env.boatdock.rendering import Scene, draw
 
 ID = "hpamdp/BoatDock-v0"
 START, GOAL = np.array([640.0, 512.0]), np.array([640.0, 452.0])  # 60 px straight up, the congruent controller's key 1
@@ -44,10 +38,10 @@ def same(one, other) -> bool:
     return type(one) is type(other) and one == other
 
 
-@pytest.mark.parametrize("action_format", ["dict", "tuple"])
-@pytest.mark.parametrize("controller", ["choose", "congruent", "incongruent", "random"])
-@pytest.mark.parametrize("observation", ["scaled", "pixels"])
-@pytest.mark.parametrize("noise", [{}, NOISE], ids=["exact", "noisy"])
+@pytest.mark.parametrize(
+    ("action_format", "controller", "observation", "noise"),
+    [("dict", "choose", "scaled", {}), ("tuple", "choose", "pixels", NOISE), ("dict", "random", "pixels", {})],
+)
 def test_gymnasiums_checker_finds_nothing(action_format, controller, observation, noise):
     env = gymnasium.make(
         ID, controller=controller, keymap="random", observation=observation, action_format=action_format, **noise
@@ -56,24 +50,6 @@ def test_gymnasiums_checker_finds_nothing(action_format, controller, observation
         warnings.simplefilter("always")
         check_env(env.unwrapped)
     assert [w for w in caught if RECOMMENDATION not in str(w.message)] == []
-
-
-def test_importing_the_package_registers_the_ids_and_loads_no_torch():
-    code = f"import hpamdp, gymnasium, sys; print({ID!r} in gymnasium.registry, 'torch' in sys.modules)"
-    root = Path(hpamdp.__file__).parents[1]
-    out = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
-    assert out.stdout.split() == ["True", "False"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        hpamdp.register()
-
-
-def test_observations_stay_in_their_space_whatever_is_pressed():
-    for observation in ("scaled", "pixels"):
-        env = BoatDockVector(2000, controller="random", observation=observation, **NOISE)
-        env.action_space.seed(0)
-        seen = [env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(15))]
-        assert all(batch in env.observation_space for batch in seen)
 
 
 @pytest.mark.parametrize("observation", ["scaled", "pixels"])
@@ -107,13 +83,6 @@ def test_unseeded_environments_differ_and_seed_themselves_from_np_random():
     for env in twins:
         env.np_random = np.random.default_rng(1)
     assert np.array_equal(twins[0].reset()[0], twins[1].reset()[0])
-
-
-def test_global_generators_are_not_moved():
-    with global_generators_unmoved():
-        env = BoatDock(**NOISE)
-        env.reset(seed=1)
-        env.step(press(0, 0.3, option=1))
 
 
 def test_the_info_has_the_outcome_and_at_the_end_the_score():
@@ -163,24 +132,18 @@ GOOD = {"option": 1, "key": 1, "duration": np.full(3, 0.2)}
 BAD_ACTIONS = {
     "nan": {**GOOD, "duration": np.array([0.1, np.nan, 0.1])},
     "key too large": {**GOOD, "key": 3},
-    "key negative": {**GOOD, "key": -1},
     "fractional key": {**GOOD, "key": 1.5},
     "key of another shape": {**GOOD, "key": np.array([1])},
     "no such option": {**GOOD, "option": 2},
     "one duration": {**GOOD, "duration": np.array([0.1])},
-    "words": {**GOOD, "duration": ["a", "b", "c"]},
     "ragged": {**GOOD, "duration": [0.1, [0.2], 0.3]},
-    "nothing": {**GOOD, "duration": None},
     "no key": {"option": 1, "duration": GOOD["duration"]},
     "another leaf": {**GOOD, "speed": 1},
-    "a number": 1,
     "none": None,
 }
 BAD_TUPLES = {
     "too short": (1, (0.1, 0.1, 0.1)),
     "flat": (1, 1, np.full(3, 0.1)),
-    "two durations": (1, 1, (np.array([0.1]), np.array([0.1]))),
-    "scalars": (1, 1, (0.1, 0.1, 0.1)),
     "nan": (1, 1, tuple(np.array([x]) for x in (0.1, np.nan, 0.1))),
     "dict": GOOD,
 }
@@ -209,17 +172,16 @@ def test_an_invalid_action_is_refused_in_one_line_and_changes_nothing(action_for
         {"start": START, "goal": [np.nan, 0.0]},
         {"start": START, "goal": GOAL[:1]},
         {"start": START, "goal": GOAL, "controller": 1},
-        {"start": START, "goal": GOAL, "keymap": 1.5},
         {"begin": START},
     ],
 )
-@pytest.mark.parametrize("seed", [None, 9])
-def test_an_invalid_reset_option_is_refused_in_one_line_and_changes_nothing(options, seed):
+def test_an_invalid_reset_option_is_refused_in_one_line_and_changes_nothing(options):
     env, untouched = BoatDock(), BoatDock()
     for each in (env, untouched):
         each.reset(seed=0)
-    with pytest.raises(ValueError, match=r"^reset: [^\n]+$"):
-        env.reset(seed=seed, options=options)
+    for seed in (None, 9):
+        with pytest.raises(ValueError, match=r"^reset: [^\n]+$"):
+            env.reset(seed=seed, options=options)
     assert same(env.step(GOOD)[0], untouched.step(GOOD)[0])
     assert same(env.reset()[0], untouched.reset()[0])
 
@@ -324,18 +286,3 @@ def test_no_directions_are_drawn_before_a_controller_is_chosen():
     marks = [(np.abs(c.astype(int) - background).sum(-1) > 200).sum() for c in corner]
     assert marks[0] == 0
     assert min(marks[1:]) > 40
-
-
-def test_a_frame_takes_less_time_than_sorting_as_many_numbers():
-    legs = tuple(Leg((-60 + 10 * i, -40), (-50 + 10 * i, -40), 0.5) for i in range(10))
-    scene = Scene((-60, -40), (60, 40), (40, -40), (1, 0), legs, 0.5, 10, 1, 1, "out_of_fuel", -1.0)
-    numbers = np.random.default_rng(0).uniform(size=480 * 480 * 3)
-    drawing, sorting = [], []
-    for _ in range(10):
-        began = time.process_time()
-        assert draw(scene).shape == (480, 480, 3)
-        drawing.append(time.process_time() - began)
-        began = time.process_time()
-        np.sort(numbers)
-        sorting.append(time.process_time() - began)
-    assert min(drawing) < min(sorting)
