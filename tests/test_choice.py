@@ -2,13 +2,8 @@
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
-from torchrl.modules import MLP, EGreedyModule, QValueModule
-from torchrl.objectives import DQNLoss
 from toy_options import Crossing, WholeStep, steppers
 
 from hpamdp import keys
@@ -19,7 +14,6 @@ from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
 from hpamdp.policies.high_level.fixed import Fixed
-from hpamdp.policies.low_level.planner import PlannerPolicy
 from hpamdp.policies.low_level.random import RandomPolicy
 from hpamdp.specs import PAMDPSpecs
 
@@ -138,42 +132,3 @@ def test_given_layouts_are_played():
 def test_an_environment_without_a_choice_is_refused(controller):
     with pytest.raises(ValueError, match="no option to choose"):
         OptionChoiceEnv(Presser(), BoatDockEnv(2, controller=controller))
-
-
-def planned(num_envs: int, seed: int = 0) -> OptionChoiceEnv:
-    boats = BoatDockEnv(num_envs, oracle=True, seed=seed)
-    return OptionChoiceEnv(PlannerPolicy(PAMDPSpecs.from_env(boats)), boats)
-
-
-@pytest.mark.slow
-def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
-    torch.manual_seed(0)
-    env = planned(50, seed=5)
-    q = TensorDictModule(MLP(16, 2, num_cells=[64, 64]), [keys.OBSERVATION], ["action_value"])
-    out_keys = [keys.OPTION, "action_value", "chosen_action_value"]
-    greedy = TensorDictSequential(q, QValueModule(action_space="categorical", out_keys=out_keys))
-    option = env.full_action_spec[keys.OPTION]
-    explore = EGreedyModule(option, eps_init=1.0, eps_end=0.2, annealing_num_steps=300, action_key=keys.OPTION)
-    loss = DQNLoss(greedy, action_space="categorical", delay_value=False)
-    loss.set_keys(action=keys.OPTION)
-    loss.make_value_estimator(gamma=1.0)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=5e-3)
-    buffer = ReplayBuffer(storage=LazyTensorStorage(600), batch_size=256)
-    policy = TensorDictSequential(greedy, explore)
-    collector = Collector(env, policy, frames_per_batch=50, total_frames=600, auto_register_policy_transforms=False)
-    for batch in collector:
-        buffer.extend(batch.reshape(-1))
-        explore.step(len(batch))
-        for _ in range(25):
-            optimizer.zero_grad()
-            loss(buffer.sample())["loss"].backward()
-            optimizer.step()
-    collector.shutdown(close_env=False)
-
-    test = planned(200)
-    returns = []
-    for chosen in (0, 1, None):
-        td = test.reset(test.fixed_episodes(0))
-        td = greedy(td) if chosen is None else td.set(keys.OPTION, torch.full((200,), chosen))
-        returns.append(test.step(td)["next", keys.REWARD].mean().item())
-    assert returns[2] > max(returns[:2]) + 0.1  # the best choices: 0.23
