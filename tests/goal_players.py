@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -11,12 +10,10 @@ from typing import Any
 
 import pytest
 import torch
-from batched_players import Player, action
-from tensordict import TensorDict, TensorDictBase
+from batched_players import action
+from tensordict import TensorDictBase
 from torch import Tensor
-from torch.nn import functional as F
 
-from hpamdp import keys
 from hpamdp.env.goal import rules
 from hpamdp.env.goal.environment import GoalEnv
 from hpamdp.env.goal.rules import GoalState
@@ -56,64 +53,6 @@ def trained_player(env: GoalEnv) -> Callable[[TensorDictBase], TensorDictBase]:
         return action(discrete, specs.from_unit(unit))
 
     return play
-
-
-# What a look-ahead tries: points to kick to, whose y is read where that slip is repaired alone, and places on the goal
-# line to shoot at.
-KICKS = F.pad(torch.linspace(0.0, 40.0, 21)[:, None], (0, 3))
-REPAIRED_KICKS = F.pad(torch.cartesian_prod(torch.linspace(2.0, 20.0, 10), torch.linspace(-9.0, 9.0, 7)), (0, 2))
-SHOTS = F.pad(torch.linspace(-7.0, 7.0, 29)[:, None], (2, 1))
-SECOND = action(torch.ones(len(SHOTS), dtype=torch.long), SHOTS)
-
-
-def first_actions(env: GoalEnv) -> TensorDict:
-    """Return the kicks and the shots."""
-    kicks = REPAIRED_KICKS if "kick_to" in env.options.repaired else KICKS
-    return torch.cat([action(torch.zeros(len(kicks), dtype=torch.long), kicks), SECOND])
-
-
-def of_rows(env: GoalEnv, rows: Tensor, seed: int = 0) -> GoalEnv:
-    """Return copies of some of the pitches, with noise of their own."""
-    copies = GoalEnv(len(rows), repaired=env.options.repaired, seed=seed)
-    copies.reset()
-    copies.set_env_state({name: column[rows] for name, column in env.env_state().items()})
-    return copies
-
-
-def tried(env: GoalEnv, actions: TensorDict, seed: int) -> tuple[Tensor, GoalEnv]:
-    """Take each of these actions `[A]` from each state `[N]` with other noise; return outcomes `[N, A]` and pitches."""
-    model = of_rows(env, torch.arange(env.num_envs).repeat_interleave(len(actions)), seed)
-    outcome = model.step(actions.repeat(env.num_envs))["next", keys.OUTCOME]
-    return outcome.reshape(env.num_envs, len(actions)), model
-
-
-def look_ahead_player(num_samples: int = 6) -> Player:
-    """Return a player of the first of the two actions that score most often by the true rules.
-
-    Where no two actions score, it takes the ball forward.
-    """
-    seeds = itertools.count(1000)
-
-    def values(env: GoalEnv) -> Tensor:
-        """Return the fraction of goals after each first action and the best shot that follows it, `[N, A]`."""
-        outcome, model = tried(env, first_actions(env), next(seeds))
-        value = (outcome == rules.GOAL).float().flatten()
-        playing = (outcome.flatten() == rules.PLAYING).nonzero().squeeze(-1)
-        if len(playing):
-            after = of_rows(model, playing)
-            goals = torch.stack([tried(after, SECOND, next(seeds))[0] == rules.GOAL for _ in range(num_samples)])
-            value[playing] = goals.float().mean(0).amax(-1) + 1e-3 * after.env_state()["ball_x"]
-        return value.reshape(outcome.shape)
-
-    def act(env: GoalEnv) -> TensorDict:
-        playing = (env.env_state()["outcome"] == rules.PLAYING).nonzero().squeeze(-1)
-        now = of_rows(env, playing)
-        best = torch.stack([values(now) for _ in range(num_samples)]).mean(0).argmax(-1)
-        chosen = torch.zeros(env.num_envs, dtype=torch.long)
-        chosen[playing] = best
-        return first_actions(env)[chosen]
-
-    return act
 
 
 class Trace:

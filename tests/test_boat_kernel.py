@@ -16,7 +16,6 @@ from hpamdp import keys
 from hpamdp.env import counter_rng, kernels
 from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.task import MAX_PRESSES
 from hpamdp.env.rng_streams import folded
 
 POSITIONS = ("start_x", "start_y", "goal_x", "goal_y", "x", "y")
@@ -151,19 +150,6 @@ def test_all_outcomes_come_up_in_the_comparison():
     assert outcomes >= set(range(physics.TIME_LIMIT))
 
 
-def test_a_time_limit_is_the_tensor_functions_one():
-    env = BoatDockEnv(2)
-    td = env.reset()
-    for _ in range(MAX_PRESSES):
-        for name in (keys.OPTION, keys.DISCRETE):
-            td[name] = torch.zeros(2, dtype=torch.long)
-        td[keys.PARAMETERS] = torch.zeros(2, 3)
-        td, root = env.step_and_maybe_reset(td)
-        last, td = td, root
-    assert last["next", keys.TRUNCATED].all() and not last["next", keys.TERMINATED].any()
-    assert (last["next", keys.OUTCOME] == physics.TIME_LIMIT).all()
-
-
 @pytest.mark.slow
 def test_a_million_random_steps_agree():
     _, num_different = play(100_000, 10, 5, controller="random", observation="scaled", slip=0.1, motor_noise=0.1)
@@ -197,20 +183,6 @@ def test_a_state_that_was_read_does_not_change_with_the_boats():
     state, saved = env.state, env.env_state()
     env.step(env.rand_action(td))
     assert (state.presses == 0).all() and (saved["presses"] == 0).all() and (env.state.presses == 1).all()
-
-
-def test_the_step_with_a_reset_returns_what_torchrls_own_does():
-    fast, slow = BoatDockEnv(200, seed=2), BoatDockEnv(200, seed=2)
-    one, other = fast.reset(), slow.reset()
-    for _ in range(5):
-        action = fast.rand_action(one.clone()).select(keys.OPTION, keys.ACTION)
-        fast_step, one = fast.step_and_maybe_reset(one.update(action))
-        # An entry that the environment does not know takes TorchRL's way.
-        slow_step, other = slow.step_and_maybe_reset(other.update(action).set("mark", torch.zeros(200)))
-        other = other.exclude("mark")
-        assert set(fast_step.keys(True)) == set(slow_step.exclude("mark").keys(True))
-        assert set(one.keys(True)) == set(other.keys(True))
-        assert (fast_step == slow_step.exclude("mark")).all() and (one == other).all()
 
 
 def test_durations_that_require_gradients_get_them():

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-import random
 
-import numpy as np
 import pytest
 import torch
-from conftest import global_generators_unmoved
+from batched_players import is_unchanged, snapshot
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
-from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.task import FUEL, SCALED_NAMES
+from hpamdp.env.boatdock.task import SCALED_NAMES
 
 CENTRE = torch.tensor(harbour.CENTRE)
 NOISE = {"motor_noise": 0.2, "sensor_noise": 3.0, "slip": 0.3}
-MODES = list(
-    itertools.product(
-        ("choose", "congruent", "incongruent", "random"), (1, 2, "random"), ("paper", "sparse"), ("scaled", "pixels")
-    )
-)
 
 
 def action(key, duration, option=None) -> TensorDict:
@@ -43,13 +35,6 @@ def press(env: BoatDockEnv, key, duration, option=None) -> TensorDictBase:
     return env.step(action(key, duration, option))["next"]
 
 
-def random_action(env: BoatDockEnv, generator: torch.Generator, longest: float = 1.0) -> TensorDict:
-    num = env.num_envs
-    key = torch.randint(3, (num,), generator=generator)
-    option = torch.randint(2, (num,), generator=generator) if env.has_choice else None
-    return action(key, longest * torch.rand(num, 3, generator=generator), option)
-
-
 def layout(start, goal, num: int = 1, **rest) -> TensorDict:
     """Return a layout given in px from the harbour's centre, the same for every boat."""
     td = TensorDict(batch_size=[num])
@@ -60,73 +45,11 @@ def layout(start, goal, num: int = 1, **rest) -> TensorDict:
     return td
 
 
-def snapshot(env: BoatDockEnv) -> list[torch.Tensor]:
-    return [column.clone() for column in env.state]
-
-
-def is_unchanged(env: BoatDockEnv, before: list[torch.Tensor], rows=slice(None)) -> bool:
-    return all(torch.equal(now[rows], then[rows]) for now, then in zip(env.state, before, strict=True))
-
-
-def play(env: BoatDockEnv, num_presses: int, longest: float = 1.0) -> list[TensorDictBase]:
-    """Reset and press random keys, also in finished episodes; return everything that was returned."""
-    generator = torch.Generator().manual_seed(0)
-    readings = [env.reset()]
-    for _ in range(num_presses):
-        readings.append(env.step(random_action(env, generator, longest))["next"])
-    return readings
-
-
-@pytest.mark.parametrize(("controller", "keymap", "reward", "observation"), MODES)
-def test_all_tensors_are_as_the_specs_say_in_every_mode(controller, keymap, reward, observation):
-    noise = NOISE if keymap == "random" else {}
-    env = BoatDockEnv(2, controller=controller, keymap=keymap, reward=reward, observation=observation, **noise)
-    check_env_specs(env, return_contiguous=True)
-
-
-@pytest.mark.parametrize("noise", [{}, NOISE])
-def test_a_seed_fixes_layouts_and_noise(noise):
-    first, second, other = (BoatDockEnv(8, controller="random", **noise, seed=seed) for seed in (3, 0, 4))
-    second.set_seed(3)
-    readings = [play(env, 5) for env in (first, second, other)]
-    assert all((one == same).all() for one, same in zip(*readings[:2], strict=True))
-    assert not torch.equal(readings[0][0]["observation"], readings[2][0]["observation"])
-    first.set_seed(3)
-    assert all((again == once).all() for again, once in zip(play(first, 5), readings[0], strict=True))
-    assert not torch.equal(first.reset()["observation"], readings[0][0]["observation"])
-
-
-def test_global_generators_are_neither_moved_nor_read():
-    env = BoatDockEnv(8, controller="random", keymap="random", **NOISE)
-    press_all = action([0, 1, 2, 0, 1, 2, 0, 1], [0.3] * 8)
-
-    def run() -> TensorDictBase:
-        env.set_seed(5)
-        env.reset()
-        return env.step(press_all.clone())["next"]
-
-    with global_generators_unmoved():
-        once = run()
-    torch.rand(3)
-    np.random.rand()
-    random.random()
-    assert (run() == once).all()
-
-
-def test_a_partial_reset_leaves_the_other_boats_alone():
-    env = BoatDockEnv(4, controller="choose")
-    env.reset()
-    press(env, [0, 1, 2, 0], [0.2] * 4, [0, 1, 0, 1])
-    before = snapshot(env)
-    mask = torch.tensor([[False], [True], [False], [True]])
-    reading = env.reset(TensorDict({"_reset": mask}, batch_size=[4]))
-    kept = ~mask[:, 0]
-    fresh = mask[:, 0]
-    assert is_unchanged(env, before, kept)
-    assert env.state.episode.tolist() == [0, 1, 0, 1]
-    assert (env.state.presses[fresh] == 0).all()
-    assert not torch.isclose(env.state.start_x, before[0])[fresh].any()
-    assert (reading[FUEL][fresh] == 1.0).all()
+@pytest.mark.parametrize("observation", ["scaled", "pixels"])
+@pytest.mark.parametrize("controller", ["choose", "congruent", "random"])
+def test_all_tensors_are_as_the_specs_say(controller, observation):
+    noise = NOISE if controller == "random" else {}
+    check_env_specs(BoatDockEnv(2, controller=controller, observation=observation, **noise), return_contiguous=True)
 
 
 def test_the_option_is_read_at_the_first_press_and_held():
@@ -142,21 +65,6 @@ def test_the_option_is_read_at_the_first_press_and_held():
     assert torch.allclose(env.state.y[0], -env.state.y[1])
     env.reset()
     assert env.state.controller.tolist() == [-1, -1]
-
-
-def test_a_finished_episode_stays_finished_and_earns_nothing():
-    env = BoatDockEnv(64, controller="congruent")
-    env.reset()
-    generator = torch.Generator().manual_seed(0)
-    env.step(random_action(env, generator, 2.0))
-    over = env.state.outcome != physics.SAILING
-    assert 0 < over.sum() < 64
-    before = snapshot(env)
-    after = env.step(random_action(env, generator, 2.0))["next"]
-    assert is_unchanged(env, before, over)
-    assert after[keys.DONE][over].all()
-    assert (after[keys.REWARD][over] == 0.0).all()
-    assert (env.state.presses[~over] == 2).all()
 
 
 def test_given_layouts_are_played_with_their_controllers_and_keymaps():
@@ -182,12 +90,13 @@ BAD_LAYOUTS = {
     "one coordinate": TensorDict(start=torch.zeros(2, 1), goal=torch.zeros(2, 2), batch_size=[2]),
     "no such controller": layout([0.0, 0.0], [50.0, 0.0], 2, controller=2),
     "no such keymap": layout([0.0, 0.0], [50.0, 0.0], 2, keymap=0),
+    "a controller that the agent chooses": layout([0.0, 0.0], [50.0, 0.0], 2, controller=1),
 }
 
 
 @pytest.mark.parametrize("name", BAD_LAYOUTS)
 def test_an_invalid_layout_is_refused_and_changes_nothing(name):
-    env = BoatDockEnv(2, controller="random")
+    env = BoatDockEnv(2, controller="choose" if name == "a controller that the agent chooses" else "random")
     env.reset()
     before = snapshot(env)
     with pytest.raises(ValueError, match="reset: "):
@@ -195,26 +104,10 @@ def test_an_invalid_layout_is_refused_and_changes_nothing(name):
     assert is_unchanged(env, before)
 
 
-def test_a_controller_is_refused_where_the_agent_chooses_it():
-    env = BoatDockEnv(2, controller="choose")
-    env.reset()
-    before = snapshot(env)
-    with pytest.raises(ValueError, match="option"):
-        env.reset(layout([0.0, 0.0], [50.0, 0.0], 2, controller=1))
-    assert is_unchanged(env, before)
-
-
 BAD_ACTIONS = {
     "nan": action([0, 1], [0.1, math.nan], [0, 0]),
-    "inf": action([0, 1], [math.inf, 0.1], [0, 0]),
-    "key too large": action([0, 3], [0.1, 0.1], [0, 0]),
-    "key negative": action([-1, 0], [0.1, 0.1], [0, 0]),
     "no such option": action([0, 0], [0.1, 0.1], [0, 2]),
-    "key of another shape": action([[0], [1]], [0.1, 0.1], [0, 0]),
-    "one duration a boat": action([0, 1], [[0.1], [0.1]], [0, 0]),
-    "fractional key": action([0.5, 1.0], [0.1, 0.1], [0, 0]),
     "no option": action([0, 1], [0.1, 0.1]),
-    "no key": action([0, 1], [0.1, 0.1], [0, 0]).exclude(keys.DISCRETE),
     "option of another shape": action([0, 1], [0.1, 0.1], [[0], [1]]),
 }
 
@@ -229,49 +122,14 @@ def test_an_invalid_action_is_refused_and_changes_nothing(name):
     assert is_unchanged(env, before)
 
 
-@pytest.mark.parametrize("noise", [{}, NOISE])
-def test_returned_tensors_never_change_later(noise):
-    env = BoatDockEnv(16, controller="choose", **noise)
-    returned = []
-    copies = []
-
-    def keep(reading: TensorDictBase) -> None:
-        returned.append(reading)
-        copies.append(reading.clone())
-
-    generator = torch.Generator().manual_seed(0)
-    keep(env.reset())
-    given = layout([0.0, 0.0], [90.0, 0.0], 16)
-    for _ in range(4):
-        keep(env.step(random_action(env, generator))["next"])
-        keep(env.reset(TensorDict({"_reset": torch.rand(16, 1, generator=generator) < 0.5}, batch_size=[16])))
-    keep(env.reset(given))
-    keep(env.step(random_action(env, generator))["next"])
-    assert all((now == then).all() for now, then in zip(returned, copies, strict=True))
-
-
-def test_a_restored_state_continues_as_the_original():
-    env, copy = (BoatDockEnv(8, controller="congruent", **NOISE) for _ in range(2))
-    play(env, 1, 0.3)
-    copy.state = env.state
-    for _ in range(2):
-        results = [press(e, [0, 1, 2, 0, 1, 2, 0, 1], [0.3] * 8) for e in (env, copy)]
-        assert (results[0] == results[1]).all()
-
-
 BAD_ARGUMENTS = [
-    {"controller": "both"},
-    {"keymap": 3},
-    {"reward": "dense"},
-    {"observation": "image"},
-    {"slip": 1.5},
-    {"motor_noise": -0.1},
-    {"motor_noise": [0.1, 0.2, 0.3]},
-    {"motor_noise": [0.1, math.nan]},
-    {"motor_noise": 1e30},
-    {"sensor_noise": math.inf},
-    {"sensor_noise": 1e30},
-    {"num_envs": 0},
+    *({"controller": "both"}, {"keymap": 3}, {"reward": "dense"}, {"observation": "image"}, {"slip": 1.5}),
+    *(
+        {"motor_noise": -0.1},
+        {"motor_noise": [0.1, 0.2, 0.3]},
+        {"motor_noise": [0.1, math.nan]},
+        {"sensor_noise": math.inf},
+    ),
 ]
 
 
@@ -289,16 +147,3 @@ def test_a_step_before_the_reset_is_refused(name):
         env.set_seed(1)
     with pytest.raises(RuntimeError, match="call reset before step"):
         press(env, [0, 1], 0.5)
-
-
-def test_float64_durations_leave_rewards_and_observations_float32():
-    env, doubled = (BoatDockEnv(2, controller="congruent") for _ in range(2))
-    env.reset()
-    doubled.reset()
-    single = action([0, 1], 0.5)
-    expected = env.step(single.clone())["next"]
-    single[keys.PARAMETERS] = single[keys.PARAMETERS].double()
-    following = doubled.step(single)["next"]
-    for leaf in (keys.OBSERVATION, keys.REWARD):
-        assert following[leaf].dtype == torch.float32
-        assert torch.equal(following[leaf], expected[leaf])

@@ -171,11 +171,6 @@ def test_the_first_episodes_of_an_evaluation_are_its_fixed_layouts():
     assert torch.allclose(torch.stack(env.state[:4]), torch.stack(harbour.fixed_layouts(50, 4)), atol=1e-4)
 
 
-def test_the_fixed_layouts_of_later_environments_continue_those_of_earlier_ones():
-    whole, later = BoatDockEnv(4).fixed_episodes(3), BoatDockEnv(2, first_env=2).fixed_episodes(3)
-    assert (later == whole[2:]).all()
-
-
 def test_slip_presses_a_uniformly_random_key():
     num = 30_000
     env = BoatDockEnv(num, controller="congruent", slip=0.3)

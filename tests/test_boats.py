@@ -40,10 +40,6 @@ def press(env: BoatDockEnv, key: list[int], duration: list[float], option: list[
     return env.step(td)["next"]
 
 
-def test_the_settings_have_the_controllers_that_the_code_knows():
-    assert BoatDockOptions().controllers == CONTROLLER_DEGREES
-
-
 def test_the_controllers_are_peoples():
     boats = made(THREE).boats
     for table, row in zip(boats.directions, (2, 0, 1), strict=True):
@@ -141,11 +137,11 @@ def test_changes_never_make_a_layout_worse_and_cheaper_ones_are_worth_more():
 def follow(env: BoatDockEnv, option: int | None) -> tuple[torch.Tensor, torch.Tensor]:
     """Return scores and outcomes of the oracle's presses, which begin with an option or with the best one."""
     td = env.reset()
+    row = torch.arange(env.num_envs)
     for number in range(planner.MAX_PRESSES + 1):
         chosen = td["oracle", "option"]
-        if number == 0 and option is not None:
+        if option is not None and (number == 0 or env.rules.switch_cost is None):
             chosen = torch.full_like(chosen, option)
-        row = torch.arange(env.num_envs)
         td[keys.OPTION] = chosen
         td[keys.DISCRETE] = td["oracle", "discrete"][row, chosen]
         td[keys.PARAMETERS] = td["oracle", "parameters"][row, chosen].unsqueeze(-1).expand(-1, 3).contiguous()
@@ -163,15 +159,14 @@ def follow(env: BoatDockEnv, option: int | None) -> tuple[torch.Tensor, torch.Te
     ids=str,
 )
 def test_the_oracle_reaches_the_score_of_its_plans(settings):
-    env = BoatDockEnv(8, oracle=True, seed=2, **settings)
+    env = BoatDockEnv(4, oracle=True, seed=2, **settings)
     for option in (None, 0):
         env.set_seed(2)
         env.reset()
         optimum = env.describe()["optimum"]
         env.set_seed(2)
         planned = optimum.amax(1) if option is None else optimum[:, option]
-        held_to_option = option is not None and env.rules.switch_cost is None
-        score, outcome = follow_held(env, option) if held_to_option else follow(env, option)
+        score, outcome = follow(env, option)
         solved = planned > -1.0
         assert (outcome[solved] == physics.SUCCESS).all()
         torch.testing.assert_close(score[solved], planned[solved], atol=2e-3, rtol=0.0)
@@ -197,19 +192,7 @@ def test_boats_that_are_put_elsewhere_have_the_plans_of_that_place(presses):
     assert (restored.read()["oracle"] == planned).all()
 
 
-def follow_held(env, option):
-    td = env.reset()
-    for _ in range(planner.MAX_PRESSES + 1):
-        td[keys.OPTION] = torch.full((env.num_envs,), option)
-        td[keys.DISCRETE] = td["oracle", "discrete"][:, option]
-        td[keys.PARAMETERS] = td["oracle", "parameters"][:, option].unsqueeze(-1).expand(-1, 3).contiguous()
-        td = env.step(td)["next"]
-    return harbour.score(td[keys.OUTCOME], td["fuel"].squeeze(-1)), td[keys.OUTCOME]
-
-
-@pytest.mark.parametrize(
-    ("num_presses", "cost"), [(1, 0.1), (2, 0.1), (3, 0.15), pytest.param(3, 0.0, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("num_presses", "cost"), [(1, 0.1), (3, 0.15), pytest.param(3, 0.0, marks=pytest.mark.slow)])
 def test_an_evolutionary_search_over_presses_and_boats_never_beats_the_planner(num_presses, cost):
     num, samples, elite, children = 25, 4000, 30, 8
     rules = made(["congruent", "incongruent1", "sideways"], cost, SIDEWAYS)
@@ -292,7 +275,7 @@ def test_the_fuel_of_a_change_is_not_drawn_as_a_press():
     assert rendering.leg(before, env.state, 1.0).pressed == pytest.approx(1.0 / 1.95, abs=1e-3)
 
 
-@pytest.mark.parametrize("high", ["meta_critic", "actor", "option_critic", "oracle"])
+@pytest.mark.parametrize("high", ["actor", "option_critic", "oracle"])
 def test_selectors_that_end_options_train_with_changes_of_boats(high):
     learned = high == "option_critic"
     ends = ["agent.termination=learned"] if learned else ["agent.termination=steps", "agent.option_length=1"]
