@@ -55,8 +55,6 @@ def test_a_ceiling_with_changes_that_options_never_make_is_told_in_one_line(caps
         ("high=human env=platform", "high=human: env=platform has no human data"),
         ("high=oracle env=platform", "high=oracle: env=platform has no planner to ask"),
         ("high=none low=planner env=platform", "low=planner: env=platform has no planner to ask"),
-        ("high=none low=planner env=boatdock_released", "low=planner: env=boatdock_released has no planner to ask"),
-        ("high=ucb env=boatdock_released", "high=ucb: env=boatdock_released has no options to choose; use high=none"),
         (
             "high=ucb env.controller=random",
             "high=ucb: env=boatdock leaves nothing to choose; use high=none or env.controller=choose",
@@ -80,13 +78,14 @@ def test_a_ceiling_with_changes_that_options_never_make_is_told_in_one_line(caps
             "agent.termination=learned: high=actor does not decide where options end; use high=option_critic, "
             "high=meta_critic or agent.termination=steps",
         ),
-        *(
-            (
-                f"high={high} env=crossing low=stepper agent.termination=steps agent.option_length=3",
-                f"agent.termination=steps: high={high} is a bandit, which counts what an option returns and nothing of "
-                "what follows it; use agent.termination=episode, high=meta_critic or high=actor",
-            )
-            for high in ("ucb", "epsilon_greedy", "thompson", "exp3", "linucb", "lin_thompson")
+        (
+            "high=linucb env=crossing low=stepper agent.termination=steps agent.option_length=3",
+            "agent.termination=steps: high=linucb is a bandit, which counts what an option returns and nothing of "
+            "what follows it; use agent.termination=episode, high=meta_critic or high=actor",
+        ),
+        (
+            "env=crossing low=stepper low.freeze=true agent.termination=steps agent.option_length=2",
+            "agent.termination=steps: low.freeze=true plays whole episodes; use agent.termination=episode",
         ),
         (
             "high=none env.controller=random low.freeze=true",
@@ -126,13 +125,6 @@ def test_a_selector_that_ends_options_trains_and_is_evaluated(high, tmp_path):
     assert played["steps"].max() <= 12
 
 
-def test_frozen_learners_play_whole_episodes_so_that_options_cannot_be_shorter(tmp_path):
-    with pytest.raises(ConfigError) as error:
-        make(crossing("low.freeze=true", "agent.termination=steps", "agent.option_length=2"), tmp_path)
-    line = "agent.termination=steps: low.freeze=true plays whole episodes; use agent.termination=episode"
-    assert str(error.value) == line
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
     """Return the output folder of a tiny run of H-PPO."""
@@ -141,15 +133,7 @@ def trained(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "low=random",
-        " ".join(["low=pdqn", *SHORT["pdqn"]]),
-        "low=hppo low.hidden_dims=[8]",
-        "low=hppo agent.sharing=shared",
-    ],
-)
+@pytest.mark.parametrize("words", ["low=random", "low=hppo low.hidden_dims=[8]", "low=hppo agent.sharing=shared"])
 def test_learners_of_another_kind_or_size_are_refused_in_one_line(words, trained, tmp_path):
     with pytest.raises(ConfigError) as error:
         make(make_config([*SMALL, "total_frames=20000", *words.split(), f"low.checkpoint={trained}"]), tmp_path)
@@ -188,7 +172,7 @@ def test_learners_of_another_run_go_on_learning_where_they_are_not_frozen(traine
     assert not is_same(copied(train(make_config(words), tmp_path / "on").agent.learners), start)
 
 
-@pytest.mark.parametrize("low", ["hppo", "pdqn", "hsac"])
+@pytest.mark.parametrize("low", ["hppo", "pdqn"])
 def test_learners_of_another_run_bring_their_networks_and_begin_their_schedules_afresh(low, tmp_path):
     words = [*SMALL, "high=uniform", f"low={low}", *SHORT[low]]
     trained = copied(train(make_config(words), tmp_path / "first").agent.learners)
@@ -212,18 +196,8 @@ def test_rows_that_wait_in_a_saved_run_do_not_keep_its_networks_from_one_with_sm
         assert not learner.waiting and torch.equal(learner.actor.discrete_head.bias, trained.actor.discrete_head.bias)
 
 
-def test_a_finished_hppo_begins_a_new_run_with_its_first_learning_rate(tmp_path):
-    words = [*SMALL, "high=uniform", "low=hppo", *SHORT["hppo"], "low.anneal_steps=64", "low.minibatch_size=8"]
-    train(make_config(words), tmp_path / "first")
-    parts = make(make_config([*words, f"low.checkpoint={tmp_path / 'first'}"]), tmp_path / "second")
-    parts.agent.learn(parts.env.rollout(8, parts.policy, break_when_any_done=False))
-    for learner in parts.agent.learners:
-        assert learner.optimizer.param_groups[0]["lr"] == learner.options.lr
-
-
-@pytest.mark.parametrize("low", ["pdqn", "hsac"])
-def test_a_learner_of_another_run_fills_its_replay_before_it_updates(low, tmp_path):
-    words = [*SMALL, "high=uniform", f"low={low}", *SHORT[low]]
+def test_a_learner_of_another_run_fills_its_replay_before_it_updates(tmp_path):
+    words = [*SMALL, "high=uniform", "low=pdqn", *SHORT["pdqn"]]
     parts = train(make_config(words), tmp_path / "first")
     frames = min(int(learner.frames) for learner in parts.agent.learners)
     again = [*words, f"low.checkpoint={tmp_path / 'first'}", f"low.warmup_steps={frames}"]
