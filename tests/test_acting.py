@@ -5,10 +5,8 @@ from __future__ import annotations
 import threading
 from collections import Counter
 
-import gymnasium
-import numpy as np
-from gymnasium import spaces
 from torchrl.envs.utils import ExplorationType, exploration_type
+from toy_environments import Toy
 
 import hpamdp
 from hpamdp.acting import acting
@@ -16,19 +14,12 @@ from hpamdp.acting import acting
 STEPS = Counter()
 
 
-class Recorder(gymnasium.Env):
+class Recorder(Toy):
     """Counts the steps that are taken with each exploration type."""
-
-    observation_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
-    action_space = spaces.Tuple((spaces.Discrete(2), spaces.Tuple((spaces.Box(-1.0, 1.0, (1,)),) * 2)))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(3, np.float32), {}
 
     def step(self, action):
         STEPS[exploration_type()] += 1
-        return np.zeros(3, np.float32), 0.0, False, False, {}
+        return super().step(action)
 
 
 def steps_of_a_training() -> Counter:

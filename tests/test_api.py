@@ -509,20 +509,16 @@ def test_fewer_episodes_of_a_seed_are_the_first_of_more(platform_agent):
     np.testing.assert_array_equal(few, more[:3])
 
 
-class Spoken(gymnasium.Env):
+class Spoken(Toy):
     """Observe a dict of a box and a number."""
 
-    observation_space = spaces.Dict(
-        pos=spaces.Box(-1.0, 1.0, (2,), np.float32), time=spaces.Box(0.0, 9.0, (), np.float32)
-    )
-    action_space = Reach.action_space
+    def __init__(self):
+        super().__init__()
+        box, number = spaces.Box(-1.0, 1.0, (2,), np.float32), spaces.Box(0.0, 9.0, (), np.float32)
+        self.observation_space = spaces.Dict(pos=box, time=number)
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return {"pos": np.zeros(2, np.float32), "time": np.float32(0.0)}, {}
-
-    def step(self, action):
-        return {"pos": np.zeros(2, np.float32), "time": np.float32(1.0)}, 0.0, False, False, {}
+    def _observation(self):
+        return {"pos": np.zeros(2, np.float32), "time": np.float32(self.steps)}
 
 
 @pytest.fixture(scope="module")
