@@ -793,7 +793,7 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make_gymnasium("lunar_lander", enable_wind="no"), "enable_wind=.no.: must be a valid boolean"),
         (lambda: hpamdp.make_gymnasium("lunar_lander", gravty=-3.0), r"no such setting .*; did you mean gravity\? It"),
         (lambda: hpamdp.make_gymnasium("lunar_lander", 2, max_step=3), r"no such setting .*; it has enable_wind, grav"),
-        (lambda: hpamdp.make_gymnasium("TrafficCrossing", minute=3), r"no such argument; did you mean minutes\?"),
+        (lambda: hpamdp.make_gymnasium("TrafficCrossing", minute=3), r"minute: no such .*; did you mean minutes\?"),
         (lambda: gymnasium.make("hpamdp/Office-v0", num_envs=3), "num_envs=3: this is one environment; use "),
         (lambda: hpamdp.train("platform", max_stps=5), r"did you mean env\.max_steps"),
         (lambda: hpamdp.train("platform", low="hppo", lr=1e-3), r"did you mean low\.lr\?"),
