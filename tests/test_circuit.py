@@ -147,19 +147,6 @@ def test_native_circuits_have_the_simulators_fidelity_and_the_sum_of_their_gates
     assert results["cost"].tolist() == pytest.approx(costs, abs=1e-5)
 
 
-@pytest.mark.parametrize("task", CIRCUITS)
-def test_the_textbooks_circuit_scores_1(task):
-    env = CircuitEnv(1, task=task, oracle=True)
-    reading = env.reset()
-    while not reading[keys.DONE].all():
-        known = reading["oracle"]
-        reading = act(env, known["discrete"].squeeze(-1), known["parameters"].squeeze(-1))
-    assert env.results(reading)["score"].item() == pytest.approx(1.0, abs=5e-5)
-    assert reading[keys.OUTCOME].item() == MATCHED
-    assert env.state.steps.item() == len(CIRCUITS[task]) + 1
-    assert len(CIRCUITS[task]) == {"hadamard": 3, "bell": 3, "ghz": 4, "toffoli": 11}[task]
-
-
 @pytest.mark.parametrize(
     ("task", "mean"),
     [
@@ -179,15 +166,10 @@ def test_a_circuit_without_gates_has_the_known_score(task, mean):
     assert reading[keys.REWARD].mean().item() == pytest.approx(mean, abs=0.004 if "random" in task else 1e-4)
 
 
-@pytest.mark.parametrize("gate_set", ["published", "choose", "superconducting", "ion"])
-def test_all_tensors_are_as_the_specs_say(gate_set):
-    check_env_specs(CircuitEnv(3, task="bell", gate_set=gate_set, oracle=True), return_contiguous=True)
-
-
-@pytest.mark.parametrize("reward", rules.REWARDS)
 @pytest.mark.parametrize("gate_set", ["choose", "superconducting", "ion"])
-def test_the_kernel_does_what_the_rules_say_of_native_gates(gate_set, reward):
-    env = CircuitEnv(500, task="random_state", gate_set=gate_set, reward=reward, seed=3, first_env=2)
+def test_the_kernel_does_what_the_rules_say_of_native_gates(gate_set):
+    check_env_specs(CircuitEnv(3, task="bell", gate_set=gate_set, oracle=True), return_contiguous=True)
+    env = CircuitEnv(500, task="random_state", gate_set=gate_set, reward="progress", seed=3, first_env=2)
     assert compare_with_rules(env, 12, 1e-5)[1] <= 3
 
 
@@ -203,21 +185,7 @@ def test_learners_see_the_sources_actions_and_observations(task):
     assert set(specs.parameter_low) == {-float(np.float32(math.pi))}
 
 
-def test_progress_adds_up_to_the_score_less_that_of_no_gates():
-    final, progress = (CircuitEnv(50, task="toffoli", reward=reward, max_steps=9) for reward in ("final", "progress"))
-    totals = []
-    for env in (final, progress):
-        player = random_player(4)
-        reading, total = env.reset(), torch.zeros(50)
-        while not reading[keys.DONE].all():
-            reading = env.step(player(env))["next"]
-            total += reading[keys.REWARD].squeeze(-1)
-        totals.append(total)
-    assert torch.allclose(totals[0], totals[1] + 0.29517, atol=1e-4)
-
-
-@pytest.mark.parametrize("floor", [None, 0.1])
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(("task", "floor"), [("random_state", None), ("toffoli", None), ("toffoli", 0.1)])
 def test_gain_is_how_much_the_final_score_exceeds_the_floor_and_never_negative(task, floor):
     gaining = {"task": task, "reward": "gain", "floor": floor, "max_steps": 3}
     assert compare_with_rules(CircuitEnv(200, **gaining), 6, 1e-5)[1] <= 3
@@ -233,8 +201,8 @@ def test_gain_is_how_much_the_final_score_exceeds_the_floor_and_never_negative(t
         returns.append(total)
     counts_from = without_gates if floor is None else floor
     assert torch.allclose(returns[1], (returns[0] - counts_from).clamp(min=0.0), atol=1e-5)
-    # No three gates make more than half of a GHZ state, or bring the identity nearer to the Toffoli gate.
-    assert (returns[1] > 0.0).any() == (floor is not None or task not in ("ghz", "toffoli"))
+    # No three gates bring the identity nearer to the Toffoli gate.
+    assert (returns[1] > 0.0).any() == ((task, floor) != ("toffoli", None))
 
 
 def test_products_of_vectors_include_the_overlap_with_the_target():
@@ -298,7 +266,7 @@ def test_a_circuit_of_as_many_gates_as_are_allowed_is_finished_and_has_its_score
 
 
 @pytest.mark.parametrize("task", CIRCUITS)
-def test_the_planner_finishes_the_known_circuit_wherever_training_begins_in_it(task):
+def test_the_planner_finishes_the_textbooks_circuit_wherever_training_begins_in_it_and_scores_1(task):
     env = CircuitEnv(50, task=task, begin="known", oracle=True)
     first = torch.tensor([0, *env.parameter_dims]).cumsum(0)
     td = env.reset()
@@ -311,8 +279,9 @@ def test_the_planner_finishes_the_known_circuit_wherever_training_begins_in_it(t
         parameters[has_angle, first[gate][has_angle]] = plan["parameters"][has_angle, 0]
         td = env.step(td.update({"action": {"discrete": gate, "parameters": parameters}}))["next"]
         steps.append(td[keys.DONE].sum())
-    assert (td[keys.OUTCOME] == MATCHED).all() and env.state.similarity.min() > 0.999
+    assert (td[keys.OUTCOME] == MATCHED).all() and env.results(td)["score"].min() > 0.9999
     assert steps[1] > 0 and len(steps) == len(CIRCUITS[task]) + 1  # some had but one gate to go
+    assert len(CIRCUITS[task]) == {"hadamard": 3, "bell": 3, "ghz": 4, "toffoli": 11}[task]
 
 
 def test_the_closing_table_has_the_score_of_no_gates_for_the_target_at_hand():
@@ -323,7 +292,7 @@ def test_the_closing_table_has_the_score_of_no_gates_for_the_target_at_hand():
     assert CircuitEnv(1, task="random_state").references({})["no gates"]["score"] == 0.25
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", ["random_state", "toffoli"])
 def test_training_may_begin_as_many_gates_from_the_target_as_are_said_and_evaluation_begins_without_gates(task):
     assert compare_with_rules(CircuitEnv(60, task=task, begin="near_target"), 3, 1e-5)[1] == 0
     env = CircuitEnv(60, task=task, begin="near_target", begin_gates=1)
@@ -363,14 +332,6 @@ def test_random_targets_are_normalised_uniform_and_new_in_every_episode():
     assert (np.abs(operators.reshape(500, -1)) ** 2).mean(0) == pytest.approx(np.full(16, 0.25), abs=0.05)
     env.reset()
     assert np.abs(targets_of(env) - operators).max(axis=(1, 2)).min() > 0.05
-
-
-def test_evaluation_meets_no_target_of_training():
-    training, evaluation = (CircuitEnv(50, task="random_state", seed=7) for _ in range(2))
-    evaluation.seed_evaluation(7)
-    first = {tuple(row) for _ in range(20) for row in training.reset()[keys.OBSERVATION].tolist()}
-    second = {tuple(row) for _ in range(20) for row in evaluation.reset()[keys.OBSERVATION].tolist()}
-    assert len(first) == len(second) == 1000 and not first & second
 
 
 def test_a_numbered_target_is_the_same_in_training_and_evaluation_whatever_the_seed():
@@ -441,10 +402,10 @@ def test_no_circuit_found_by_another_search_beats_the_compilers(name):
     # Any order of the gates, not only the forms, with another optimizer.
     gate_set = SETS[name]
     rng = np.random.default_rng(3)
-    best = compiler.best(states(3, 2), gate_set).score
-    for target, score in zip(states(3, 2), best, strict=True):
+    best = compiler.best(states(2, 2), gate_set).score
+    for target, score in zip(states(2, 2), best, strict=True):
         found = -1.0
-        for _ in range(25):
+        for _ in range(15):
             numbers = rng.integers(len(gate_set) - 1, size=rng.integers(1, 9))
             cost = sum(gate_set[number].cost for number in numbers)
 
@@ -513,7 +474,6 @@ def test_the_oracle_with_the_planner_reaches_the_ceiling_and_always_chooses_righ
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"task": "cnot"}, "task='cnot': must be 'hadamard'"),
         ({"task": "toffoli", "gate_set": "ion"}, "gate_set=ion: native sets are for task=bell and random_state, not"),
         (
             {"task": "bell", "gate_set": "ion", "begin": "near_target"},
@@ -522,10 +482,8 @@ def test_the_oracle_with_the_planner_reaches_the_ceiling_and_always_chooses_righ
         ({"task": "random_state", "begin": "known"}, "begin=known: needs gate_set=published and a target with a"),
         ({"task": "bell", "target_number": 1}, "target_number=1: task=bell has one target; leave it out"),
         ({"floor": 0.9}, "floor=0.9: needs reward=gain, not reward=final"),
-        ({"reward": "gain", "floor": 1.0}, "floor=1.0: must be less than 1"),
         ({"ion_costs": [0.0, 0.1]}, r"ion_costs=\[0.0, 0.1\]: must lie between 0.001 and 1, and the second"),
         ({"task": "random_unitary", "oracle": True}, "task=random_unitary: nobody knows its best circuits"),
-        ({"task": "bell", "begin": "near_target", "oracle": True}, "begin=near_target: nobody knows the best circuits"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused_in_one_line(settings, words):
