@@ -227,23 +227,6 @@ class OfTold(OfSign):
         self.in_keys = [*self.in_keys, keys.ORACLE_OPTION]
 
 
-@pytest.mark.parametrize("is_shared", [False, True], ids=["per_option", "shared"])
-def test_a_replayed_step_is_followed_by_the_option_that_the_selector_would_choose_now(is_shared):
-    agent = make_agent("pdqn", OfSign(SPECS), is_shared=is_shared, words=[*LEARNERS["pdqn"], "low.target_smoothing=0"])
-    state = torch.rand(20, 2) * 2 - 1
-    seen = torch.cat([state, torch.tensor([[1.0, 0.0]]).expand(20, 2)], -1) if is_shared else state
-    chosen_then = torch.randint(2, (20,))
-    is_ended = torch.rand(20) < 0.7
-    sample = TensorDict(
-        {"next_state": seen, "option_ended": is_ended, "next_option": chosen_then, "option": chosen_then}, [20]
-    )
-    expected = []
-    for i in range(20):
-        option = int(state[i, 0] > 0.0) if is_ended[i] else 0
-        expected.append(value(agent, option, state[i : i + 1]))
-    assert agent.learners[0].next_value(sample).tolist() == pytest.approx(expected, abs=1e-6)
-
-
 class Softly(OfSign):
     """Choose the second option with a probability that the first entry gives."""
 
@@ -252,21 +235,22 @@ class Softly(OfSign):
         return torch.stack([1.0 - second, second], -1)
 
 
+@pytest.mark.parametrize("selector", [OfSign, Softly])
 @pytest.mark.parametrize("is_shared", [False, True], ids=["per_option", "shared"])
-def test_a_replayed_step_is_worth_the_mean_over_the_options_of_a_stochastic_selector(is_shared):
+def test_a_replayed_step_is_worth_the_mean_over_the_options_that_the_selector_would_choose_now(is_shared, selector):
     words = [*LEARNERS["pdqn"], "low.target_smoothing=0"]
-    agent = make_agent("pdqn", Softly(SPECS), is_shared=is_shared, words=words)
+    agent = make_agent("pdqn", selector(SPECS), is_shared=is_shared, words=words)
     state = torch.rand(20, 2) * 2 - 1
     seen = torch.cat([state, torch.tensor([[1.0, 0.0]]).expand(20, 2)], -1) if is_shared else state
-    is_ended = torch.rand(20) < 0.7
-    held = torch.zeros(20, dtype=torch.long)
-    sample = TensorDict({"next_state": seen, "option_ended": is_ended, "next_option": held, "option": held}, [20])
+    is_ended, chosen_then = torch.rand(20) < 0.7, torch.randint(2, (20,))
+    rows = {"next_state": seen, "option_ended": is_ended, "next_option": chosen_then, "option": chosen_then}
     expected = []
     for i in range(20):
-        second = float(state[i, 0].sigmoid()) if is_ended[i] else 0.0
+        now = float(state[i, 0].sigmoid()) if selector is Softly else float(state[i, 0] > 0.0)
+        second = now if is_ended[i] else 0.0
         first_value, second_value = (value(agent, option, state[i : i + 1]) for option in range(2))
         expected.append((1.0 - second) * first_value + second * second_value)
-    assert agent.learners[0].next_value(sample).tolist() == pytest.approx(expected, abs=1e-6)
+    assert agent.learners[0].next_value(TensorDict(rows, [20])).tolist() == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize("is_shared", [False, True], ids=["per_option", "shared"])
