@@ -14,45 +14,32 @@ from hpamdp.run import train
 MISTAKES = [
     # A choice that isn't there, a group that isn't there.
     (["high=foo"], "high=foo: no such choice; conf/high has actor, "),
-    (["high=3"], "high=3: no such choice; conf/high has actor, "),
     (["low=null"], "low=null: no such choice; conf/low has "),
-    (["experiment=foo"], "experiment=foo: no such choice; conf/experiment has circuits, circuits/bell, "),
     (["experiment=domains/foo"], "experiment=domains/foo: no such choice; did you mean domains/goal or "),
     (["hihg=ucb"], "hihg: no such group or value of the run (conf/config.yaml); did you mean high? It has "),
     (["~low"], "low: nothing chosen; set low=NAME"),
     (["~low.tau"], "~low.tau: a setting cannot be removed; give it a value"),
-    (["~film"], "~film: a setting cannot be removed; give it a value"),
     # A key that isn't there.
     (["sed=3"], "sed: no such group or value of the run (conf/config.yaml); did you mean seed? It has "),
-    (["+sed=3"], "sed: no such value of the run (conf/config.yaml); did you mean seed? It has "),
     (["eval.evry=3"], "eval.evry: no such value of eval; did you mean every? It has every, layouts, seed"),
-    (["+eval.evry=3"], "eval.evry: no such value of the run (conf/config.yaml); did you mean every? It has every, "),
     (["low=pdqn", "low.lr_final=0.1"], "low.lr_final: is called low.lr_final_fraction now"),
     (["agent.uniform_option_steps=5"], "agent.uniform_option_steps: is called agent.practice now"),
     (["high=ucb", "high.windw=3"], "high.windw: no such setting of UCB; did you mean window? It"),
-    (["high=ucb", "+high.windw=3"], "high.windw: no such setting of UCB; did you mean window? It"),
     (["high=none", "high.window=3"], "high.window: high=none has no settings; choose another high, too"),
     (["exploration.epsilon=0.5"], "exploration.epsilon: exploration=none has no settings; choose another exploration"),
     (["+low=hppo"], "+low=hppo: low is always chosen; leave out the +"),
-    (["+exploration=held"], "+exploration=held: exploration is always chosen; leave out the +"),
     (["low=pdqn", "low.epsilon=0.1"], "did you mean epsilon_steps or epsilon_final or epsilon_episodes? It has "),
     (["low=hppo", "low.learning_rate=1"], "no such setting of HPPO; did you mean lr or critic_lr? It has "),
-    (["low=pdqn", "low.learning_rate=1"], "did you mean actor_lr or critic_lr? It has "),
     (["low=hppo", "low.batch_size=64"], "did you mean minibatch_size? It has "),
-    (["low=hppo", "low.n_steps=64"], "did you mean steps_per_batch? It has "),
     (["total_timesteps=64"], "did you mean total_frames? It has "),
-    (["n_envs=64"], "did you mean num_envs? It has "),
     (["low.lrr=1"], "low.lrr: no such setting of HyAR; it has actor_lr, "),
     (["hydra.run.dri=x"], "hydra.run.dri: no such value of hydra.run; did you mean dir? It has dir"),
     # A name that leaves its group.
     (["low=../env/boatdock"], "low=../env/boatdock: no such choice; conf/low has bc, "),
-    (["env=/etc/passwd"], "env=/etc/passwd: no such choice; conf/env has boatdock, "),
     (["hydra=null"], "hydra=null: not understood"),
     # An override that isn't one.
     (["high="], "high=: no such choice; conf/high has actor, "),
     (["=3"], "=3: not understood; write GROUP=CHOICE or SETTING=VALUE"),
-    (["low..x=1"], "low..x=1: not understood; write GROUP=CHOICE or SETTING=VALUE"),
-    (["low"], "low: not understood; write GROUP=CHOICE or SETTING=VALUE"),
     (["seed=[1"], "seed=[1: not understood; write GROUP=CHOICE or SETTING=VALUE"),
     (["+seed=3"], "Could not append to config. An item is already at 'seed'"),
     (["high=ucb,fixed"], "high=ucb,fixed: several values; add --multirun"),
@@ -64,24 +51,18 @@ MISTAKES = [
     # A value that cannot be.
     (["seed=-1"], "seed=-1: must be greater than or equal to 0 (conf/config.yaml, given as an argument)"),
     (["seed=abc"], 'seed="abc": must be a valid integer (conf/config.yaml, given as an argument)'),
-    (["eval.layouts=0"], "eval.layouts=0: must be greater than 0 (conf/config.yaml, given as an argument)"),
-    (["eval=3"], "eval=3: must be "),
     (["device=tpu"], 'device="tpu": must be auto, cpu, cuda or cuda:N (conf/config.yaml, given as an argument)'),
     (["mode=eval"], "checkpoint: missing; mode=eval needs the output folder of a run"),
     (["checkpoint=x"], "checkpoint: goes with mode=eval only"),
     (["num_envs=${nowhere}"], "num_envs: Interpolation key 'nowhere' not found"),
-    (["low.batch_size=0"], "low.batch_size=0: must be greater than 0 (HyAR, given as an argument)"),
     (["low._target_=os.path.join"], "low._target_=os.path.join: there is no class join in os.path"),
-    (["env.slip=2"], "must be "),
     (["env.reward=big"], "env.reward=\"big\": must be 'paper' or 'sparse' (BoatDockEnv, given as an argument)"),
-    (["high=fixed", "high.option=sideways"], "sideways"),
     # The same in a sweep.
     (["-m", "high=ucb,foo"], "high=foo: no such choice; conf/high has actor, "),
     (
         ["-m", "high=ucb,fixed", "high.window=1,2"],
         "high.window: no such setting of Fixed; it has",
     ),
-    (["-m", "low.lrr=1,2"], "low.lrr: no such setting of HyAR; it has actor_lr, "),
     (
         ["-m", "seed=-1"],
         "seed=-1: seed=-1: must be greater than or equal to 0 (conf/config.yaml, given as an argument)",
@@ -90,7 +71,6 @@ MISTAKES = [
     (["-m", "hydra.run.dir=x"], "hydra.run.dir=x: has no effect on a sweep; give hydra.sweep.dir"),
     (["experiment=few_steps", "hydra.run.dir=x"], "hydra.run.dir=x: has no effect on a sweep; give hydra.sweep.dir"),
     (["hydra.sweep.dir=x"], "hydra.sweep.dir=x: has no effect on a single run; add --multirun"),
-    (["hydra.sweep.subdir=x"], "hydra.sweep.subdir=x: has no effect on a single run; add --multirun"),
     (
         ["experiment=few_steps", "hydra.mode=RUN", "hydra.sweep.dir=x"],
         "hydra.sweep.dir=x: has no effect on a single run; add --multirun",
@@ -110,7 +90,6 @@ MISTAKES = [
         "env=goal,hard_goal: experiment=domains/moving chooses env=moving itself; leave env=goal,hard_goal out",
     ),
     (["-m", "low=glob(x*)"], "low=glob(x*): matches no choice; conf/low has "),
-    (["-m", "experiment=glob(domains/*)"], "experiment=glob(domains/*): matches no choice; conf/experiment has "),
     (["-m", "seed=glob(*)"], "seed=glob(*): glob is for a group, as in low=glob(h*); list the values"),
     (["low=glob(h*)"], "low=glob(h*): several values; add --multirun"),
     (["-m", "seed=range(1"], "seed=range(1: not understood"),
@@ -139,7 +118,6 @@ def test_a_broken_yaml_is_named_with_the_line(command, tmp_path):
     [
         ("env", b"\xff\xfe\x00", "a yaml file that was chosen is not written in UTF-8 ("),
         ("env", b"- 1\n- 2\n", "Cannot merge DictConfig with ListConfig"),
-        ("low", b"- 1\n- 2\n", "Cannot merge DictConfig with ListConfig"),
         ("high", b"", "high=mine: conf/high/mine.yaml names no class as _target_"),
         ("env", b"_target_: collections.OrderedDict\n", "env=mine: OrderedDict is no PAMDPEnv (hpamdp.env.base)"),
     ],
@@ -228,14 +206,6 @@ def test_the_script_tells_a_mistake_in_one_line(tmp_path):
     done = run_script("low.lrr=1", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("low.lrr: no such setting of HyAR") and done.stderr.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_the_script_tells_a_mistake_inside_a_job_in_one_line(tmp_path):
-    done = run_script("--multirun", "high.exploration=0", "low=random", cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith("high.exploration=0 low=random: high.exploration=0: must be greater than 0 (UCB, ")
-    assert done.stderr.count("\n") == 1
 
 
 def test_help_does_not_wait_for_torch():

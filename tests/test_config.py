@@ -88,19 +88,14 @@ def test_an_integer_is_a_float_and_a_list_a_tuple():
     [
         ("size", 0, "low.size=0: must be greater than 0 (Sample)"),
         ("size", True, "low.size=true: must be a valid integer"),
-        ("size", "3", 'low.size="3": must be a valid integer'),
         ("size", 3.0, "low.size=3.0: must be a valid integer"),
-        ("size", None, "low.size=null: must be a valid integer"),
         ("size", "absent", "low.size: missing (Sample)"),
         ("rate", 1.5, "low.rate=1.5: must be less than or equal to 1"),
-        ("rate", "1e-3x", 'low.rate="1e-3x": must be a valid number'),
         ("rate", float("nan"), "low.rate=NaN: must be a finite number"),
         ("form", "fany", "low.form=\"fany\": must be 'plain' or 'fancy'"),
         ("widths", 4, "low.widths=4: must be a list"),
         ("widths", [4, 0], "low.widths.1=0: must be greater than 0"),
-        ("depth", "deep", 'low.depth="deep": must be a valid integer'),
         ("label", 1.5, "low.label=1.5: must be a valid string or must be a valid integer"),
-        ("is_on", 1, "low.is_on=1: must be a valid boolean"),
         ("specs", 1, "low.specs: no such setting of Sample"),
         ("widths", [13], "low: widths: 13 is unlucky (Sample)"),
         ("rate", "${nowhere}", "rate: Interpolation key 'nowhere' not found"),
@@ -147,16 +142,12 @@ def test_all_problems_come_in_one_line():
         ("logger", "builtins.int", "logger=csv: int is no Logger (hpamdp.run.loggers); it lacks log, images, film, s"),
         ("logger", "hpamdp.run.loggers.Logger", "logger=csv: Logger is abstract; choose one of its subclasses (conf/"),
         ("logger", "json.dumps", "logger._target_=json.dumps: there is no class dumps in json (conf/logger/csv.yaml)"),
-        ("logger", "os.path", "logger._target_=os.path: there is no class path in os (conf/logger/csv.yaml)"),
-        ("collector", "enum.Enum", "collector=single: Enum is no Collection (hpamdp.run.collection.base); derive it "),
         (
             "collector",
             "hpamdp.run.collection.workers.WorkerCollection",
             "collector=single: WorkerCollection is abstract; choose one of its subclasses, which have _death, _star",
         ),
         ("data", "hpamdp.run.loggers.CSVLogger", "data=none: CSVLogger is no Demonstrations (hpamdp.data.demonstrat"),
-        ("data", "hpamdp.data.demonstrations.Demonstrations", "data=none: Demonstrations is abstract; choose one of "),
-        ("env", "hpamdp.env.base.PAMDPEnv", "env=boatdock: PAMDPEnv is abstract; choose one of its subclasses, which"),
         (
             "env",
             "hpamdp.env.option_choice.OptionChoiceEnv",
@@ -167,7 +158,6 @@ def test_all_problems_come_in_one_line():
             "torch.nn.Module",
             "high=auto: Module is no Selector (hpamdp.policies.base); derive it from Selector ",
         ),
-        ("low", "hpamdp.policies.shared.replay.ReplayLearner", "low=hyar: ReplayLearner is abstract; choose one of "),
     ],
 )
 def test_a_class_of_another_kind_is_refused_in_one_line(group, target, complaint):
@@ -196,7 +186,6 @@ def test_an_argument_with_the_name_of_a_value_of_the_run_is_refused_in_one_line(
     ("words", "complaint"),
     [
         (["recipe=goal_pdqm"], "recipe=goal_pdqm: no such file in conf/recipe; did you mean goal_pdqn? It has "),
-        (["recipe=boatdock_hyr"], "recipe=boatdock_hyr: no such file in conf/recipe; did you mean "),
         (
             ["recipe/high=boatdock_uc"],
             "recipe/high=boatdock_uc: no such file in conf/recipe/high; did you mean ",
@@ -292,10 +281,6 @@ def test_a_saved_config_has_names_instead_of_modules_and_is_read_back_the_same(w
             ["agent.option_length=3"],
             "agent.option_length=3: goes with agent.termination=steps only, not with episode",
         ),
-        (
-            ["agent.termination=learned", "agent.option_length=3"],
-            "agent.option_length=3: goes with agent.termination=steps only, not with learned",
-        ),
     ],
 )
 def test_a_number_of_steps_goes_with_options_that_end_after_steps_alone(words, complaint):
@@ -320,42 +305,22 @@ def test_one_run_checks_its_config_once(tmp_path, monkeypatch):
     assert sorted(checked) == sorted(GROUPS)
 
 
-def test_an_experiment_sets_groups_and_values(tmp_path, monkeypatch):
-    (tmp_path / "experiment").mkdir()
-    study = "# @package _global_\ndefaults:\n  - override /high: fixed\nseed: 7\nhigh:\n  option: incongruent\n"
-    (tmp_path / "experiment/study.yaml").write_text(study)
-    cfg = compose_config([f"hydra.searchpath=[{tmp_path}]", "experiment=study"])
-    assert (cfg.hydra.runtime.choices.high, cfg.high.option, cfg.seed) == ("fixed", "incongruent", 7)
-    assert compose_config([f"hydra.searchpath=[{tmp_path}]", "experiment=study", "seed=8"]).seed == 8
+def test_every_yaml_says_what_it_is():
+    assert not [file for file in CONF.rglob("*.yaml") if not file.read_text().startswith("#")]
 
 
-@pytest.mark.parametrize("file", sorted(CONF.rglob("*.yaml")), ids=lambda file: file.relative_to(CONF).as_posix())
-def test_every_yaml_says_what_it_is(file):
-    assert file.read_text().startswith("#")
-
-
-@pytest.mark.parametrize(("group", "name"), FILES)
-def test_a_yaml_holds_only_what_differs_from_its_class(group, name):
-    given = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())
-    given.pop("budget", None)
-    target = given.pop("_target_")
-    if target is not None:
-        defaults = defaults_of(settings_model(load_class(target), SUPPLIED_ARGUMENTS[group]))
-        assert given.keys() <= defaults.keys()
-        assert not [setting for setting, value in given.items() if value == defaults[setting]]
-
-
-@pytest.mark.parametrize(("group", "name"), [*FILES, *((CALLBACK, name) for name in choices(CALLBACK))])
-def test_every_setting_has_its_meaning_in_the_model(group, name):
-    target = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())["_target_"]
-    if target is not None:
-        fields = settings_model(load_class(target), SUPPLIED_ARGUMENTS.get(group, ())).model_fields
-        assert not [setting for setting, field in fields.items() if not field.description]
-
-
-def test_every_group_has_a_folder():
-    others = {CALLBACK, "experiment", "search", "recipe"}
-    assert {folder.name for folder in CONF.iterdir() if folder.is_dir()} == {*GROUPS, *others}
+def test_a_yaml_holds_only_what_differs_from_its_class_and_every_setting_has_its_meaning_in_the_model():
+    offenders = []
+    for group, name in (*FILES, *((CALLBACK, name) for name in choices(CALLBACK))):
+        given = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())
+        target = given.pop("_target_")
+        if target is not None:
+            model = settings_model(load_class(target), SUPPLIED_ARGUMENTS.get(group, ()))
+            defaults = defaults_of(model)
+            same = [key for key, value in given.items() if key != "budget" and value == defaults.get(key, value)]
+            nameless = [key for key, field in model.model_fields.items() if not field.description]
+            offenders += [f"{group}/{name}: {key}" for key in (*same, *nameless)]
+    assert not offenders
 
 
 def test_a_learner_gets_what_it_needs_on_a_problem_and_the_command_line_has_the_last_word():
@@ -409,7 +374,6 @@ def test_cuda_is_refused_in_one_line_where_there_is_none(monkeypatch):
     ("words", "blind"),
     [
         (["high=none", "low=pdqn"], None),
-        (["high=none", "low=hppo"], None),
         (["high=none", "low=pets"], "low=pets"),
         (["high=none", "low=pets", "low.gamma=1"], None),
         (["env.grouping=default", "high=meta_critic", "low=pdqn"], "high=meta_critic"),

