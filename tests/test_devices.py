@@ -69,21 +69,21 @@ def observed(specs: PAMDPSpecs) -> TensorDict:
 
 
 # DLPA's plans use autocast, which knows no such device.
-@pytest.mark.parametrize("mode", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
 @pytest.mark.parametrize("low", sorted({*choices("low")} - {"planner", "dlpa"}))
-def test_policies_stay_on_their_device(low, mode):
+def test_policies_stay_on_their_device(low):
     agent, specs = agent_of(["high=uniform", f"low={low}"])
-    with Answers(), set_exploration_type(mode):
-        acted = agent.learners[0].policy(observed(specs))
-    assert acted[keys.DISCRETE].device == acted[keys.PARAMETERS].device == META
+    for mode in (ExplorationType.DETERMINISTIC, ExplorationType.RANDOM):
+        with Answers(), set_exploration_type(mode):
+            acted = agent.learners[0].policy(observed(specs))
+        assert acted[keys.DISCRETE].device == acted[keys.PARAMETERS].device == META
 
 
-@pytest.mark.parametrize("mode", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
 @pytest.mark.parametrize("high", sorted({*choices("high")} - {"none", "oracle", "human", "value"}))
-def test_selectors_stay_on_their_device(high, mode):
+def test_selectors_stay_on_their_device(high):
     agent, specs = agent_of([f"high={high}", "low=random"])
-    with Answers(), set_exploration_type(mode):
-        assert agent.selector(observed(specs))[keys.OPTION].device == META
+    for mode in (ExplorationType.DETERMINISTIC, ExplorationType.RANDOM):
+        with Answers(), set_exploration_type(mode):
+            assert agent.selector(observed(specs))[keys.OPTION].device == META
 
 
 def on_meta(values: TensorDict) -> TensorDict:

@@ -8,7 +8,6 @@ from conftest import UPDATES_THAT_PAY, compose_config, make_config
 from test_grid import SHORT
 
 from hpamdp.config.errors import ConfigError
-from hpamdp.policies.base import have_stepped
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.run.assemble import assemble, make_agent, make_env, set_up_updates
 from hpamdp.run.summary import short_sight
@@ -33,7 +32,6 @@ TINY = ["num_envs=16", "steps_per_batch=4", "eval.layouts=4", "eval.every=0"]
             "1,000",
             "640",
         ),
-        (640, "low=random high=option_critic", "high.warmup_steps=2000 (high=option_critic)", "2,000", "640"),
         (
             640,
             "low.freeze=true low=random high=actor high.minibatch_size=1024",
@@ -75,15 +73,6 @@ def test_a_run_names_the_parts_without_an_update(words, without, tmp_path, capsy
     assert json.loads((tmp_path / "summary.json").read_text())["without_update"] == without
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("no update was made")]
     assert lines == ([f"no update was made: {', '.join(without)}"] if without else [])
-
-
-def test_optimizers_with_a_state_show_whether_they_have_stepped():
-    weight = torch.nn.Parameter(torch.ones(1))
-    adam, plain = torch.optim.Adam([weight]), torch.optim.SGD([weight])
-    assert have_stepped({}) and have_stepped({"plain": plain}) and not have_stepped({"adam": adam, "plain": plain})
-    weight.sum().backward()
-    adam.step()
-    assert have_stepped({"adam": adam, "plain": plain})
 
 
 def test_the_closing_table_names_learners_that_look_far_less_ahead_than_episodes_last():
