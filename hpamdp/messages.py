@@ -16,6 +16,10 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 _LONGEST_CODE = 80  # letters of a value in a message
 
 
+class ProblemError(ValueError):
+    """A problem breaks its own contract, such as with an observation outside its space; the message is one line."""
+
+
 def one_line(text: object) -> str:
     """Return a text or an error's message as one line, with a space in place of every line break.
 

@@ -14,9 +14,8 @@ from torchrl.envs import EnvBase
 
 from hpamdp import keys
 from hpamdp.components import Components
-from hpamdp.env.errors import ProblemError
 from hpamdp.geometry import PlaneGeometry, Symmetries
-from hpamdp.messages import as_code
+from hpamdp.messages import ProblemError, as_code
 from hpamdp.observation_entries import ObservationEntry, observation_dtype
 
 # A step or a batch of steps, by name.

@@ -150,6 +150,14 @@ def test_no_rooms_know_each_other_in_a_circle_also_within_functions():
     assert not knows
 
 
+def test_what_every_room_may_use_knows_no_room_also_within_functions():
+    doors = {"hpamdp.__main__", "hpamdp.cli"}
+    below = {module for module in FILES if module.count(".") == 1 and FILES[module].name != "__init__.py"} - doors
+    assert {"hpamdp.keys", "hpamdp.specs"} <= below
+    known = {name for module in below for name in imports(module) if is_in(name, "hpamdp")}
+    assert not [name for name in known if not any(is_in(name, module) for module in below)]
+
+
 def test_environments_and_policies_know_nothing_of_a_run():
     for room in ("hpamdp.run", "hpamdp.config", "hpamdp.cli"):
         assert not importers(room, inside="hpamdp.env") | importers(room, inside="hpamdp.policies")

@@ -9,15 +9,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Protocol
 
+from hpamdp.messages import ProblemError as ProblemError  # part of what environments use
 from hpamdp.messages import one_line
 
 # Frames of these packages are left out of an environment's traceback. It may call NumPy itself, but NumPy's frames do
 # not show where the environment went wrong.
 _NOT_THEIRS = ("hpamdp", "gymnasium", "numpy", "torch", "torchrl", "tensordict", "multiprocessing")
-
-
-class ProblemError(ValueError):
-    """A problem breaks its own contract, such as with an observation outside its space; the message is one line."""
 
 
 class EnvironmentFaultError(RuntimeError):
