@@ -12,6 +12,7 @@ import torch
 from conftest import forked
 from torchrl.envs.utils import check_env_specs
 
+import hpamdp
 from hpamdp import cli
 
 FOLDER = Path(__file__).resolve().parent.parent / "examples" / "extending"
@@ -45,6 +46,18 @@ def test_each_command_of_the_readme_runs(command, tmp_path):
     minibatch = ["low.minibatch_size=16"] if "hppo" in command else []
     summary = run([*shlex.split(command), *SHORT, *minibatch], tmp_path)
     assert summary["finished"] and summary["frames"] == 256
+
+
+def test_the_selector_of_ones_own_keeps_to_options_that_a_problem_allows(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    from softmax import Softmax
+
+    env = hpamdp.make("office", num_envs=64, chooses_goal=True)
+    step = env.reset()
+    mask = step["option_mask"] & torch.tensor([True, False, True])
+    step.update({"option_mask": mask, "is_decision": torch.ones(64, 1, dtype=torch.bool)})
+    selector = Softmax(hpamdp.PAMDPSpecs.from_env(env))
+    assert mask.gather(-1, selector.select(step).unsqueeze(-1)).all()
 
 
 def test_a_run_of_ones_own_classes_is_resumed_by_their_names(tmp_path):

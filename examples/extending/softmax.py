@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import PositiveFloat
 from torch import Tensor
 
+from hpamdp.policies.masks import masked_logits
 from hpamdp.policies.shared.bandit import Bandit
 from hpamdp.policies.shared.bandit_options import BanditOptions
 
@@ -22,7 +23,7 @@ class Softmax(Bandit):
     Options = SoftmaxOptions
     options: SoftmaxOptions
 
-    def sample(self, num: int) -> Tensor:
-        """Return `num` exploratory choices, int64 `[num]`."""
-        probabilities = (self.statistics.means / self.options.temperature).softmax(0)
+    def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
+        """Return `num` exploratory choices, int64 `[num]`, of the allowed options."""
+        probabilities = masked_logits(self.statistics.means / self.options.temperature, allowed).softmax(0)
         return probabilities.multinomial(num, replacement=True) if num else probabilities.new_zeros(0).long()
