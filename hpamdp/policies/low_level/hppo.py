@@ -139,7 +139,7 @@ class HPPO(OnPolicy, Learner):
         steps = [self.gradient_step(self.loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]
         for minibatch in self.minibatches(rows, options.critic_epochs):
             self.gradient_step(self.critic_loss, minibatch)
-        # The lower limit is the one before this batch, the upper one the one after it. Published scores were made so.
+        # Kept for reproducibility: `min_scale` uses the progress before this batch, `max_scale` the progress after it.
         self.actor.set_min_scale(options.min_scale * (options.min_scale_final / options.min_scale) ** progress)
         if options.max_scale_final is not None:
             fall = options.max_scale_final / options.max_scale
