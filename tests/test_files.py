@@ -58,7 +58,7 @@ def test_a_run_never_writes_through_a_link_in_its_folder(tmp_path, with_figures)
     } < names
     assert {"episodes.gif", "learning_curves.png"} < names
     contents = outside_copies(folder, tmp_path / "outside")
-    os.link(tmp_path / "outside/summary.json", folder / ".lock")
+    os.link(tmp_path / "outside/summary.json", folder / ".hpamdp-lock")
     os.symlink(tmp_path / "outside/summary.json", folder / "metrics.csv.previous")
     words = [f"resume={folder}", "total_frames=32", "film=true"]
     with locked(folder):

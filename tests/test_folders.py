@@ -115,6 +115,20 @@ def test_a_folder_that_a_list_of_figures_names_is_never_deleted(tmp_path):
     assert [*(tmp_path / "run").iterdir()] == [tmp_path / "run" / "thesis"]
 
 
+def test_folders_of_loggers_that_a_run_did_not_have_and_a_users_own_lock_are_never_deleted(tmp_path):
+    start(tmp_path / "run")
+    own = [".lock", ".replaced/notes.txt", "wandb/run-1/files/model.pt", "tensorboard/events"]
+    for name in own:
+        (tmp_path / "run" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "run" / name).write_text("mine")
+    with pytest.raises(OSError, match="full"), locked(tmp_path / "run"), moved_aside(tmp_path / "run"):
+        (tmp_path / "run" / CONFIG_NAME).write_text("choices: {logger: wandb}\n")
+        raise OSError("full")
+    with locked(tmp_path / "run"):
+        start(tmp_path / "run", "overwrite=true")
+    assert [(tmp_path / "run" / name).read_text() for name in own] == ["mine"] * len(own)
+
+
 def test_a_resumed_run_of_wandb_removes_its_own_earlier_folder_alone(tmp_path):
     ids = ["1_000000-one", "1_000000-[a-z]*", "2_000000-[a-z]*"]
     names = [f"offline-run-2026010{each}" for each in ids]

@@ -46,13 +46,14 @@ _OTHERS = (
     EVALUATION_NAME,
     FILM_NAME,
     ERROR_NAME,
-    TENSORBOARD_NAME,
-    WANDB_NAME,
 )
+# Folders of loggers, named after these.
+_OF_LOGGERS = (TENSORBOARD_NAME, WANDB_NAME)
 # In the first line of each `error.txt` that is written here.
 _TRACEBACK = b"Traceback (most recent call last):"
 # Folder of an earlier run while a new one starts in its place.
-_ASIDE_NAME = ".replaced"
+_ASIDE_NAME = ".hpamdp-replaced"
+_LOCK_NAME = ".hpamdp-lock"
 
 
 @contextmanager
@@ -67,7 +68,7 @@ def locked(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
         ConfigError: another process works in the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    file = folder / ".lock"
+    file = folder / _LOCK_NAME
     remove_link(file)
     lock = FileLock(file, timeout=patience_s)
     try:
@@ -160,6 +161,7 @@ def moved_aside(folder: Path) -> Iterator[None]:
     earlier = written_by_a_run(folder)
     if earlier:
         aside.mkdir()
+    others = {*folder.iterdir()} - {*earlier}
     try:
         for path in earlier:
             path.rename(aside / path.name)
@@ -169,7 +171,7 @@ def moved_aside(folder: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        for path in written_by_a_run(folder):
+        for path in {*written_by_a_run(folder)} - others:
             _delete(path)
         _bring_back(folder)
         raise
@@ -226,8 +228,14 @@ def has_foreign_error(folder: Path) -> bool:
 
 
 def written_by_a_run(folder: Path) -> list[Path]:
-    """Return the paths that a run has written into its folder, first the files that mark a run."""
-    names = [*_MARKS, *_OTHERS]
+    """Return the paths that a run has written into its folder, first the files that mark a run.
+
+    If the folder has the config of a run, the folder of a logger counts only if the run had this logger.
+    """
+    choices = saved_config(folder).get("choices")
+    logger = choices.get("logger") if isinstance(choices, dict) else None
+    of_logger = [name for name in _OF_LOGGERS if logger in (None, name)]
+    names = [*_MARKS, *_OTHERS, *of_logger]
     with suppress(OSError, UnicodeDecodeError):
         listed = read_regular(folder / FIGURES_NAME, MAX_TEXT_BYTES).decode().splitlines()
         names += [name for name in listed if Path(name).name == name and not (folder / name).is_dir()]
