@@ -17,6 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from test_folders import kill_at
 from toy_callbacks import Faulty
 
+from hpamdp.config import compose as config_compose
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import read_saved
 from hpamdp.config.schema import Config
@@ -246,6 +247,15 @@ def test_callbacks_are_called_in_the_order_of_the_list_and_before_those_from_pyt
     assert [*trainer.callbacks] == ["BestAgent", "Patience", "Recording", "TimeLimit"]
     words = [*SMALL, "callbacks=[time_limit,best_agent]", "save_best=true"]
     assert [*begin(make_config(words)).callbacks] == ["TimeLimit", "BestAgent"]
+
+
+def test_a_name_that_is_listed_several_times_is_composed_once(monkeypatch):
+    composed, compose = [], config_compose.compose
+    monkeypatch.setattr(config_compose, "compose", lambda words: composed.append(words) or compose(words))
+    again = [{"name": "patience", "evaluations": i} for i in (1, 2)]
+    listed = config_compose.listed_callbacks(["time_limit", *again, "patience"], {})
+    assert len(composed) == 2
+    assert [settings["evaluations"] for _, settings in listed[1:3]] == [1, 2]
 
 
 LIST = "callbacks=[time_limit,{name:patience,evaluations:5},{name:recording,breaks_at:${total_frames}}]"

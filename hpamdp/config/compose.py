@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -190,14 +190,19 @@ def check(given: Mapping[str, Any], names: Mapping[str, str], place_of: PlaceOf 
 def _learners_of_options(run: RunConfig, env: str) -> dict[str, tuple[str, dict[str, Any]]]:
     """Return each learner in `low.per_option`: its name, and its yaml file and recipe with the given settings."""
     learners = {}
+
+    @cache  # somebody else's file may name a learner as often as it likes
+    def written(name: str) -> dict[str, Any]:
+        cfg = compose([choosing("env", env), choosing("low", name)])
+        return plain_groups(cfg, run.model_dump(), ["low"])["low"]
+
     for option, choice in (run.low.per_option or {}).items():
         where = f"low.per_option.{option}"
         name, given = _name_and_settings(choice, where, "a learner", _NOT_PER_OPTION)
         try:
-            cfg = compose([choosing("env", env), choosing("low", name)])
-        except ConfigError as error:
+            learners[option] = name, {**written(name), **given}
+        except MissingChoiceError as error:
             raise ConfigError(f"{where}={name}: there is no {file_of('low', name)}") from error
-        learners[option] = name, {**plain_groups(cfg, run.model_dump(), ["low"])["low"], **given}
     return learners
 
 
@@ -212,16 +217,22 @@ def listed_callbacks(choices: Sequence[Any], run: Mapping[str, Any]) -> list[tup
         ConfigError: an entry names no yaml file of the searched folders.
     """
     callbacks = []
+
+    @cache  # likewise
+    def written(name: str) -> dict[str, Any]:
+        cfg = compose([f"+{choosing(CALLBACK, name)}"])
+        return plain_groups(cfg, run, [CALLBACK])[CALLBACK] if cfg.get(CALLBACK) else {}
+
     for i, choice in enumerate(choices):
         where = f"callbacks.{i}"
         name, given = _name_and_settings(choice, where, "a callback", {TARGET: _NAMED_BY_YAML})
         try:
-            cfg = compose([f"+{choosing(CALLBACK, name)}"])
+            own = written(name)
         except MissingChoiceError as error:
             raise ConfigError(f"{where}={name}: {no_such(f'file in conf/{CALLBACK}', name, error.known)}") from error
-        if TARGET not in (cfg.get(CALLBACK) or {}):
+        if TARGET not in own:
             raise ConfigError(f"{where}={name}: {file_of(CALLBACK, name)} names no class as {TARGET}")
-        callbacks.append((name, {**plain_groups(cfg, run, [CALLBACK])[CALLBACK], **given}))
+        callbacks.append((name, {**own, **given}))
     return callbacks
 
 
