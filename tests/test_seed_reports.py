@@ -241,6 +241,11 @@ def test_damaged_and_hostile_runs_cost_a_line_each(tmp_path, capsys):
     leave_run(study / "circular", seed="&a {b: *a}")
     (study / "gone").symlink_to(tmp_path / "nowhere")
     (study / "good/loop").symlink_to(study)
+    leave_run(tmp_path / "above")
+    (study / "good/up").symlink_to(tmp_path)
+    (study / "foreign").mkdir()
+    (study / "foreign/config.yaml").write_text("model: resnet\nseed: 0\n")
+    (study / "foreign/summary.json").write_text('{"score": 3.0, "finished": true}')
     leave_run(study / "half", seed=7)
     text = (study / "half/config.yaml").read_text()
     (study / "half/config.yaml").write_text(text[: text.rindex(":") + 2])  # which is still yaml
@@ -251,6 +256,7 @@ def test_damaged_and_hostile_runs_cost_a_line_each(tmp_path, capsys):
     assert sorted(line.removeprefix(f"{study}/") for line in lines) == [
         "circular: config.yaml is missing or damaged, left out",
         "cut: summary.json is damaged, left out",
+        "foreign: is of another program, left out",
         "gone: is a broken link, left out",
         f"good: has the settings and the seed of {study}/again, left out",
         "half: config.yaml is missing or damaged, left out",

@@ -153,8 +153,10 @@ def _read(folder: Path, metric: str) -> SeedRun | None:
     if not config:
         warn(f"{one_line(folder)}: {CONFIG_NAME} is missing or damaged, left out")
         return None
-    if not summary and not {"mode", _SEED, "env", "low"} <= config.keys():
-        return None  # a config of another program
+    if not {"mode", _SEED, "env", "low"} <= config.keys():
+        if summary:
+            warn(f"{one_line(folder)}: is of another program, left out")
+        return None
     fault = fault_of(summary, config)
     if fault is not None:
         warn(one_line(f"{folder}: {fault}, left out"))

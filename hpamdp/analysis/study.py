@@ -237,7 +237,7 @@ def _own_settings(env: str, low: str) -> dict[str, Any]:
 def run_folders(folder: Path, seen: set[str], marks: Collection[str] = (SUMMARY_NAME,)) -> Iterator[Path]:
     """Yield the folders that hold a file with one of these names, and warn about broken links.
 
-    Links to folders are followed. Folders whose names begin with a dot are left out.
+    Links to folders are followed, except to folders above. Folders whose names begin with a dot are left out.
 
     Args:
         folder: the folder to search.
@@ -248,9 +248,11 @@ def run_folders(folder: Path, seen: set[str], marks: Collection[str] = (SUMMARY_
     def report(error: OSError) -> None:
         warn(one_line(f"{error.filename}: {error.strerror}, left out"))
 
+    start = Path(os.path.realpath(folder))
     for path, folders, files in os.walk(folder, onerror=report, followlinks=True):
         real = os.path.realpath(path)
-        if real in seen:  # a link may lead to a folder above itself
+        is_above = real != str(start) and start.is_relative_to(real)
+        if real in seen or is_above:  # by a link
             folders.clear()
             continue
         folders[:] = [name for name in folders if name not in (TENSORBOARD_NAME, WANDB_NAME) and name[0] != "."]
