@@ -15,7 +15,7 @@ from batched_players import random_player
 from hpamdp.env.pinball import maps, rules
 from hpamdp.env.pinball.environment import PinballEnv
 from hpamdp.env.pinball.options import SOURCE_MAPS
-from hpamdp.env.pinball.rules import DOWN, LEFT, NONE, REACHED, RIGHT, ROLLING, UP, PinballState
+from hpamdp.env.pinball.rules import LEFT, NONE, REACHED, RIGHT, ROLLING, PinballState
 
 FOLDER = Path(os.environ.get("HPAMDP_TRACES", "nowhere")) / "domains"
 each_map = pytest.mark.parametrize("name", SOURCE_MAPS)
@@ -169,23 +169,6 @@ def step(
         columns([place]), torch.tensor([action]), torch.tensor([strength], dtype=torch.float64), table_of(name)
     )
     return [float(column) for column in after[:4]], float(reward)
-
-
-@pytest.mark.parametrize(
-    ("action", "strength", "velocity"),
-    [(RIGHT, 1.0, (0.2, 0.0)), (UP, 0.5, (0.0, 0.1)), (LEFT, -1.0, (-0.2, 0.0)), (DOWN, -0.25, (0.0, -0.05))],
-)
-def test_a_push_changes_the_speed_by_a_fifth_of_its_strength_and_costs_5(action, strength, velocity):
-    (x, y, vx, vy), reward = step((0.2, 0.9, 0.0, 0.0), action, strength)
-    assert (vx, vy) == pytest.approx((0.995 * velocity[0], 0.995 * velocity[1]))
-    # A step covers the speed times the radius.
-    assert (x, y) == pytest.approx((0.2 + 0.02 * velocity[0], 0.9 + 0.02 * velocity[1]))
-    assert reward == -5.0
-
-
-def test_a_ball_that_nobody_pushes_slows_down_and_costs_1():
-    (x, y, vx, vy), reward = step((0.2, 0.9, 1.0, 0.0), NONE)
-    assert (x, y, vx, vy) == pytest.approx((0.22, 0.9, 0.995, 0.0)) and reward == -1.0
 
 
 def test_a_wall_mirrors_the_speed_and_a_corner_reverses_it():
