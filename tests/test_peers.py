@@ -60,19 +60,6 @@ def test_the_time_of_an_evaluation_is_not_part_of_the_time_of_training(protocol,
     assert [row["steps"] for row in rows] == list(range(0, 90, 10))
 
 
-def test_evaluations_become_rarer_and_a_learner_that_ends_early_is_scored_at_its_end(protocol, monkeypatch, tmp_path):
-    clock, curve = measured(protocol, monkeypatch, tmp_path / "a.csv", limit=600.0)
-    curve.begin()
-    for steps in range(1, 200):
-        clock.now += 1.0
-        assert not curve.after(steps)
-    clock.now += 0.5
-    curve.end(199)
-    times = [row["cpu_s"] for row in read_csv(tmp_path / "a.csv")]
-    assert times[-1] == 199.5 and times[:4] == [0.0, 5.0, 10.0, 15.0]
-    assert max(times[i + 1] - times[i] for i in range(len(times) - 1)) > 20.0
-
-
 def test_every_evaluation_plays_the_same_episodes_and_leaves_the_random_numbers_alone(protocol, tmp_path):
     curve = protocol.Curve("platform", {"greedy": leap}, {}, tmp_path / "a.csv")
     state = torch.get_rng_state()
@@ -85,12 +72,6 @@ def test_every_evaluation_plays_the_same_episodes_and_leaves_the_random_numbers_
 def row(seed, cpu_s, steps, score, learner="pdqn"):
     name = {"problem": "platform", "library": "hpamdp", "version": "1", "learner": learner, "acts": "greedy"}
     return {**name, "seed": seed, "limit_s": 600.0, "cpu_s": cpu_s, "steps": steps, "score": score, "success": score}
-
-
-def test_a_score_at_a_time_is_the_last_one_within_it_and_the_end_of_the_time_comes_a_batch_later():
-    study = module("study")
-    run = [row(300, cpu_s, 0, cpu_s / 1000) for cpu_s in (0.0, 50.0, 110.0, 601.0)]
-    assert [study.at(run, cpu_s)["cpu_s"] for cpu_s in (60.0, 120.0, 599.0, 600.0)] == [50.0, 110.0, 110.0, 601.0]
 
 
 def test_a_folder_with_trainings_of_different_lengths_or_with_a_run_twice_is_refused(tmp_path):

@@ -59,14 +59,12 @@ def success(env: BatchedEnv, player) -> tuple[Tensor, Tensor]:
         (lambda: CatchPointEnv(4000), 0.961, 8.5, 0.2),
         (lambda: CatchPointEnv(4000, max_steps=30), 0.997, None, None),
         (lambda: HardMoveEnv(4000, n=4), 0.962, 7.0, 0.2),
-        (lambda: HardMoveEnv(4000, n=6), 0.990, None, None),
-        (lambda: HardMoveEnv(4000, n=8), 0.993, None, None),
         (lambda: HardMoveEnv(2000, n=10), 0.995, 9.0, 0.2),
         (lambda: HardMoveEnv(4000, n=4, max_steps=25), 0.852, None, None),
         (lambda: MovingEnv(1000), 0.9995, 1.867, 0.01),
         (lambda: SlidingEnv(1000), 0.9985, 1.856, 0.01),
     ],
-    ids=["catch", "catch in 30", "hard 4", "hard 6", "hard 8", "hard 10", "hard 4 in 25", "moving", "sliding"],
+    ids=["catch", "catch in 30", "hard 4", "hard 10", "hard 4 in 25", "moving", "sliding"],
 )
 def test_the_scripted_player_reaches_the_known_figures(make, share, mean, error):
     succeeds, returns = success(make(), scripted)
@@ -251,14 +249,6 @@ def test_our_rules_play_as_the_reference_code(tool, name):
         assert report.worst <= tolerance
 
 
-def test_the_replay_counts_the_ticks_of_an_action(tool):
-    document = json.loads(recording("goal").read_text())
-    document["episodes"] = document["episodes"][:1]
-    assert tool.replay(document).largest["ticks"] == 0.0
-    document["episodes"][0]["steps"][0]["ticks"] += 1
-    assert tool.replay(document).largest["ticks"] == 1.0
-
-
 @pytest.mark.parametrize("change", ["reward", "state", "observation", "outcome", "truncated"])
 def test_the_replay_finds_a_difference(tool, change, tmp_path, capsys):
     document = json.loads(recording("catch_point").read_text())
@@ -277,20 +267,3 @@ def test_the_replay_finds_a_difference(tool, change, tmp_path, capsys):
     assert tool.main([str(path)]) == 1
     if change in ("outcome", "truncated"):
         assert "episode 1, step 3" in capsys.readouterr().out
-
-
-def test_a_file_that_is_no_recording_is_refused(tool, tmp_path, capsys):
-    for text, message in (
-        ("[]", "not a recording: it has no domain and episodes"),
-        ('{"domain": "platform", "episodes": []}', "not a recording: it lacks 'state_names'"),
-        ('{"domain": "platform", "schema": 2, "episodes": []}', "schema 2, but must be 1"),
-        ('{"domain": "platform", "state_names": [], "episodes": [{"initial": {"state": ["a"]}}]}', "not a recording: "),
-        ('{"domain": "catch_point", "state_names": [], "episodes": [7]}', "not a recording: "),
-        ('{"domain": "chess", "episodes": []}', "domain 'chess', but must be one of"),
-        ("{", "Expecting"),
-    ):
-        path = tmp_path / "bad.json"
-        path.write_text(text)
-        assert tool.main([str(path)]) == 2
-        printed = capsys.readouterr().err
-        assert message in printed and printed.count("\n") == 1

@@ -56,14 +56,6 @@ def test_every_command_of_a_page_has_a_line_of_its_own(page):
         assert not re.search(r"(^| )(python|hpamdp) [-\w]", comment), line
 
 
-def test_a_broken_link_is_found(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(
-        "# One heading\n[a](gone.md) [b](#one-heading) [c](#other) [d](page.md#one-heading) [e](https://x.y)\n"
-    )
-    assert broken_links(page) == ["gone.md", "#other"]
-
-
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 140
 

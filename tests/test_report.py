@@ -82,13 +82,6 @@ def test_all_tables_are_renewed_between_the_markers_and_nothing_else_of_the_page
     assert (experiments / "fine/README.md").read_text() == PAGE.replace(old, renewed)
 
 
-def test_a_page_in_which_nothing_changes_is_not_written(module, experiments):
-    module.report(experiments)
-    before = (experiments / "fine/README.md").stat().st_mtime_ns
-    module.report(experiments)
-    assert (experiments / "fine/README.md").stat().st_mtime_ns == before
-
-
 @pytest.mark.parametrize("name", ["README.md", "docs/results.md"])
 def test_the_front_page_and_the_documentation_get_the_tables_that_they_number(module, experiments, tmp_path, name):
     page = tmp_path / name

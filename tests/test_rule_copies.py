@@ -3,10 +3,7 @@
 import re
 from typing import get_args
 
-import pytest
-import torch
-
-from hpamdp.env.boatdock import figures, harbour, kernel, physics, planner, task
+from hpamdp.env.boatdock import figures, kernel, physics, planner, task
 from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.boatdock.play.episodes import Episode
 from hpamdp.env.boatdock.reference import HUMAN
@@ -49,24 +46,3 @@ def test_the_kernel_and_the_planner_have_the_tasks_constants():
     assert kernel._DOCKING_SPEED == task.DOCKING_SPEED and kernel._DOCK == task.DOCK_RADIUS
     assert planner.DOCK_RADIUS == physics.DOCK_RADIUS == task.DOCK_RADIUS
     assert planner.TANK == physics.TANK == task.TANK and planner.HARBOUR_RADIUS == task.HARBOUR_RADIUS
-
-
-def test_the_planners_presses_dock_by_the_rules_with_the_score_that_it_promises():
-    layout = harbour.fixed_layouts(64, 5)
-    keymap = torch.ones(64, dtype=torch.int32)
-    plans = planner.best_plans(layout, keymap)
-    for option in (task.INCONGRUENT, task.CONGRUENT):
-        x, y, fuel = layout.start_x, layout.start_y, torch.full((64,), task.TANK)
-        outcome = torch.full((64,), task.SAILING, dtype=torch.int32)
-        for i in range(planner.MAX_PRESSES):
-            controller = torch.full((64,), option, dtype=torch.int32)
-            dir_x, dir_y = harbour.direction(controller, keymap, plans.keys[:, option, i])
-            pressed = physics.press(
-                x, y, fuel, layout.goal_x, layout.goal_y, dir_x, dir_y, plans.durations[:, option, i]
-            )
-            moves = (outcome == task.SAILING) & (i < plans.num_presses[:, option])
-            x, y, fuel = (torch.where(moves, new, old) for new, old in zip(pressed[:3], (x, y, fuel), strict=True))
-            outcome = torch.where(moves, pressed.outcome, outcome)
-        assert (outcome == task.SUCCESS).all()
-        score = harbour.score(outcome, fuel / task.TANK)
-        assert score.tolist() == pytest.approx(plans.score[:, option].tolist(), abs=1e-3)

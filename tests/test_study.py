@@ -223,11 +223,6 @@ def test_a_curve_joins_runs_that_were_evaluated_at_different_times():
     assert at.tolist() == [0, 50, 100] and means.tolist() == [0.0, 0.5, 1.0] and not deviations.any()
 
 
-def test_a_curve_of_one_seed_has_no_deviation():
-    rows = [{"seed": 0, "frames": 10 * i, "score": float(i)} for i in range(3)]
-    assert curve(rows, "frames", "score")[2].tolist() == [0.0, 0.0, 0.0]
-
-
 def test_a_curve_goes_as_far_as_all_seeds_do():
     rows = [{"seed": 0, "frames": 10 * i, "score": float(i)} for i in range(4)]
     rows += [{"seed": 1, "frames": 10 * i, "score": i + 2.0} for i in range(3)]
@@ -265,21 +260,6 @@ def test_the_table_keeps_runs_that_ended_at_peoples_score_apart_from_full_length
     assert [(row["frames"], row["eval/score"]) for row in found["efficiency"]] == [(0.0, 0.0), (100.0, 2.0)]
 
 
-def test_few_steps_keeps_runs_that_were_left_running_apart(tmp_path):
-    learner = dict(augment="auto", num_members=5, posterior_sampling="auto", updates_per_step=10.0, horizon=2)
-    config = {"low": learner, "env": {"reward": "paper"}}
-    runs = []
-    for name, frames in (("short", 384), ("long", 2000)):
-        leave_run(tmp_path / name, low="pets")
-        (run,) = finished([tmp_path / name])
-        runs.append(Run(run.folder, {**run.summary, "frames": frames}, config))
-    gathered = study("few_steps").gather(runs)
-    assert [row["variant"] for row in gathered["curves"]] == [""] * 3
-    assert len(gathered["long"]) == 3 and gathered["augment"] == []
-    last = study("few_steps").long_table(gathered["long"]).splitlines()[-1]
-    assert last == "| congruent | 1 | 1.500 | 2.500 | 1 s |"
-
-
 def test_the_hierarchy_ranks_selectors_by_their_distances_to_the_ceilings_of_their_own_layouts():
     hierarchy = study("hierarchy")
     cell = {"low": "hppo", "total": 100, "uniform_option_steps": 0} | dict.fromkeys(hierarchy.COLUMNS, 0.5)
@@ -293,16 +273,6 @@ def test_the_hierarchy_ranks_selectors_by_their_distances_to_the_ceilings_of_the
     first, second = hierarchy.table(rows).splitlines()[2:]
     assert first.startswith("| ucb | hppo | 100, 0 | 3 | 3.410 ± 0.010 | 0.090 | +0.100 (+0.077 to +0.123) |")
     assert second.startswith("| actor | hppo | 100, 0 | 3 | 3.510 ± 0.010 | 0.190 |  |")
-
-
-def test_the_map_of_the_hierarchy_shows_the_length_of_most_selectors_whatever_the_number_of_their_runs():
-    rows = [
-        {"low": "hppo", "total": total, "uniform_option_steps": 0, "high": high, "seed": seed}
-        for total, highs, seeds in ((200, ("ucb", "actor", "exp3"), 3), (400, ("ucb",), 20))
-        for high in highs
-        for seed in range(seeds)
-    ]
-    assert {row["total"] for row in study("hierarchy").of_the_map(rows)} == {200}
 
 
 def test_offline_compares_data_sets_after_the_same_number_of_updates():
@@ -410,18 +380,6 @@ def test_a_curve_that_is_given_twice_or_is_shorter_than_those_of_its_cell_is_ref
         add(of_run(1, 200))
     add(of_run(1, 384))
     assert read_csv(tmp_path / "curves.csv") == of_run(0, 384) + of_run(1, 384)
-
-
-def test_domains_and_pearl_refuse_a_run_that_is_given_twice(tmp_path, monkeypatch):
-    domains, twice = study("domains"), {**_row("pdqn", 100), "frames": 200}
-    monkeypatch.setattr(domains, "HERE", tmp_path)
-    monkeypatch.setattr(domains, "gathered", lambda *_, **__: ([twice, twice], []))
-    with pytest.raises(SystemExit, match="two runs of goal, pdqn, 200, 100; nothing was written"):
-        domains.main([str(tmp_path)])
-    curve_of_run = read_csv(EXPERIMENTS / "pearl" / "curves.csv")[:2]
-    write_tables(tmp_path, {"one": curve_of_run, "two": curve_of_run})
-    with pytest.raises(SystemExit, match=r"two runs of pinball, .*; nothing was written"):
-        study("pearl").gather(tmp_path)
 
 
 def test_nothing_is_written_if_there_are_no_new_runs(tmp_path):
@@ -533,30 +491,6 @@ def test_options_refuses_cells_of_runs_with_different_settings():
         options.standing([*rows, rows[0]], options.PAIR)
 
 
-@pytest.mark.parametrize(
-    ("script", "words", "complaint"),
-    [
-        ("train_rooms", ["high=actor", "low=hppo,hpo"], "low=hpo: no such choice.*no run was trained"),
-        ("train_crossing", ["high=actor,acto", "low=hppo"], "high=acto: no such choice.*no run was trained"),
-        ("train_rooms", ["low"], "give words such as low=hppo,pdqn, not low"),
-        ("train_boats", ["low=hppo"], "high=... and low=... among them; nothing was trained"),
-    ],
-)
-def test_scripts_of_options_check_all_runs_before_they_train(script, words, complaint, monkeypatch):
-    monkeypatch.syspath_prepend(str(EXPERIMENTS / "options"))
-    module = load_script(EXPERIMENTS / "options" / f"{script}.py")
-
-    def train(given):
-        raise AssertionError(f"trains {given}")
-
-    with pytest.raises(SystemExit, match=f"(?s){complaint}"):
-        if script == "train_boats":
-            monkeypatch.setattr(module, "train", train)
-            module.main(words)
-        else:
-            module.train_all(words, module.RECIPE, train, module.FILE, module.RUN)
-
-
 def test_scripts_of_options_show_the_row_of_a_run_that_its_table_refuses(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(EXPERIMENTS / "options"))
     module = load_script(EXPERIMENTS / "options" / "train_rooms.py")
@@ -609,38 +543,12 @@ def change_summary(folder, **values):
     file.write_text(json.dumps(json.loads(file.read_text()) | values))
 
 
-def test_a_folder_with_one_curve_leaves_pearls_other_curves_as_they_are(tmp_path):
-    pearl = study("pearl")
-    stored = read_csv(EXPERIMENTS / "pearl" / "curves.csv")
-    again = [{**stored[0], "score": -5.0}]
-    write_tables(tmp_path, {"one": again})
-    rows = pearl.merged(stored, pearl.gather(tmp_path))
-    is_same = lambda row: all(row[name] == stored[0][name] for name in (*pearl.LEARNER, "seed"))  # noqa: E731
-    assert [row["score"] for row in rows if is_same(row)] == [-5.0]
-    assert [row for row in rows if not is_same(row)] == [row for row in stored if not is_same(row)]
-
-
 def test_runs_are_added_to_a_csv_file_in_the_place_of_repeated_ones(tmp_path):
     write_tables(tmp_path, {"results": [_row("pdqn", 0), _row("pdqn", 2)]})
     again = {**_row("pdqn", 2), "success": 0.1}
     add_to_tables(tmp_path, {"results": [again, _row("hyar", 1)]}, ("domain", "learner", "seed"))
     rows = [(row["learner"], row["seed"], row["success"]) for row in read_csv(tmp_path / "results.csv")]
     assert rows == [("hyar", 1, 0.7), ("pdqn", 0, 0.7), ("pdqn", 2, 0.1)]
-
-
-def test_numbers_come_before_texts_in_a_column_of_both(tmp_path):
-    write_tables(tmp_path, {"results": [{"fleet": "new", "seed": 1}]})
-    add_to_tables(tmp_path, {"results": [{"fleet": each, "seed": 1} for each in (16, 4)]}, ("fleet", "seed"))
-    assert [row["fleet"] for row in read_csv(tmp_path / "results.csv")] == [4, 16, "new"]
-
-
-def test_domains_says_what_each_learner_was_given_as_its_settings_say():
-    domains = study("domains")
-    config = {"low": {"gamma": 0.9, "greedy_samples": 40, "initial_parameters": "domain", "augment": True}}
-    run = Run(Path(), {"low": "pdqn"}, config)
-    row = {"domain": "goal", "learner": "pdqn", **domains.given(run)}
-    line = domains.given_table([row, row | {"domain": "platform"}]).splitlines()[-1]
-    assert line == "| pdqn | goal, platform | domain | mapped steps | 0.9 | 40 variations | 1 |"
 
 
 def test_domains_ranks_learners_by_the_plain_mean():
@@ -705,79 +613,3 @@ def test_a_run_of_another_sharing_replaces_no_stored_run_with_unknown_boats(tmp_
     for new, num in ((row, 1), (other, 2)):
         add_to_tables(tmp_path, {"results": [new]}, study_of.RUN)
         assert len(read_csv(tmp_path / "results.csv")) == num
-
-
-def test_all_scripts_of_studies_print_to_streams_that_may_close():
-    """Those that run other libraries print nothing."""
-    scripts = {script: script.read_text() for script in sorted(EXPERIMENTS.rglob("*.py"))}
-    printing = {script: text for script, text in scripts.items() if "print(" in text and "__main__" in text}
-    assert len(printing) > 30
-    for script, text in printing.items():
-        assert "exit_code(" in text.rpartition('if __name__ == "__main__":')[2], script
-
-
-PINBALL = {"map": "hard", "start": "map", "training_start": "both"}
-ARM = {"task": "assembly", "reward": "sparse", "actions": "primitives", "reach": 0.4, "negative_distances": False}
-CIRCUIT = {"task": "ghz", "gate_set": "published", "target_number": None, "begin": "empty"}
-
-
-@pytest.mark.parametrize(
-    ("env", "settings", "name"),
-    [
-        ("traffic", {"demand": "rush", "network": "corridor", "strategies": True}, "rush, corridor, strategies"),
-        ("pinball", PINBALL, "hard, training_start=both"),
-        (
-            "pinball",
-            PINBALL | {"map": "simple", "grouping": {"a": [0], "b": [1]}},
-            "simple, training_start=both, 2 options",
-        ),
-        ("primitives", ARM | {"decisions": 5}, "assembly, sparse"),
-        (
-            "primitives",
-            ARM | {"decisions": 5, "actions": "all", "reach": 1.0},
-            "assembly, sparse, actions=all, reach=1.0",
-        ),
-        ("circuit", CIRCUIT | {"begin": "known"}, "ghz, begin=known"),
-    ],
-)
-def test_runs_on_different_problems_have_different_names(tmp_path, env, settings, name):
-    run = Run(tmp_path, {"env": env}, {"env": settings})
-    assert study("problems").problem_of(run) == f"{env} {name}"
-
-
-@pytest.mark.parametrize(
-    ("summary", "env", "low", "name"),
-    [
-        ({"env": "office", "high": "none", "low": "pdqn"}, {}, {}, "pdqn"),
-        ({"env": "office", "high": "ucb", "low": "random"}, {}, {}, "ucb"),
-        ({"env": "circuit", "high": "meta_critic", "low": "planner"}, {}, {}, "meta_critic over planner"),
-        ({"env": "pinball"}, {"map": "hard"}, {"discrete_entropy": 0.01}, "hppo, discrete_entropy=0.01"),
-        ({"env": "pinball"}, {"map": "simple"}, {"discrete_entropy": 0.01}, "hppo"),
-        ({"env": "circuit"}, {}, {"min_scale_final": 0.003}, "hppo, noise to 0.003"),
-        ({"env": "primitives"}, {"actions": "primitives"}, {"lr": 1e-3}, "hppo, lr=0.001"),
-        ({"env": "primitives"}, {"actions": "large_steps"}, {"lr": 1e-3}, "hppo"),
-    ],
-)
-def test_a_learner_under_a_selector_or_with_earlier_settings_has_another_name(tmp_path, summary, env, low, name):
-    run = Run(tmp_path, {"high": "none", "low": "hppo", **summary}, {"env": env, "low": low})
-    assert study("problems").learner_of(run) == name
-
-
-def test_the_table_of_exploration_has_a_column_for_each_kind_even_for_options_with_a_bonus(tmp_path):
-    exploration = study("exploration")
-    row = {"problem": "office", "learner": "hppo", "frames": 1, "score": 0.5, "success": 0.5, "solved_after": ""}
-    config = {"choices": {"exploration": "counts"}}
-    kind = exploration.kind_of(Run(tmp_path, {"env": "office", "high": "meta_critic"}, config))
-    rows = [{**row, "exploration": kind, "seed": seed, "cpu_s": 2.0} for seed in range(3)]
-    head, _, line = exploration.table(rows).splitlines()
-    assert head.endswith(f"| novelty | options | {kind} |")
-    assert line.endswith("| 0.500 ± 0.000; 50 %; never, never, never; 2 s |")
-
-
-@pytest.mark.parametrize(
-    ("env", "weight", "name"),
-    [("office", 50.0, "counts, weight=50"), ("office", 25.0, "counts"), ("pinball", 50.0, "counts")],
-)
-def test_other_weights_of_counted_visits_are_told_apart_on_office(tmp_path, env, weight, name):
-    config = {"choices": {"exploration": "counts"}, "exploration": {"weight": weight}}
-    assert study("problems").exploration_of(Run(tmp_path, {"env": env}, config)) == name

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import ClassVar
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from conftest import make_config
-from scripts import load_script
 
 from hpamdp.env.traffic import lights
 from hpamdp.env.traffic.demand import HELD_OUT, KINDS, NUM_DEMANDS, Demand, draw
@@ -167,18 +165,3 @@ def test_the_files_have_the_roads_turns_and_programs_that_the_code_names(network
 def test_an_observation_has_a_name_for_each_entry():
     assert len(observation_names("crossing")) == 29 and len(observation_names("corridor")) == 93
     assert all(len({*observation_names(network)}) == len(observation_names(network)) for network in NETWORKS)
-
-
-def test_the_table_of_the_study_says_by_how_much_the_agents_delay_is_lower():
-    study = load_script(Path(__file__).resolve().parent.parent / "experiments/problems/study.py")
-    name = {"problem": "traffic rush", "learner": "pdqn", "exploration": "none", "frames": 100}
-    results = {"queue": 10.0, "stops": 1.0, "throughput": 2500.0}
-    delays = {study.AGENT: (20.0, 21.0, 22.0), "max_pressure": (25.0, 28.0, 22.0)}
-    rows = [
-        {**name, "seed": seed, "player": player, "delay": of_player[seed], **results}
-        for seed in range(3)
-        for player, of_player in delays.items()
-    ]
-    *_, agent, other = study.traffic_table(rows).splitlines()
-    assert agent.startswith("| traffic rush | pdqn | 100 | 3 | agent | 21.0 ± 1.0 |  |")
-    assert other.startswith("| traffic rush | pdqn | 100 | 3 | max pressure | 25.0 ± 3.0 | 15.0 % |")

@@ -98,11 +98,3 @@ def test_the_yaml_files_that_tutorials_show_are_those_of_the_examples():
     for page in PAGES:
         for shown in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S):
             assert shown in files, page.name
-
-
-def test_a_tutorial_that_prints_something_else_fails(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("```python\nprint(1)\n```\n\n```text\n2\n```\n")
-    assert forked(follow, page, tmp_path) == 1
-    page.write_text("```python\nprint(1)\n```\n\n```text\n1\n```\n")
-    assert forked(follow, page, tmp_path) == 0
