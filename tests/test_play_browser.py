@@ -2,30 +2,20 @@
 (Debian: `apt-get install chromium`) or no Playwright (`hpamdp[browser]`)."""
 
 import json
-import os
 import shutil
-import signal
 import statistics
-import subprocess
-import sys
 import threading
 import time
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
-import torch
-from conftest import compose_config
-from play_players import docked
 
-from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
 from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
 from hpamdp.run.page_server import EpisodeFile, PageServer
 from hpamdp.run.play import export
-from hpamdp.run.train import run
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
@@ -208,17 +198,6 @@ def test_a_new_press_ends_the_one_before_and_a_lost_focus_ends_it_too(player):
     assert player.get("events.map((event) => event.type)") == ["down", "down", "up", "blur", "up"]
 
 
-def test_an_episode_that_was_left_open_for_an_hour_begins_anew(player):
-    player.board(layout=DOWN_THE_MIDDLE)
-    player.page.evaluate("hpamdpGame.origin -= 3.7e6")
-    player.hold("k", 0.1)
-    player.until("screen === 'choose'")
-    assert "more than an hour" in player.page.inner_text("#result")
-    player.board()
-    player.hold("k", 0.3)
-    player.until("state?.legs.length === 1")
-
-
 def test_auto_repeat_is_no_press(player):
     player.board(layout=DOWN_THE_MIDDLE)
     for _ in range(5):
@@ -226,18 +205,6 @@ def test_auto_repeat_is_no_press(player):
         time.sleep(0.05)
     player.page.keyboard.up("k")
     assert player.get("events.length") == 2
-
-
-def test_nothing_is_stored_without_consent(browser, page_data, tmp_path):
-    with serving(tmp_path / "played.jsonl", page_data) as address:
-        context = browser.new_context()
-        player = Player(context, address, consents=False)
-        player.board(layout=DOWN_THE_MIDDLE)
-        player.hold("k", 1.8)
-        player.ends()
-        time.sleep(0.3)
-        assert player.get("stored.length") == 0 and not (tmp_path / "played.jsonl").exists()
-        context.close()
 
 
 def test_fingers_steer_on_a_narrow_screen_on_which_everything_fits(browser, page_data, tmp_path):
@@ -259,26 +226,6 @@ def test_fingers_steer_on_a_narrow_screen_on_which_everything_fits(browser, page
         context.close()
 
 
-def test_episodes_wait_for_a_server_that_is_gone_and_two_pages_lose_none(browser, page_data, tmp_path):
-    path = tmp_path / "played.jsonl"
-    with serving(path, page_data) as address:
-        context = browser.new_context()
-        players = [Player(context, address) for _ in range(2)]
-        context.set_offline(True)
-        for player in players:
-            player.page.bring_to_front()
-            player.board(layout=DOWN_THE_MIDDLE)
-            player.hold("k", 1.8)
-            player.ends()
-        time.sleep(0.2)
-        assert [player.get("unsent.length") for player in players] == [1, 1] and not path.exists()
-        context.set_offline(False)
-        for player in players:
-            player.until("sent === 1")
-        assert len({json.loads(line)["player"] for line in path.read_text().splitlines()}) == 2
-        context.close()
-
-
 def test_the_exported_page_plays_from_files_and_gives_its_episodes_as_a_file(browser, tmp_path):
     page = BoatPage(seed=0)
     export(page, page.data([], has_server=False), tmp_path / "site")
@@ -294,37 +241,6 @@ def test_the_exported_page_plays_from_files_and_gives_its_episodes_as_a_file(bro
     (episode,) = episodes.read(tmp_path / "mine.jsonl").values()
     assert episodes.check(episode.model_dump(mode="json")).outcome == "too_fast" and player.errors == []
     context.close()
-
-
-def play_plan(player, boat):
-    """Play the best plan of a boat from rest to rest, as well as a process can that sleeps between."""
-    player.until("screen === 'choose'")
-    plan = player.get(f"layout.best.{boat}.presses")
-    player.board(boat)
-    for press in plan:
-        player.hold(KEYS[press["key"]], press["duration"] + 0.006)
-        time.sleep((1.0 + physics.GLIDE) * press["duration"] * 0.49 + 0.15)
-    for _ in range(6):  # if it fell short
-        time.sleep(0.25)
-        if player.get("screen") != "sail":
-            break
-        player.hold("k", 1.6)
-    return player.ends()
-
-
-def test_what_was_played_by_keys_trains_learners_beside_an_agents_track(player, tmp_path):
-    for turn in range(4):
-        boat = ("congruent", "incongruent")[turn % 2]
-        result = play_plan(player, boat)
-        assert result["controller"] == boat
-        player.page.keyboard.press("Enter")
-    assert len(stored(player, 4)) == 4
-    data = ["data=recorded", f"data.path={player.file}", "mode=offline", "offline.updates=5", "eval.layouts=8"]
-    for low in ("bc", "td3_bc"):
-        words = [f"low={low}", "high=linucb", *data, f"env.recording={player.file}"]
-        assert run(compose_config(words), tmp_path / low, words) == 0
-        summary = json.loads((tmp_path / low / "summary.json").read_text())
-        assert "you" in summary["references"] and "human" not in summary["references"]
 
 
 def test_a_block_ends_with_the_curve(player):
@@ -356,92 +272,6 @@ def test_enter_on_a_button_does_what_the_button_says(player):
     player.page.focus("#again")
     player.page.keyboard.press("Space")
     assert player.get("screen") == "start"
-
-
-def test_what_waits_for_the_server_is_said_for_as_long_as_it_waits_also_after_a_refusal(player):
-    notice = player.page.locator("#notice")
-    for turn in range(2):
-        if turn == 0:
-            player.page.route("**/episodes", lambda route: route.fulfill(status=422, body="nobody plays so"))
-        else:
-            player.page.unroute("**/episodes")
-            player.page.context.set_offline(True)
-        player.board(layout=DOWN_THE_MIDDLE)
-        player.hold("k", 1.8)
-        player.ends()
-        player.until("refused.length === 1" if turn == 0 else "unsent.length === 1")
-        time.sleep(0.3)
-        assert "1 episode was refused (nobody plays so)" in notice.inner_text()
-        assert ("1 episode waits for the server" in notice.inner_text()) == (turn == 1)
-        player.page.keyboard.press("Enter")
-    player.page.context.set_offline(False)
-    player.until("unsent.length === 0")
-    time.sleep(0.1)
-    assert "waits" not in notice.inner_text() and "refused" in notice.inner_text()
-
-
-@pytest.mark.parametrize("has_server", [True, False])
-def test_the_page_asks_before_it_forgets_episodes_that_are_nowhere_else(browser, page_data, tmp_path, has_server):
-    with serving(tmp_path / "played.jsonl", {**page_data, "has_server": has_server}) as address:
-        context = browser.new_context(accept_downloads=True)
-        player = Player(context, address)
-        asked = []
-        player.page.on("dialog", lambda dialog: asked.append(dialog.type) or dialog.accept())
-        player.board(layout=DOWN_THE_MIDDLE)
-        player.hold("k", 1.8)
-        player.ends()
-        if has_server:
-            player.until("sent === 1")
-            player.page.reload()
-            assert asked == []
-        else:
-            player.page.reload()
-            assert asked == ["beforeunload"]
-        context.close()
-
-
-def test_the_command_serves_the_page_and_ends_on_ctrl_c(browser, tmp_path):
-    words = ["play", "--no-browser", "--port", "0", "--agent", "none", "--to", str(tmp_path / "a.jsonl")]
-    root = Path(__file__).resolve().parent.parent
-    process = subprocess.Popen(
-        [sys.executable, "-m", "hpamdp.cli", *words], cwd=tmp_path, text=True, stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(root)},
-    )  # fmt: skip
-    try:
-        address = process.stdout.readline().split()[0].rstrip(":")
-        context = browser.new_context()
-        player = Player(context, address)
-        player.board(layout=DOWN_THE_MIDDLE)
-        player.hold("k", 1.8)
-        player.ends()
-        player.until("sent === 1")
-        context.close()
-    finally:
-        process.send_signal(signal.SIGINT)
-        code = process.wait(20)
-    assert code == 0 and "1 episodes added" in process.stdout.read()
-    assert len(episodes.read(tmp_path / "a.jsonl")) == 1
-
-
-def test_the_page_of_the_browser_and_python_know_the_same_episode(browser, page_data, tmp_path):
-    (made,) = docked(1)
-    with serving(tmp_path / "a.jsonl", page_data) as address:
-        context = browser.new_context()
-        page = context.new_page()
-        page.goto(address)
-        found = page.evaluate(
-            """(episode) => {
-                const physics = makePhysics(window.HPAMDP_DATA.rules);
-                const name = episode.controller === "congruent" ? "congruent" : `incongruent_${episode.keymap}`;
-                const directions = window.HPAMDP_DATA.directions[name];
-                return physics.sail(episode, { directions }, physics.settle(episode.events), Infinity);
-            }""",
-            made,
-        )
-        context.close()
-    assert found["outcome"] == made["outcome"] == "success"
-    assert found["fuel"] / physics.TANK == pytest.approx(made["fuel"], abs=1e-12)
-    torch.testing.assert_close(torch.tensor([found["x"], found["y"]]), torch.tensor(made["end"]), atol=1e-6, rtol=0.0)
 
 
 @pytest.mark.parametrize("boats", [1, 2])
