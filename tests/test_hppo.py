@@ -1,11 +1,10 @@
 """H-PPO: ratios, advantages, which rows count, and learning a problem with a known optimum."""
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
-from conftest import global_generators_unmoved, make_config
+from conftest import global_generators_unmoved
 from tensordict import TensorDict
 from torch.distributions import Categorical, Normal
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -21,11 +20,8 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
-    hidden_dims=[32, 32], critic_hidden_dims=[32, 32], vector_products=False, initial_parameters="none",
-    initial_scale=0.5, min_scale=0.05, min_scale_final=0.01,
-    max_scale=1.0, epochs=4, minibatch_size=256, clip=0.2, gamma=0.9, gae_lambda=0.8, lr=3e-3, lr_final=3e-4,
-    critic_weight=0.5, discrete_entropy=0.01, parameter_entropy=0.0, entropy_final=0.1, anneal_steps=40_000,
-    max_grad_norm=1.0, greedy_discrete="most_probable",
+    hidden_dims=[32, 32], critic_hidden_dims=[32, 32], min_scale=0.05, min_scale_final=0.01, epochs=4, gamma=0.9,
+    gae_lambda=0.8, lr=3e-3, lr_final=3e-4, anneal_steps=40_000,
 )  # fmt: skip
 
 
@@ -116,15 +112,6 @@ def test_actor_and_critic_see_products_of_vectors():
         torch.testing.assert_close(output(turned), output(state))
         assert not torch.allclose(output(other), output(state), atol=1e-3)
     assert learner.exported() is None, "the actors of pages have no products"
-
-
-def test_the_parameters_of_other_actions_do_not_change_the_likelihood():
-    learner = make()
-    td = random_rows(learner, 50, 2)
-    other = ~SPECS.parameter_mask[td[keys.DISCRETE]]
-    changed = td[RAW] + 7.0 * other
-    now = learner.actor(td[keys.OBSERVATION])
-    torch.testing.assert_close(now.log_prob(td[keys.DISCRETE], changed), now.log_prob(td[keys.DISCRETE], td[RAW]))
 
 
 def test_the_ratios_are_one_before_the_first_update_also_of_what_an_older_policy_did():
@@ -276,18 +263,6 @@ def test_the_policy_samples_from_its_distribution():
     torch.testing.assert_close(td[RAW].std(0), torch.full((3,), 0.5), atol=0.02, rtol=0)
 
 
-def test_discrete_actions_without_parameters_are_learned_too():
-    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()))
-    for _ in range(15):
-        td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(512, 1, 4)}, [512, 1]))
-        is_end = torch.ones(512, 1, 1, dtype=torch.bool)
-        reward = (td[keys.DISCRETE] == 1).float().unsqueeze(-1)
-        td["next"] = {keys.OBSERVATION: td[keys.OBSERVATION], keys.REWARD: reward}
-        td["next"].update({keys.DONE: is_end, keys.TERMINATED: is_end})
-        learner.learn(td, everything(td))
-    assert td[keys.PARAMETERS].shape == (512, 1, 0) and reward.mean() > 0.95
-
-
 def test_the_critics_own_learning_rate_falls_with_that_of_the_actors():
     learner = make(anneal_steps=200, minibatch_size=2, critic_lr=3e-2)
     td = random_rows(learner, 50, 2)
@@ -313,19 +288,6 @@ def test_further_passes_of_the_critic_leave_the_actors_alone():
     assert errors[1] < errors[0]
     for name, parameter in once.actor.named_parameters():
         assert torch.equal(parameter, more.actor.get_parameter(name)), name
-
-
-def test_the_published_form_has_the_settings_of_hyars_code():
-    settings = make_config(["low=hppo_published", "high=none", "env=platform"]).low.settings
-    expected = dict(
-        hidden_dims=(256, 256), critic_hidden_dims=(256, 256), minibatch_size=50, epochs=2, critic_epochs=8, lr=1e-4,
-        lr_final=1e-4, critic_lr=1e-3, clip=0.2, gamma=0.99, gae_lambda=0.95, discrete_entropy=0.0,
-        parameter_entropy=0.0, greedy_discrete="sampled", initial_parameters="none", reward_scale=1.0,
-        critic_weight=1.0, min_scale=1e-4, min_scale_final=1e-4, max_scale=100.0, max_scale_final=None,
-        max_grad_norm=1e6,
-    )  # fmt: skip
-    assert {name: settings[name] for name in expected} == expected
-    assert settings["initial_scale"] == pytest.approx(math.exp(-0.5), abs=1e-3)
 
 
 def test_learning_rate_and_scale_are_annealed_over_the_steps_of_the_whole_run():

@@ -17,11 +17,9 @@ from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
-    hidden_dims=[64, 64], initial_parameters="none",
-    min_scale=0.01, max_scale=1.0, discrete_temperature=0.05, parameter_temperature=0.03,
-    tune_discrete_temperature=True, tune_parameter_temperature=True, discrete_target_entropy=0.1,
-    parameter_target_entropy=-1.5, temperature_lr=3e-3, warmup_steps=1000, buffer_size=20_000, batch_size=64,
-    updates_per_step=0.12, augment=False, policy_delay=2, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
+    hidden_dims=[64, 64], min_scale=0.01, discrete_temperature=0.05, parameter_temperature=0.03,
+    discrete_target_entropy=0.1, parameter_target_entropy=-1.5, temperature_lr=3e-3, warmup_steps=1000,
+    buffer_size=20_000, batch_size=64, updates_per_step=0.12, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
 )  # fmt: skip
 
 
@@ -134,13 +132,6 @@ def test_a_temperature_falls_above_its_target_rises_below_and_stays_if_fixed(exc
     assert change * excess < -1e-6 if is_tuned else abs(change) < 1e-6
 
 
-def test_updates_leave_fixed_temperatures_unchanged():
-    learner = make(tune_discrete_temperature=False, tune_parameter_temperature=False, policy_delay=1)
-    before = learner.temperatures()
-    learner.update_once(sample())
-    assert learner.temperatures() == before
-
-
 def test_the_value_that_selectors_compare_is_that_of_the_greedy_action_without_entropy():
     learner, td = make(), states(50)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
@@ -164,19 +155,6 @@ def test_the_greedy_policy_samples_nothing_and_the_exploring_one_is_uniform_in_t
         learner.actor.net[-1].bias[-3:] = -50.0  # the smallest deviation
     sampled = SPECS.to_unit(learner.policy(td.clone())[keys.PARAMETERS])
     assert (sampled - SPECS.to_unit(greedy[keys.PARAMETERS])).std() < 0.02
-
-
-def test_discrete_actions_without_parameters_are_learned_too():
-    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_steps=100)
-    td = learner.policy(states(200))
-    assert td[keys.PARAMETERS].shape == (200, 0)
-    is_end = torch.ones(200, 1, dtype=torch.bool)
-    reward = td[keys.DISCRETE].float().unsqueeze(-1)
-    td["next"] = {keys.OBSERVATION: td[keys.OBSERVATION], keys.REWARD: reward, keys.TERMINATED: is_end}
-    for _ in range(4):
-        learner.learn(td, is_end.squeeze(-1))
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert (learner.policy(states(100))[keys.DISCRETE] == 1).all()
 
 
 @pytest.mark.parametrize("is_random", [True, False])

@@ -14,20 +14,9 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
-    twin=True, discrete="greedy",
-    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, codec_inputs="concatenated", predicted_change="standardised",
-    change_unit="warmup",
-    codec_loss="sum", reconstruction_weight=1.0, codec_batch_size=None, codec_episodes=None, codec_first_episode=0,
-    latent_range_every=100, correction_error="mean", critic_window=None, inverting_gradients=False,
-    actor_max_grad_norm=None, noise_initial=None, noise_episodes=1000,
-    hidden_dims=[64, 64], layer_norm=False, warmup_steps=2000,
-    codec_pretrain_updates=700, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
-    latent_coverage=0.96, correction_factor=5.0, parameter_tolerance=None, relabelling="mean",
-    buffer_size=20_000, batch_size=64, updates_per_step=0.25, gamma=0.9, reward_scale=1.0, tau=0.02, actor_lr=1e-3,
-    critic_lr=1e-3, augment=False, lr_final_fraction=1.0,
-    lr_steps=0, policy_delay=2, target_smoothing=0.1, target_smoothing_clip=0.2, parameter_noise=0.1,
-    preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
-    greedy_samples=0, greedy_noise=0.3, epsilon_final=0.05, epsilon_steps=3000,
+    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], codec_pretrain_updates=700,
+    relabelling="mean", buffer_size=20_000, batch_size=64, gamma=0.9, tau=0.02, critic_lr=1e-3, lr_final_fraction=1.0,
+    lr_steps=0, epsilon_steps=3000,
 )  # fmt: skip
 
 
@@ -107,16 +96,6 @@ def test_a_random_action_is_encoded_when_sampled(trained):
     assert is_random.any() and is_corrected[is_random].all() and latent.isfinite().all()
 
 
-def test_parameters_stay_in_bounds_and_the_greedy_policy_is_deterministic(trained):
-    td = TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 3}, [500])
-    low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
-    parameters = trained.policy(td.clone())[keys.PARAMETERS]
-    assert (parameters >= low).all() and (parameters <= high).all()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        first, second = trained.policy(td.clone()), trained.policy(td.clone())
-    assert torch.equal(first[keys.PARAMETERS], second[keys.PARAMETERS]) and not first[LATENT].isnan().any()
-
-
 @pytest.mark.parametrize("discrete", ["greedy", "nearest"])
 def test_the_greedy_policy_takes_the_best_of_the_actors_latent_actions_and_their_variations(discrete):
     torch.manual_seed(0)
@@ -133,33 +112,6 @@ def test_the_greedy_policy_takes_the_best_of_the_actors_latent_actions_and_their
         )
     assert (values.argmax(0) > 0).float().mean() > 0.6, "an untrained actor is nowhere near the maximum"
     assert torch.equal(learner.policy.variations[:, :3], torch.zeros(40, 3)), "e says which discrete action it is"
-
-
-def test_the_state_change_is_scaled_by_its_standard_deviation(trained):
-    change = trained.buffer[:]["next_state"] - trained.buffer[:]["state"]
-    expected = change[: OPTIONS["warmup_steps"]].std(0).clamp(min=1e-2)
-    torch.testing.assert_close(trained.codec.change_scale, expected)
-
-
-def test_only_masked_transitions_are_stored():
-    learner = make(warmup_steps=10_000)
-    learner.learn(one_step_rows(learner, 100), torch.arange(100) < 30)
-    assert learner.frames == 30 and len(learner.buffer) == 30
-
-
-def test_rewards_are_stored_scaled():
-    learner = make(reward_scale=0.1, warmup_steps=10_000)
-    rows = one_step_rows(learner, 50)
-    learner.learn(rows, torch.ones(rows.shape, dtype=torch.bool))
-    torch.testing.assert_close(learner.buffer[:]["reward"], 0.1 * rows["next", keys.REWARD].flatten())
-
-
-def test_targets_bootstrap_past_truncation_and_not_past_termination(trained):
-    rows = trained.buffer.sample(64)
-    rows["discount"] = torch.zeros(64)
-    torch.testing.assert_close(trained.target(rows), rows["reward"])
-    rows["discount"] = torch.full((64,), 0.9)
-    assert (trained.target(rows) - rows["reward"]).abs().mean() > 0.05
 
 
 def test_the_greedy_form_takes_the_discrete_action_with_the_highest_q():
@@ -237,8 +189,9 @@ class TwoHills(torch.nn.Module):
         return hills.sum(-1).unsqueeze(0)
 
 
-@pytest.mark.parametrize("discrete", ["greedy", "nearest"])
-@pytest.mark.parametrize(("search_samples", "expected"), [(0, 0.6), (16, -0.5)])
+@pytest.mark.parametrize(
+    ("discrete", "search_samples", "expected"), [("greedy", 0, 0.6), ("greedy", 16, -0.5), ("nearest", 16, -0.5)]
+)
 def test_the_search_brings_z_to_a_higher_hill_that_the_gradient_does_not_see(discrete, search_samples, expected):
     torch.manual_seed(0)
     learner = make(discrete=discrete, search_samples=search_samples, search_weight=10.0, actor_lr=1e-2, latent_dim=2)
@@ -268,17 +221,6 @@ def test_the_search_tries_no_forbidden_action(discrete):
     else:
         tried = learner.codec.nearest_discrete(torch.cat(asked, 1)[..., :3].flatten(0, 1))
         assert tried.unique().tolist() == [0, 2]
-
-
-def test_the_penalty_brings_the_actor_back_from_the_bounds():
-    torch.manual_seed(0)
-    learner = make(preactivation_penalty=0.1, actor_lr=1e-2)
-    with torch.no_grad():
-        learner.actor.net[-1].bias.fill_(8.0)
-    state = torch.rand(64, 4) * 2 - 1
-    for _ in range(300):
-        learner.gradient_step("actor", learner.actor_loss, state, None)
-    assert learner.actor.raw(state).abs().max() < 3.0
 
 
 def test_ddpg_has_one_critic_an_actor_update_each_time_and_no_noise_in_its_targets():
@@ -333,17 +275,6 @@ def test_with_a_tolerance_a_latent_is_outdated_exactly_where_it_decodes_to_other
     _, is_corrected = trained.corrected_latent(rows)
     trained.dynamics_error.copy_(usual)
     assert not is_corrected.any()
-
-
-@pytest.mark.parametrize("layer_norm", [False, True])
-def test_layer_norm_bounds_what_critics_promise_far_from_all_they_have_seen(layer_norm):
-    torch.manual_seed(0)
-    critics = make(layer_norm=layer_norm).critics
-    last = critics.net.layers[-1]
-    bound = (last.weight.norm(dim=1) * 64**0.5 + last.bias.abs().squeeze(-1)).amax()
-    with torch.no_grad():
-        q = critics(1e4 * torch.randn(500, 4), 1e4 * torch.randn(500, 1, 6))
-    assert (q.abs().amax() <= bound) == layer_norm
 
 
 def test_relabelling_by_samples_spreads_over_the_latent_space():
@@ -533,19 +464,8 @@ def test_inverting_gradients_scale_a_latent_actions_gradient_by_the_range_that_i
     torch.testing.assert_close(gradients[1], gradients[0] * left)
 
 
-def test_the_published_recipe_has_the_published_settings_and_learns():
+def test_the_published_recipe_learns():
     settings = make_config(["low=hyar_published", "high=none", "env=platform"]).low.settings
-    expected = dict(
-        twin=True, discrete="nearest", embedding_dim=6, latent_dim=6, hidden_dims=(256, 256), codec_hidden_dim=256,
-        codec_lr=1e-4, codec_batch_size=64, codec_pretrain_updates=5000, reconstruction_weight=2.0, kl_weight=0.5,
-        dynamics_weight=1.0, codec_loss="mean", latent_coverage=0.96, correction_factor=5.0, relabelling="sample",
-        gamma=0.99, tau=0.005, actor_lr=3e-4, critic_lr=3e-4, policy_delay=2, target_smoothing=0.1,
-        target_smoothing_clip=0.5, batch_size=128, updates_per_step=1.0, critic_window=100_000, noise_initial=1.0,
-        noise_episodes=1000, parameter_noise=0.1, actor_max_grad_norm=10.0, inverting_gradients=True,
-        lr_final_fraction=1.0, augment=False, parameter_tolerance=None,
-        greedy_samples=0, search_samples=0, preactivation_penalty=0.0,
-    )  # fmt: skip
-    assert {name: settings[name] for name in expected} == expected
     short = dict(warmup_steps=200, codec_pretrain_updates=2, updates_per_step=0.02, critic_window=150)
     learner = make(**{**{name: value for name, value in settings.items() if name != "budget"}, **short})
     for _ in range(3):

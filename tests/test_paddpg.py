@@ -14,9 +14,8 @@ from hpamdp.policies.low_level.paddpg import PADDPG, SCORES
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
-    twin=False, target_smoothing=0.1, target_smoothing_clip=0.2, policy_delay=2, initial_parameters="none",
-    hidden_dims=[64, 64], warmup_steps=1000, buffer_size=20_000, batch_size=64, updates_per_step=0.12, gamma=0.9,
-    tau=0.02, actor_lr=1e-3, critic_lr=1e-3, max_grad_norm=None, parameter_noise=0.1, epsilon_final=0.1,
+    initial_parameters="none", hidden_dims=[64, 64], warmup_steps=1000, buffer_size=20_000, batch_size=64,
+    updates_per_step=0.12, gamma=0.9, tau=0.02, actor_lr=1e-3, critic_lr=1e-3, max_grad_norm=None, epsilon_final=0.1,
     epsilon_steps=3000,
 )  # fmt: skip
 GREEDY = set_exploration_type(ExplorationType.DETERMINISTIC)

@@ -7,6 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.base import States
 from hpamdp.policies.low_level.dlpa.learner import DLPA
@@ -34,12 +35,9 @@ SEARCH = dict(
     temperature=0.1, first_min_deviation=0.2, min_deviation=0.02,
 )  # fmt: skip
 OPTIONS = dict(
-    augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False,
-    linear_part="auto", lr=2e-3, weight_decay=0.1, weight_decay_steps=256, transition_weight=2.0,
-    warmup_steps=64, updates_per_step=2.0, batch_size=32, buffer_size=4000,
-    posterior_sampling=True, optimism=0.0, caution=0.0, parameter_noise=0.05, epsilon=0.0, gamma=0.97,
-    planning_precision="float32", end_values=False, end_value_lr=1e-3,
-    end_value_tau=0.02, end_value_expectile=0.9, **SEARCH,
+    num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], lr=2e-3, weight_decay=0.1, warmup_steps=64,
+    updates_per_step=2.0, batch_size=32, buffer_size=4000, posterior_sampling=True, optimism=0.0, gamma=0.97,
+    planning_precision="float32", **SEARCH,
 )  # fmt: skip
 
 
@@ -91,17 +89,6 @@ def test_all_sequences_are_tried_where_there_are_few():
     assert second.tolist() == [[0, 1, 2] * 3] * 2, "each first step is shared by the sequences that begin with it"
 
 
-def test_sequences_that_begin_alike_share_their_first_steps_parameters():
-    seen = []
-
-    def returns(steps):
-        seen.append(steps)
-        return torch.rand(4, steps[-1].discrete.shape[1], 16)
-
-    SequenceSearch(SPECS.parameter_dims, **SEARCH)(returns, 4, CPU)
-    assert [tuple(step.own.shape[:3]) for step in seen[0]] == [(4, 3, 16), (4, 9, 16)]
-
-
 def test_half_as_many_sequences_are_refined_in_each_iteration_those_with_the_best_samples():
     seen = []
 
@@ -143,9 +130,18 @@ def test_the_smallest_deviation_falls_from_iteration_to_iteration():
     assert [round(value, 2) for value in spread[1:]] == [0.2, 0.1, 0.05]
 
 
-def test_a_smallest_deviation_that_rises_is_refused():
-    with pytest.raises(ValueError, match=r"min_deviation=0.3: must be at most first_min_deviation=0.2"):
-        make(min_deviation=0.3)
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"min_deviation": 0.3}, "min_deviation=0.3: must be at most first_min_deviation=0.2"),
+        ({"num_elites": 20}, "num_elites=20: must be at most num_samples=16"),
+        ({"num_elites": 12, "greedy_samples": 8}, "num_elites=12: must be at most greedy_samples=8"),
+        ({"augment": True}, "augment=true: the problem declares no symmetries; use augment=false"),
+    ],
+)
+def test_a_search_or_model_that_cannot_be_built_is_refused(changes, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        make(**changes)
 
 
 def test_a_rougher_estimate_may_choose_what_is_refined():
@@ -262,15 +258,6 @@ def test_the_scale_of_rewards_leaves_a_plan_as_it_is():
 # The model.
 
 
-def test_a_truncated_step_is_not_an_end():
-    learner = make()
-    ends = torch.zeros(64, dtype=torch.bool)
-    learn(learner, random_batch(64, terminated=ends, truncated=~ends))
-    assert not learner.buffer[:]["terminated"].any()
-    with torch.no_grad():
-        assert (learner.prepared()["terminated"] == 0).all()
-
-
 def test_the_model_learns_where_steps_lead_when_they_end_and_what_ends_earn():
     """Entry 0 moves by the parameter of action 0 or 1; past 1 the episode ends, which earns 10 with action 1."""
     torch.manual_seed(0)
@@ -384,7 +371,7 @@ def rotated(state: torch.Tensor, number: int) -> tuple[torch.Tensor, torch.Tenso
     return maps.map_observation(torch.full((len(state),), number), state), maps.discrete[number, 0]
 
 
-@pytest.mark.parametrize("number", range(3))  # the turns
+@pytest.mark.parametrize("number", [1, 2])  # the turns
 def test_the_model_predicts_for_a_turned_state_the_turned_next_state(number):
     learner = make(BOAT)
     state = BoatDockEnv(30, controller="congruent").reset()[keys.OBSERVATION]
@@ -402,7 +389,7 @@ def test_the_model_predicts_for_a_turned_state_the_turned_next_state(number):
     torch.testing.assert_close(turned_ahead.next_state, expected, atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("number", [1, 2])
 def test_the_plan_of_a_turned_state_is_the_turned_plan(number):
     learner = make(BOAT, max_sequences=9, num_kept=9)
     state = BoatDockEnv(20, controller="congruent").reset()[keys.OBSERVATION]
@@ -423,9 +410,7 @@ def test_the_plan_of_a_turned_state_is_the_turned_plan(number):
 
 
 def test_with_a_frame_mirror_images_are_learned_from_and_without_one_all_maps():
-    from hpamdp.env.catch_point.environment import CatchPointEnv
-
-    assert make(BOAT).symmetry is not None
+    assert make(BOAT).symmetry is not None and make().symmetry is None
     for env, factor in ((BoatDockEnv(4, controller="congruent"), 2), (CatchPointEnv(4), 16)):
         learner = make(PAMDPSpecs.from_env(env), warmup_steps=10_000)
         rolled = with_decisions(env).rollout(8, learner.policy, break_when_any_done=False)
@@ -434,12 +419,6 @@ def test_with_a_frame_mirror_images_are_learned_from_and_without_one_all_maps():
         unaugmented = make(PAMDPSpecs.from_env(env), warmup_steps=10_000, augment=False)
         learn(unaugmented, rolled)
         assert len(unaugmented.prepared()) == 32
-
-
-def test_augmentation_is_refused_where_nothing_is_declared():
-    with pytest.raises(ValueError, match="augment=true: the problem declares no symmetries; use augment=false"):
-        make(augment=True)
-    assert make(augment="auto").symmetry is None
 
 
 # The policy.
@@ -500,31 +479,17 @@ def test_exploring_plans_with_the_environments_own_member_greedy_ones_and_withou
     assert torch.equal(asked[0], member) and asked[1:] == [None, None]
 
 
-def test_exploring_plans_by_all_members_count_their_disagreement_greedy_ones_do_not():
-    learner = with_opinions(make(num_members=3, optimism=2.0), [1.0, 2.0, 6.0])
-    state, two_steps = torch.randn(6, 4), 1.0 + learner.options.gamma
-    deviation = torch.tensor([1.0, 2.0, 6.0]).std(correction=0)
-    explored = learner.policy.plan(state).value
-    torch.testing.assert_close(explored, two_steps * (3.0 + 2.0 * deviation).expand(6), atol=1e-3, rtol=0.0)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        torch.testing.assert_close(learner.policy.plan(state).value, torch.full((6,), 3.0 * two_steps))
-
-
-def test_cautious_greedy_plans_count_the_disagreement_of_members_against_a_sequence():
+def test_exploring_plans_by_all_members_add_their_disagreement_and_cautious_greedy_ones_subtract_it():
     learner = with_opinions(make(num_members=3, optimism=2.0, caution=0.5), [1.0, 2.0, 6.0])
     deviation = torch.tensor([1.0, 2.0, 6.0]).std(correction=0)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        planned = learner.policy.plan(torch.randn(6, 4)).value
-    expected = (1.0 + learner.options.gamma) * (3.0 - 0.5 * deviation)
-    torch.testing.assert_close(planned, expected.expand(6), atol=1e-3, rtol=0.0)
+    for exploration, weight in ((ExplorationType.RANDOM, 2.0), (ExplorationType.DETERMINISTIC, -0.5)):
+        with set_exploration_type(exploration):
+            planned = learner.policy.plan(torch.randn(6, 4)).value
+        expected = (1.0 + learner.options.gamma) * (3.0 + weight * deviation)
+        torch.testing.assert_close(planned, expected.expand(6), atol=1e-3, rtol=0.0)
 
 
-def test_one_member_can_plan_without_posterior_sampling():
-    learner = make(num_members=1, posterior_sampling=False, optimism=1.0)
-    assert learner.policy.plan(torch.randn(6, 4)).value.isfinite().all()
-
-
-@pytest.mark.parametrize("num_states", [1, 7, 10])
+@pytest.mark.parametrize("num_states", [1, 7])
 def test_in_greedy_plans_single_members_choose_the_sequences_that_all_refine(num_states):
     learner = make(num_members=3)
     rows = []
@@ -544,15 +509,6 @@ def test_in_greedy_plans_single_members_choose_the_sequences_that_all_refine(num
     ]
 
 
-def test_plans_with_own_members_come_back_in_the_order_of_the_states():
-    learner = make(num_members=3, num_samples=64, num_elites=8, num_iterations=6)
-    state, member = torch.randn(9, 4), torch.tensor([2, 0, 1, 2, 0, 1, 1, 2, 0])
-    together = learner.policy.plan(state, member)
-    for row in range(9):
-        alone = learner.policy.plan(state[row : row + 1], member[row : row + 1])
-        assert (alone.value[0] - together.value[row]).abs() < 0.2 * together.value.std() + 0.05
-
-
 def test_nothing_is_planned_before_the_first_update_or_for_finished_episodes(monkeypatch):
     learner = make()
     asked = []
@@ -567,7 +523,7 @@ def test_nothing_is_planned_before_the_first_update_or_for_finished_episodes(mon
     assert asked == [5]
 
 
-@pytest.mark.parametrize("value", [-1.0, 0.0, 1.0])
+@pytest.mark.parametrize("value", [0.0, 1.0])
 def test_actions_are_random_only_while_neither_rewards_nor_terminations_differ(value):
     same = {"reward": torch.full((64,), value), "terminated": torch.zeros(64, dtype=torch.bool)}
     for changes in ({"reward": torch.arange(64.0)}, {"terminated": torch.arange(64) == 3}):
@@ -630,19 +586,6 @@ def test_a_share_epsilon_of_exploring_actions_is_random_and_no_greedy_one(monkey
         discrete = learner.policy(td)[keys.DISCRETE]
     assert sum(asked) == pytest.approx(planned * 4000, abs=100)
     assert (discrete == 2).float().mean().item() == pytest.approx(planned + (1 - planned) / 3, abs=0.03)
-
-
-def test_actions_lie_in_their_bounds():
-    td = acting(make(parameter_noise=1.0), TensorDict({keys.OBSERVATION: 3 * torch.randn(50, 4)}, [50]))
-    low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
-    assert ((td[keys.PARAMETERS] >= low) & (td[keys.PARAMETERS] <= high)).all()
-
-
-def test_more_elites_than_samples_are_refused():
-    with pytest.raises(ValueError, match="num_elites=20: must be at most num_samples=16"):
-        make(num_elites=20)
-    with pytest.raises(ValueError, match="num_elites=12: must be at most greedy_samples=8"):
-        make(num_elites=12, greedy_samples=8)
 
 
 def test_a_greedy_plan_tries_as_many_samples_as_it_is_told(monkeypatch):

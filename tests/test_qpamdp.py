@@ -19,13 +19,9 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(2, (), (1, 1, 0), (0.0, -2.0), (2.0, 2.0))
 
 OPTIONS = dict(
-    features=None, phi_order=1, phi_max_coupled=2, psi_order=1, psi_max_coupled=1, warmup_steps=100,
-    initial_episodes=100, relearning_episodes=100, gamma=0.9, trace_decay=0.5, step_size=1.0, temperature=0.5,
-    parameter_updates=3, patience=2, rollouts=100, natural_step_size=1.0, max_divergence=1.0, ridge=1e-6,
-    initial_mean=0.0, initial_parameters="none",
-    feature_range=None, step_scaling=False, step_bound="each_step", envs_per_update=None,
-    temperature_final=0.01, temperature_decay=1.0,
-    samples_in_parameter_phase=True, sigma=0.2, sigma_final=0.1, sigma_decay=0.9,
+    phi_order=1, psi_order=1, psi_max_coupled=1, warmup_steps=100, initial_episodes=100, relearning_episodes=100,
+    gamma=0.9, temperature=0.5, parameter_updates=3, patience=2, rollouts=100, natural_step_size=1.0,
+    max_divergence=1.0, ridge=1e-6, initial_parameters="none", sigma=0.2, sigma_final=0.1, sigma_decay=0.9,
 )  # fmt: skip
 
 ONE = torch.ones(1)
@@ -344,7 +340,7 @@ class Always7:
         return torch.full((len(option),), 7.0)
 
 
-@pytest.mark.parametrize("num_steps", [1, 3, 6])
+@pytest.mark.parametrize("num_steps", [1, 3])
 def test_options_whose_selector_ends_them_are_counted_once_however_long_batches_are(num_steps):
     def learned(num_steps, phase):
         torch.manual_seed(0)
@@ -522,15 +518,3 @@ def test_the_parameter_phase_goes_on_with_another_number_of_environments(num_env
     learn(learner, 1, num_envs=num_envs)
     # An episode that was under way is left out, and so is what may be the middle of one.
     assert learner.enac.num_episodes == before + num_envs
-
-
-def test_a_state_dict_restores_a_learner_that_goes_on_the_same():
-    torch.manual_seed(0)
-    learner, other = make(), make()
-    learn(learner, 5)
-    other.load_state_dict(learner.state_dict())
-    batch = play(learner, num_envs=64)
-    for one in (learner, other):
-        one.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
-    for name, value in learner.state_dict().items():
-        torch.testing.assert_close(value, other.state_dict()[name])
