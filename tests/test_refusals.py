@@ -33,111 +33,59 @@ REFUSED = [
     ("low=qpamdp collector=multi collector.ahead=true", "low=qpamdp learns from steps of its current policy"),
     # More than there is memory for.
     ("num_envs=1000000000", "num_envs=1000000000: must be less than or equal to 10000000 (conf/config.yaml"),
-    ("steps_per_batch=1000000000", "steps_per_batch=1000000000: must be less than or equal to 10000000 "),
-    ("eval.layouts=1000000000", "eval.layouts=1000000000: must be less than or equal to 10000000 "),
-    (
-        "low=pdqn low.hidden_dims=[1000000,1000000]",
-        "low.hidden_dims=[1000000, 1000000], low.buffer_size=500000: takes ",
-    ),
+    ("low=pdqn low.hidden_dims=[1000000,1000000]", "low.hidden_dims=[1000000, 1000000], low.buffer_size=500000:"),
     ("low.buffer_size=10000000000", "low.buffer_size=10000000000: takes at least "),
-    ("high=meta_critic high.buffer_size=100000000000", "high.buffer_size=100000000000: takes at least "),
-    ("low.codec_hidden_dim=1000000000000", "low.codec_hidden_dim=1000000000000, low.buffer_size=300000: takes more "),
-    ("low.latent_dim=1000000000000", "low.latent_dim=1000000000000, low.buffer_size=300000: takes more memory "),
-    ("high.memory=sliding_window high.window=10000000000000", "high.window=10000000000000: takes more memory "),
     # Numbers out of all proportion.
     ("low=hppo low.lr=1e30", "low.lr=1e+30: must be above 0 and at most 1 (HPPO)"),
-    ("low=pdqn low.actor_lr=5", "low.actor_lr=5: must be above 0 and at most 1"),
-    ("low=hsac low.temperature_lr=0", "low.temperature_lr=0: must be above 0 and at most 1"),
-    ("high=actor high.lr=-1", "high.lr=-1: must be above 0 and at most 1"),
     ("exploration=held exploration.epsilon_final=0.5", "exploration: epsilon_final=0.5: must be at most epsilon=0.05"),
     ("low=hppo low.lr_final=0.5", "low: lr_final=0.5: must be at most lr=0.001"),
     ("low=hppo low.min_scale_final=2", "low: min_scale_final=2.0: must be less than max_scale=1.0"),
     (PLATFORM + "env.noise=1e9", "env.noise=1000000000.0: must be less than or equal to 100 (PlatformEnv"),
-    ("env=goal high=none low=random env.noise=11", "env.noise=11: must be less than or equal to 5 (GoalEnv"),
-    ("env.motor_noise=1e9", "env: motor_noise=1000000000.0: must lie between 0 and 10"),
     ("env.motor_noise=[0,11]", "env: motor_noise=11.0: must lie between 0 and 10"),
-    ("env.sensor_noise=1e9", "env.sensor_noise=1000000000.0: must be less than or equal to 1000"),
     # Values that contradict one another.
     ("high=value low=dlpa", "high=value: low=dlpa has no value to compare without low.end_values=true"),
     ("high=value low=random", "high=value: low=random has no value to compare; use another low or another high"),
     ("low.buffer_size=4 low.batch_size=64", "low: batch_size=64: must be at most buffer_size=4"),
-    ("high=meta_critic high.batch_size=60000", "high: batch_size=60000: must be at most buffer_size=20000"),
     ("low=pdqn low.n_step=5", "low.n_step=5: must be at most steps_per_batch=4, as sums of rewards end with a batch"),
     ("low=qpamdp low.sigma_final=5", "low: sigma_final=5.0: must be at most sigma=0.1"),
     ("low=dlpa low.horizon=10000000", "low: horizon=10000000, num_iterations=5, num_samples=256: a plan would try"),
-    ("low=hppo low.epochs=100000", "low.epochs=100000: must be less than or equal to 1000"),
     ("low.updates_per_step=1e9", "low: updates_per_step=1000000000.0: must be at most 1000"),
-    ("low=qpamdp low.features=[]", "low: features=[]: name some of the observation's entries 0 to 15; null: all"),
     ("low=qpamdp low.features=[0,16]", "low: features=[0, 16]: name some of the observation's entries 0 to 15"),
     ("low=qpamdp low.features=[0,0]", "low: features=[0, 0]: names an entry twice"),
-    (
-        "low=qpamdp low.phi_order=1000000",
-        "low: phi_order=1000000, psi_order=3: the regression for the parameters would ",
-    ),
-    ("low=qpamdp low.psi_order=200", "low: phi_order=5, psi_order=200: the regression for the parameters would have "),
+    ("low=qpamdp low.phi_order=1000000", "low: phi_order=1000000, psi_order=3: the regression for the parameters"),
     ("high=linucb high.inputs=[1,1]", "high: inputs=[1, 1]: names an entry twice"),
     # Budgets, of which the run may take nothing.
     ("low.budget.num_envs=-1", "low.budget.num_envs=-1: must be greater than 0 (conf/low/hyar.yaml)"),
-    ("low.budget.eval_every=-5", "low.budget.eval_every=-5: must be greater than or equal to 0"),
-    ("low.budget.total_frames=abc", 'low.budget.total_frames="abc": must be a valid integer'),
     ("low.budget.foo=3", "low.budget.foo: no such value of low.budget (conf/low/hyar.yaml); it has eval_every, "),
     ("low.budget=3", "low.budget=3: must be a mapping (conf/low/hyar.yaml)"),
     # Parts of another kind.
     ("low=random low._target_=hpamdp.policies.random_agent.random_agent", "there is no class random_agent in "),
     ("low=random low._target_=torch.nn.Identity", "low=random: Identity is no Learner (hpamdp.policies.base)"),
-    ("high=uniform high._target_=torch.nn.Identity", "high=uniform: Identity is no Selector (hpamdp.policies.base)"),
     ("low._target_=hpamdp.policies.low_level.random.Random", " more like this"),
-    ("low._target_=collections.OrderedDict", "low=hyar: OrderedDict is no Learner (hpamdp.policies.base)"),
-    ("agent=null", "agent=null: must be a mapping (conf/config.yaml)"),
     ("env.motor_noise=[1]", "env: motor_noise=[1.0]: must be one number or two (BoatDockEnv"),
     # Boats.
-    (
-        "env.boats=[congruent,sideways]",
-        "env: boats=['congruent', 'sideways']: no controller sideways; controllers has "
-        "congruent, incongruent1, incongruent2 (BoatDockEnv)",
-    ),
+    ("env.boats=[congruent,sideways]", "env: boats=['congruent', 'sideways']: no controller sideways; controllers"),
     ("env.boats=[congruent,congruent]", "must be different controllers"),
     ("env.boats=[congruent]", "boats=['congruent']: nothing to choose; name more, or use controller=congruent"),
-    ("env.boats=congruent", 'env.boats="congruent": must be a list (BoatDockEnv'),
     ("env.controllers.sideways=[0,180]", "controllers.sideways=[0.0, 180.0]: must be 3 directions in degrees"),
     ("env.controllers.sideways=[0,180,.inf]", "env.controllers.sideways.2=Infinity: must be a finite number"),
     ("env.controllers.congruent=[0,120,240]", "congruent is [150.0, 270.0, 30.0]; take another name"),
-    ("env.controllers.random=[0,120,240]", "random cannot name a controller; take another name"),
     ("env.boats=[congruent,incongruent1] env.keymap=2", "keymap=2: the controllers in boats="),
-    (
-        "env.boats=[congruent,incongruent1] env.controller=incongruent high=none",
-        "controller=incongruent: must be one of choose, congruent, incongruent1, random",
-    ),
+    ("env.boats=[congruent,incongruent1] env.controller=incongruent high=none", "controller=incongruent: must be one"),
     ("env.boats=[congruent,incongruent1] env.motor_noise=[0,0,1]", "motor_noise=[0.0, 0.0, 1.0]: must be one "),
-    (
-        "env.boats=[congruent,incongruent1] high=human",
-        "controllers, so what they chose says nothing here; leave it out",
-    ),
-    ("env.switch_cost=7", "env.switch_cost=7: must be less than or equal to 6"),
+    ("env.boats=[congruent,incongruent1] high=human", "controllers, so what they chose says nothing here; leave it"),
     ("env.switch_cost=0.2 env.controller=random high=none", "switch_cost=0.2: controller=random never changes"),
     ("env.switch_cost=0.2 high=oracle low=planner", "low=planner: its plans on env=boatdock change options, but"),
-    (
-        "env.switch_cost=0.2 high=human",
-        "switch_cost=0.2: people kept one of their two controllers, so what they chose ",
-    ),
+    ("env.switch_cost=0.2 high=human", "switch_cost=0.2: people kept one of their two controllers, so what they"),
     ("env.switch_cost=0.2 agent.termination=steps agent.option_length=1", "high=ucb is a bandit, which counts what "),
-    (
-        "high=meta_critic agent.termination=steps agent.option_length=1",
-        "agent.termination=steps: env=boatdock keeps an option for an episode; use agent.termination=episode or "
-        "env.switch_cost=0.2",
-    ),
+    ("high=meta_critic agent.termination=steps agent.option_length=1", "agent.termination=steps: env=boatdock keeps"),
     ("low=hppo low.critic_hidden_dims=[]", "low.critic_hidden_dims=[]: must have at least 1 item (HPPO"),
-    ("env=boatdock_released high=none env.test_mode=2", "env.test_mode=2: must be 0, 1 or null (Released"),
-    ("logger=wandb logger.project=''", 'logger.project="": must have at least 1 character (WandbLogger'),
     # Observations of others.
     (
         GYMNASIUM + "env.entry_point=toy_environments:TickingGoal env.observation_keys=[2]",
         "observation_keys=[2]: must name different entries of [0, 1]; null: all",
     ),
-    (
-        GYMNASIUM + "env.entry_point=toy_environments:Toy env.observation_keys=[0]",
-        "has no entries; use null",
-    ),
+    (GYMNASIUM + "env.entry_point=toy_environments:Toy env.observation_keys=[0]", "has no entries; use null"),
     (GYMNASIUM + "env.id=CartPole-v1 env.observation_keys=0", "env.observation_keys=0: must be a list"),
 ]
 
@@ -218,16 +166,10 @@ def saved(tmp_path_factory):
     [
         ("low.clip=-1", "low.clip=-1: resume takes the agent from "),
         ("low=hyar", "low=hyar: resume takes the agent from "),
-        (
-            "env.nose=1",
-            "env.nose: no such setting of PlatformEnv; did you mean noise? It has ",
-        ),
+        ("env.nose=1", "env.nose: no such setting of PlatformEnv; did you mean noise? It has "),
         ("env.noise=-1", "env.noise=-1: must be greater than or equal to 0"),
         ("seed=5", "seed=5: the run in "),
-        (
-            "env.noise=0",
-            "has env.noise=0.5; leave it out when you resume, or start a run with low.checkpoint=",
-        ),
+        ("env.noise=0", "has env.noise=0.5; leave it out when you resume, or start a run with low.checkpoint="),
         ("env.max_steps=3", "has env.max_steps=200; leave it out"),
         ("env=goal", "env=goal: the run in "),
         ("data=human", "data=human: low=hppo learns from its own steps only"),
@@ -274,30 +216,11 @@ def test_an_agent_is_told_when_its_options_are_others(tmp_path, capsys):
     assert "but env=boatdock has incongruent, congruent, which take their places" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_all_commands_tell_when_the_options_of_a_saved_agent_are_others(command):
-    first = "env.boats=[congruent,incongruent1]"
-    assert command(*SMALL, "film=false", first, "high=uniform", "low=random", "hydra.run.dir=saved")[0] == 0
-    chosen = "saved: its agent chooses among congruent, incongruent1, but env=boatdock has"
-    for words in (["mode=eval", "checkpoint=saved"], ["resume=saved"], ["low.checkpoint=saved", "low=random"]):
-        code, _, err = command(*words, "env.boats=[incongruent1,congruent]")
-        assert code == 2 and f"{chosen} incongruent1, congruent; keep the order" in err and err.count("\n") == 1
-    code, _, err = command("mode=eval", "checkpoint=saved", "env.boats=[congruent,incongruent1,incongruent2]")
-    assert code == 2 and err == f"checkpoint={chosen} congruent, incongruent1, incongruent2\n"
-    code, _, err = command("mode=eval", "checkpoint=saved", "env.boats=[incongruent1,incongruent2]")
-    assert code == 0 and f"{chosen} incongruent1, incongruent2, which take their places" in err
-    code, _, err = command("mode=eval", "checkpoint=saved", "env.slip=0.5", "hydra.run.dir=again")
-    assert code == 0 and "take their places" not in err
-    code, _, err = command("watch", "saved", "env.boats=[incongruent1,congruent]")
-    assert code == 2 and "keep the order" in err
-
-
 @pytest.mark.parametrize(
     "word",
     [
-        *("total_frames=5", "num_envs=2", "steps_per_batch=2", "log_every=1", "eval.every=1", "eval.stop_score=1.0"),
-        *("data=human", "collector=multi", "eval={seed:1,every:5}", "callbacks=[]", "save_best=true"),
-        *("offline.updates=2", "checkpoint_minutes=1", "checkpoint_replay=false", "compile_updates=false"),
+        *("total_frames=5", "eval.every=1", "data=human", "collector=multi", "eval={seed:1,every:5}", "callbacks=[]"),
+        *("offline.updates=2", "checkpoint_minutes=1", "compile_updates=false"),
     ],
 )
 def test_settings_of_training_are_refused_where_nothing_is_trained(saved, word):
@@ -311,12 +234,7 @@ def test_settings_of_training_are_refused_where_nothing_is_trained(saved, word):
             load_agent(path, settings)
 
 
-def test_exploration_is_refused_for_a_player_who_is_not_trained():
-    with pytest.raises(ConfigError, match=r"^exploration=held: has no effect without training; leave it out$"):
-        load_agent(None, ["low=random", "high=uniform", "exploration=held"])
-
-
-@pytest.mark.parametrize("word", ["agent.values_end=trip", "agent.selector_values_end=trip", "low.freeze=true"])
+@pytest.mark.parametrize("word", ["agent.values_end=trip", "low.freeze=true", "exploration=held"])
 def test_how_the_parts_of_an_agent_learn_is_refused_for_a_player_who_is_not_trained(word):
     with pytest.raises(ConfigError, match=rf"^{re.escape(word)}: has no effect without training; leave it out$"):
         load_agent(None, ["env=boatdock_unseen", "env.boats=2", "low=random", "high=uniform", word])
@@ -357,7 +275,7 @@ def test_settings_that_watch_has_flags_for_are_refused(command, word, instead):
     assert (code, err) == (2, f"{word}: the command has a flag for it; use {instead}\n")
 
 
-@pytest.mark.parametrize("word", ["total_frames=5", "low=hppo", "low.lr=0.1", "high=ucb", "callbacks=[]", "seed=3"])
+@pytest.mark.parametrize("word", ["total_frames=5", "low.lr=0.1", "high=ucb", "callbacks=[]"])
 def test_settings_that_change_nothing_about_a_page_are_refused(command, word):
     code, _, err = command("play", word, "--export", "site")
     assert (code, err) == (2, f"{word}: has no effect on the page; give settings of the problem\n")
@@ -383,35 +301,22 @@ def test_the_length_of_another_mode_is_refused(mode, word):
     ("words", "needs"),
     [
         ("low=hppo low.memory_size=8", "with memory=gru"),
-        ("low=dlpa low.end_value_lr=0.1", "if end_values is set"),
         ("low=qpamdp low.patience=3", "with parameter_updates=null"),
         ("low=random high=ucb high.window=9", "with memory=sliding_window"),
-        ("low=random exploration=held exploration.epsilon_steps=9", "if epsilon_final is set"),
         ("env=boatdock_unseen high=none low=random env.fleet_seed=3", "if fleet_size is set"),
-        ("env=lunar_lander high=none low=random env.wind_power=3", "if enable_wind is set"),
-        ("env=circuit high=none low=random env.ion_costs=[0.1,0.2]", "with gate_set=choose or ion"),
         ("env=primitives high=none low=random env.actions=small_steps env.reach=0.5", "with actions=primitives or all"),
         (
             "low=pets exploration=novelty exploration.in_plans=disagreement exploration.lr=0.1",
             "with in_plans=auto or distillation",
         ),
-        (
-            "env=platform high=none low=pdqn low.target_smoothing=0 low.target_smoothing_clip=3",
-            "if target_smoothing is set",
-        ),
         ("env=platform high=none low=pdqn low.epsilon_episodes=5 low.epsilon_steps=5", "with epsilon_episodes=null"),
         ("env=platform high=none low=pdqn low.epsilon_steps=5", None),
-        ("data=human high=human mode=offline low=pdqn low.lr_final_fraction=0.1", "with mode=train"),
         ("data=human high=human mode=offline low=iql low.warmup_steps=9", "with mode=train"),
-        ("data=human high=human mode=offline low=hsac low.updates_per_step=2", "with mode=train"),
-        ("data=human low=iql mode=offline high=meta_critic high.epsilon_decisions=9", "with mode=train"),
         ("data=human low=iql mode=offline high=epsilon_greedy high.epsilon_scale=9", "with mode=train"),
         ("data=human high=human mode=offline low=iql low.actor_lr_updates=9", None),
         ("low=hppo low.memory=gru low.memory_size=8", None),
-        ("low=hppo", None),
         ("env=boatdock_unseen high=none low=hppo low.memory_size=8", None),  # whose recipe has low.memory=gru
         ("low=random high=ucb high.memory=sliding_window high.window=9", None),
-        ("env=boatdock_unseen high=none low=random env.fleet_size=4 env.fleet_seed=3", None),
     ],
 )
 def test_a_setting_that_counts_only_with_another_value_is_told(words, needs):

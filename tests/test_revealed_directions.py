@@ -168,6 +168,7 @@ def test_a_plan_keeps_the_directions_it_began_with():
     torch.testing.assert_close(imagined, torch.cat([features[:, :9], following], -1), check_stride=False)
 
 
+@pytest.mark.slow
 def test_a_few_hundred_presses_suffice_to_dock_boats_never_met():
     env = UnseenBoatsEnv(16, seed=3)
     learner = make(env)
@@ -251,14 +252,6 @@ def test_one_model_of_both_boats_does_not_see_which_of_them_it_is():
     [
         ({"directions": torch.zeros(1, 3, 2)}, "directions are both known and revealed"),
         ({"revealed": RevealedDirections((2, 3), (0, 1))}, "revealed by 2 entries of the last action, but must be 3"),
-        (
-            {"revealed": RevealedDirections((2, 3, 5), (0, 1))},
-            r"revealed by the entries \(2, 3, 5, 0, 1\), but must be",
-        ),
-        (
-            {"revealed": RevealedDirections((2, 3, 4), (0, 2))},
-            r"revealed by the entries \(2, 3, 4, 0, 2\), but must be",
-        ),
         (
             {"revealed": RevealedDirections((2, 3, 4), (0, 1), last_option=1)},
             r"revealed by the entries \(2, 3, 4, 0, 1, 1\), but must be",
