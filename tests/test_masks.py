@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 import torch
-from conftest import make_config
+from conftest import OF_EACH_KIND, make_config
 from tensordict import TensorDict
 from test_following_options import LEARNERS
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -28,27 +28,13 @@ SHORT = {
     **LEARNERS,
     "hyar": [*LEARNERS["hyar"], "low.warmup_steps=100", "low.epsilon_steps=100"],
     "dlpa": [
-        "low.hidden_dims=[16]",
-        "low.warmup_steps=100",
-        "low.num_samples=32",
-        "low.num_elites=8",
-        "low.num_iterations=2",
-        "low.horizon=2",
-        "low.batch_size=32",
+        *("low.hidden_dims=[16]", "low.warmup_steps=100", "low.num_samples=32", "low.num_elites=8"),
+        *("low.num_iterations=2", "low.horizon=2", "low.batch_size=32"),
     ],
     "pets": [
-        "low.transition_dims=[16]",
-        "low.outcome_dims=[16]",
-        "low.num_members=2",
-        "low.warmup_steps=100",
-        "low.batch_size=32",
-        "low.max_sequences=9",
-        "low.num_kept=2",
-        "low.num_samples=8",
-        "low.greedy_samples=8",
-        "low.num_elites=2",
-        "low.num_iterations=2",
-        "low.horizon=2",
+        *("low.transition_dims=[16]", "low.outcome_dims=[16]", "low.num_members=2", "low.warmup_steps=100"),
+        *("low.batch_size=32", "low.max_sequences=9", "low.num_kept=2", "low.num_samples=8", "low.greedy_samples=8"),
+        *("low.num_elites=2", "low.num_iterations=2", "low.horizon=2"),
     ],
     "random": [],
 }
@@ -166,7 +152,9 @@ def test_a_latent_action_is_worth_what_its_allowed_action_is_worth(name):
 
 
 @pytest.mark.parametrize("is_shared", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["per_option", "shared"])
-@pytest.mark.parametrize("name", [*SHORT])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in OF_EACH_KIND else pytest.mark.slow) for name in SHORT]
+)
 def test_an_option_that_is_a_set_of_actions_takes_no_other_action(name, is_shared):
     problem = Forbidden(8)
     problem.option_names = ()
