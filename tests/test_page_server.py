@@ -204,23 +204,6 @@ def test_a_body_that_is_shorter_than_it_says_is_refused_and_a_silent_client_keep
         assert send(server, EPISODES[1])[0] == 201
 
 
-def test_a_class_of_browsers_connects_at_once(tmp_path):
-    page = BoatPage(seed=0)
-    with PageServer(("127.0.0.1", 0), page, {}, EpisodeFile(tmp_path / "a.jsonl", page)) as server:
-        # The server accepts none of them yet. A connection beyond the queue would time out.
-        waiting = [socket.create_connection(("127.0.0.1", server.server_port), timeout=0.5) for _ in range(100)]
-        for connection in waiting:
-            connection.close()
-
-
-@pytest.mark.parametrize(
-    "text", [b"", b"\r\n\r\n", b"GET\r\n\r\n", b"\x16\x03\x01\x02", b"GET / HTTP/9.9\r\n\r\n", b"A" * 70_000]
-)
-def test_requests_that_are_none_break_nothing(server, text):
-    raw(server, text)
-    assert ask(server, "GET", "/")[0] == 200
-
-
 def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch, command):
     monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 1)
     code, out, _ = command("play", "--export", str(tmp_path / "site"), "--agent", "none")
@@ -245,14 +228,11 @@ def test_the_plans_of_the_page_are_made_with_the_threads_that_are_set(tmp_path, 
         (["env=platform"], "there is no page"),
         (["env.slip=0.5"], "env: BoatDockEnv: slip=0.5, but the page has 0.0"),
         (["env.boats=[congruent,incongruent1]"], "boats=['congruent', 'incongruent1'], but the page has none"),
-        (["env.keymap=2"], "keymap=2, but the page has 1"),
         (["--agent", "nowhere"], "no checkpoint there"),
         (
             ["--agent", "hppo_hard_move_8"],
             "--agent hppo_hard_move_8: was trained on env=hard_move, but the page is of env=boatdock\n",
         ),
-        (["somewhere"], "--agent somewhere"),
-        (["--port", "99999"], "whole number"),
         (["--to", "nowhere/a.jsonl", "--agent", "none"], "No such file or directory"),
         (["--agent", "none", "--host", "256.1.1.1"], "--host 256.1.1.1"),
     ],
@@ -263,9 +243,7 @@ def test_play_tells_a_mistake_in_one_line(monkeypatch, command, words, said):
     assert code == 2 and said in err and err.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("host", "is_told"), [("localhost", False), ("127.0.0.2", False), ("127.0.0.1", False), ("0.0.0.0", True)]
-)
+@pytest.mark.parametrize(("host", "is_told"), [("localhost", False), ("0.0.0.0", True)])
 def test_only_an_address_that_others_reach_is_warned_of(tmp_path, monkeypatch, command, host, is_told):
     monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
     asked = []

@@ -127,14 +127,6 @@ def test_the_working_directory_is_no_folder_of_a_sweep(command, jobs, tmp_path):
     assert not jobs and not list(tmp_path.iterdir())
 
 
-def test_a_sweep_around_the_working_directory_reports_its_own_jobs_alone(command, jobs, tmp_path, monkeypatch):
-    command("-m", "seed=0,4", "hydra.sweep.dir=elsewhere")
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    _, out, _ = command("-m", "seed=8", "hydra.sweep.dir=..")
-    assert "score: of one seed, so without a deviation" in out
-
-
 def test_an_error_file_of_the_users_own_stays_in_the_folder_of_a_job(command, jobs, tmp_path):
     for number in range(2):
         (tmp_path / f"sweep/{number}").mkdir(parents=True)
@@ -167,14 +159,6 @@ def test_a_sweep_started_again_does_what_is_left(command, jobs):
     assert command(*words[:1], "seed=0,3,4", words[2])[0] == 0 and not jobs
 
 
-def test_a_sweep_goes_on_by_itself_so_resume_auto_changes_nothing(command, jobs):
-    words = ["-m", "seed=0,3", "hydra.sweep.dir=sweep"]
-    command(*words)
-    jobs.clear()
-    code, _, err = command(*words, "resume=auto")
-    assert (code, err) == (0, "") and [seed for seed, _ in jobs] == [3]
-
-
 def test_a_sweep_over_experiments_of_one_study_lies_in_its_folder_and_is_told_at_the_end(command, jobs, tmp_path):
     words = ["-m", "experiment=domains/moving,domains/sliding", "low=random", "seed=0,4"]
     code, out, err = command(*words)
@@ -199,14 +183,6 @@ def test_the_problem_that_all_experiments_of_a_folder_choose_may_be_given():
     assert line.is_multirun and "env=circuit" in line.words
 
 
-def test_wrong_values_of_an_experiments_sweep_are_told_in_one_line(command, jobs, tmp_path):
-    (tmp_path / "mine/experiment").mkdir(parents=True)
-    text = "# @package _global_\nhydra: {mode: MULTIRUN, sweeper: {params: {seed: '[1'}}}\n"
-    (tmp_path / "mine/experiment/mine.yaml").write_text(text)
-    code, _, err = command("--config-dir", str(tmp_path / "mine"), "experiment=mine", "low=random")
-    assert code == 2 and err.startswith("seed=[1: not understood; ") and err.count("\n") == 1 and not jobs
-
-
 def test_a_glob_stands_for_a_sweep_over_the_choices_that_match(command, jobs, tmp_path):
     (tmp_path / "mine/low").mkdir(parents=True)
     (tmp_path / "mine/low/hmine.yaml").write_text((CONF / "low/hppo.yaml").read_text())
@@ -226,20 +202,6 @@ def test_a_sweep_over_experiments_with_folders_of_their_own_is_refused_until_one
     )
     assert command(*words, "hydra.sweep.dir=mine")[0] == 0 and len(jobs) == 2
     assert "add --multirun" in command(*words[1:])[2]
-
-
-def test_a_sweep_over_experiments_of_ones_own_lies_in_the_folder_that_they_name(command, jobs, tmp_path):
-    for name in ("first", "second"):
-        file = tmp_path / "mine/experiment" / f"{name}.yaml"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(f"# @package _global_\nhydra: {{sweep: {{dir: 'my runs', subdir: {name}}}}}\n")
-    assert command("--config-dir", str(tmp_path / "mine"), "-m", "experiment=first,second", "low=random")[0] == 0
-    assert {path.name for path in (tmp_path / "my runs").iterdir()} == {
-        "first",
-        "second",
-        "multirun.yaml",
-        "report.csv",
-    }
 
 
 def test_a_run_that_ended_early_is_finished_and_one_that_was_stopped_is_not(command, jobs):
@@ -266,13 +228,6 @@ def test_with_overwrite_a_job_replaces_only_the_results_of_another_config(comman
     command("-m", "seed=4,0", "hydra.sweep.dir=sweep")
     assert command("-m", "seed=7,0", "overwrite=true", "hydra.sweep.dir=sweep")[0] == 0
     assert jobs == [(4, None), (0, None), (7, None)]
-
-
-def test_a_run_without_a_checkpoint_starts_afresh(command, jobs, tmp_path):
-    (tmp_path / "sweep/0").mkdir(parents=True)
-    (tmp_path / "sweep/0/config.yaml").write_text("seed: 9\n")
-    assert command("-m", "seed=4", "hydra.sweep.dir=sweep")[0] == 0
-    assert jobs == [(4, None)]
 
 
 def test_a_sweep_that_breaks_off_tells_the_jobs_it_leaves(command, jobs, monkeypatch):
@@ -391,10 +346,7 @@ def test_a_job_of_submitit_that_is_preempted_is_requeued_and_goes_on(tmp_path):
     ("word", "package", "extra"),
     [
         ("hydra/launcher=joblib", "hydra-joblib-launcher", "joblib"),
-        ("hydra/launcher=submitit_local", "hydra-submitit-launcher", "slurm"),
         ("hydra/launcher=submitit_slurm", "hydra-submitit-launcher", "slurm"),
-        ("hydra/launcher=ray", "hydra-ray-launcher", "ray-launcher"),
-        ("hydra/sweeper=optuna", "hydra-optuna-sweeper", "optuna"),
         ("search=hppo", "hydra-optuna-sweeper", "optuna"),
     ],
 )
@@ -404,50 +356,6 @@ def test_a_missing_launcher_or_sweeper_is_told_with_its_extra(command, word, pac
     code, _, err = command("-m", word, "seed=0,1")
     assert code == 2 and err.count("\n") == 1
     assert err.endswith(f"not installed; pip install 'hpamdp[{extra}]'\n")
-
-
-def test_a_launcher_that_is_none_is_told_with_those_there_are(command):
-    code, _, err = command("-m", "hydra/launcher=jobli")
-    assert (code, err) == (
-        2,
-        "hydra/launcher=jobli: no such choice; there is basic, joblib, ray, submitit_local, submitit_slurm\n",
-    )
-
-
-@needs("hydra-submitit-launcher")
-def test_the_slurm_launcher_is_composed_with_its_options(command):
-    code, out, _ = command("hydra/launcher=submitit_slurm", "hydra.launcher.partition=long", "--cfg", "hydra")
-    assert code == 0 and "SlurmLauncher" in out and "partition: long" in out
-
-
-@needs("hydra-submitit-launcher")
-def test_a_missing_cluster_is_told_in_one_line(command, monkeypatch):
-    monkeypatch.setenv("PATH", "")
-    code, _, err = command("-m", "hydra/launcher=submitit_slurm", "seed=0,1")
-    assert code == 2 and err.count("\n") == 1 and err.startswith("hydra/launcher=submitit_slurm: ")
-
-
-@needs("hydra-optuna-sweeper")
-def test_a_search_maximises_the_score_skips_finished_trials_and_survives_failed_ones(command, monkeypatch, tmp_path):
-    tried = []
-
-    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn, **_):
-        tried.append(cfg.low.clip)
-        if len(tried) == 2:
-            raise ZeroDivisionError("a bug")
-        (folder / "config.yaml").write_text(choose_selector(read(cfg)).to_yaml())
-        summary = {"score": cfg.low.clip, "frames": cfg.total_frames, "finished": True}
-        (folder / "summary.json").write_text(json.dumps(summary))
-
-    monkeypatch.setattr(train, "run", run)
-    words = ["search=hppo", "hydra.sweep.dir=sweep"]
-    code, _, err = command(*words, "hydra.sweeper.n_trials=4")
-    assert code == 1 and "ZeroDivisionError: a bug (sweep/1/error.txt)" in err
-    best = OmegaConf.load(tmp_path / "sweep/optimization_results.yaml")
-    assert best.best_value == max(tried[:1] + tried[2:]) == best.best_params["low.clip"]
-    tried[:] = tried[1:2]  # the failed one, which fails once more
-    assert command(*words, "hydra.sweeper.n_trials=5")[0] == 1
-    assert len(tried) == 3 and tried[0] == tried[1]
 
 
 @needs("hydra-optuna-sweeper")

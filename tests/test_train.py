@@ -197,11 +197,7 @@ def test_a_run_goes_on_in_its_own_folder_with_its_own_rows_before(tmp_path):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["env.controller=congruent", "high=ucb"], "high=none"),
-        (["high=none"], "env.controller"),
-        (["high=fixed", "high.option=sideways"], "incongruent, congruent"),
         (["resume=/nowhere"], "no checkpoint"),
-        (["mode=eval", "checkpoint=/nowhere"], "no checkpoint"),
         (["eval.stop_score=1.97", "eval.every=0"], "set eval.every above 0"),
     ],
 )
@@ -209,20 +205,6 @@ def test_what_cannot_be_is_refused_in_one_line_before_anything_is_written(tmp_pa
     with pytest.raises(ConfigError, match=complaint) as error:
         start(tmp_path / "out", *words)
     assert "\n" not in str(error.value)
-
-
-def test_a_resumed_run_keeps_its_agent(tmp_path):
-    start(tmp_path / "run", "low=random", "high=uniform")
-    words = [f"resume={tmp_path / 'run'}", "low=planner"]
-    with pytest.raises(ConfigError, match="takes the agent from"):
-        run(compose_config(words), tmp_path / "out", words)
-
-
-def test_a_foreign_file_is_no_checkpoint(tmp_path):
-    file = tmp_path / "checkpoint.safetensors"
-    file.write_bytes(b"PK\x03\x04 not a checkpoint")
-    with pytest.raises(ConfigError, match="not a checkpoint"):
-        checkpoint.find(file, "resume")
 
 
 def test_no_score_is_the_mean_of_episodes_that_have_not_ended(tmp_path, monkeypatch):
