@@ -45,7 +45,6 @@ NONE = Box(0.0, 1.0, (0,))
 COUNTS = Box(2, 5, (2,), np.int64)
 SCALAR = Box(0.5, 1.5, ())
 LATE = Box(1.7e9, 1.7e9 + 3600.0, (1,), np.float64)
-MANY = Box(-(2**30), 2**30, (1,), np.int64)
 ORDER = Tuple([UNIT, Discrete(10), PAIR])
 
 TREES: dict[str, Tree] = {
