@@ -52,11 +52,6 @@ def test_widths_are_a_list_or_a_tuple_and_never_a_set():
         HPPO.Options(hidden_dims={8, 4})
 
 
-def test_a_number_in_the_place_of_the_device_is_refused_by_python():
-    with pytest.raises(TypeError, match="takes 2 positional arguments"):
-        HPPO(SPECS, 1e-3)
-
-
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
@@ -94,12 +89,17 @@ def takers_of_a_device():
 
 
 @pytest.mark.parametrize("name", takers_of_a_device())
-@pytest.mark.parametrize("device", ["gpu", "CPU", "cuda:x", "cuda:99", torch.device("cuda:99"), 1.5, True, ["cpu"]])
-def test_a_wrong_device_is_refused_in_one_line(name, device):
-    with pytest.raises(ValueError, match="device=") as raised:
-        takers_of_a_device()[name](device)
-    (line,) = str(raised.value).splitlines()
-    assert "cpu" in line
+def test_a_wrong_device_is_refused_in_one_line_wherever_it_is_given(name):
+    with pytest.raises(ValueError, match=r"device=\W?gpu\W?: .*cpu") as raised:
+        takers_of_a_device()[name]("gpu")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("device", ["CPU", "cuda:x", "cuda:99", torch.device("cuda:99"), 1.5, True, ["cpu"]])
+def test_what_is_no_device_is_refused_in_one_line(device):
+    with pytest.raises(ValueError, match=r"device=.*cpu") as raised:
+        HPPO(SPECS, device=device)
+    assert "\n" not in str(raised.value)
 
 
 def test_a_device_may_be_given_as_an_object():
