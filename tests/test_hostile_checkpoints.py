@@ -241,10 +241,8 @@ def test_learners_are_taken_over_as_a_whole_or_not_at_all(opener):
 
 
 @pytest.mark.parametrize("entry", ["frames", "wall_s", "last_score", "config", "option_names"])
-@pytest.mark.parametrize("value", ["text", [1], math.inf, {"a": 1}, True])
+@pytest.mark.parametrize("value", ["text", [1], True])
 def test_a_policy_with_other_progress_is_refused(entry, value, opener, tmp_path):
-    if (entry, value) == ("config", {"a": 1}):
-        return
     saved = parts_of(opener.folder / "policy.safetensors")
     saved["progress"][entry] = value
     write(tmp_path / "policy.safetensors", saved)

@@ -16,7 +16,6 @@ from hpamdp.data.human.released_file import read
 from hpamdp.data.human.rest_to_rest import MAX_ERROR, MIN_DISTANCE, to_rest_to_rest
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.decisions import with_decisions
 from hpamdp.metrics_file import read_rows
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.low_level.bc import BC
@@ -46,7 +45,9 @@ def overrides(path: str, low: str, high: str = "human") -> list[str]:
     return [*SMALL, f"data.path={path}", f"low={low}", f"high={high}"]
 
 
-@pytest.mark.parametrize("low", ["bc", "iql", "td3_bc", "pdqn", "hsac", "pets"])
+@pytest.mark.parametrize(
+    "low", ["bc", "iql", "pets", *(pytest.param(low, marks=pytest.mark.slow) for low in ("td3_bc", "pdqn", "hsac"))]
+)
 def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, path, tmp_path):
     given = overrides(path, low)
     assert run(compose_config(given), tmp_path, given) == 0
@@ -176,24 +177,6 @@ def test_selectors_of_their_own_choices_alone_train_beside_a_data_set(high, path
     header = (tmp_path / "metrics.csv").read_text().splitlines()[0]
     assert any(name.startswith("high/") for name in header.split(","))
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 256
-
-
-def test_decision_sums_match_those_of_the_decision_tracker(path):
-    batch = human_batch(path)[0]
-    data = read(path, checksum=None, one_frame=True)
-    ends = batch["next", keys.DONE].squeeze(-1)
-    episode = batch["collector", "traj_ids"]
-    returns = torch.zeros(len(data.episodes)).index_add(0, episode, batch["next", keys.REWARD].squeeze(-1))
-    option_return = batch["next", keys.OPTION_RETURN][ends].squeeze(-1)
-    assert torch.allclose(option_return, returns[episode[ends]], atol=1e-4)
-    num_presses = data.episodes["presses"]
-    assert (batch["next", keys.OPTION_STEPS][ends].squeeze(-1) == num_presses[num_presses > 0]).all()
-    firsts = batch[keys.IS_DECISION].squeeze(-1)
-    assert (batch["next", keys.DECISION_OBSERVATION][firsts] == batch[keys.OBSERVATION][firsts]).all()
-    tracked = with_decisions(BoatDockEnv(2)).rollout(2)["next"]
-    for name in (keys.OPTION_RETURN, keys.OPTION_STEPS, keys.DECISION_OBSERVATION):
-        assert tracked[name].dtype == batch["next", name].dtype
-        assert tracked[name].shape[2:] == batch["next", name].shape[1:]
 
 
 def test_recorded_keys_are_translated_to_the_environments_key_map(path):

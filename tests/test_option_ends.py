@@ -163,7 +163,7 @@ def train(selector, batch_steps: int = 10) -> HierarchicalAgent:
 
 @pytest.mark.parametrize(
     ("make", "batch_steps"),
-    [(make_critic, 10), (make_meta_critic, 10), (make_meta_critic, 1)],
+    [(make_critic, 10), (make_meta_critic, 10), pytest.param(make_meta_critic, 1, marks=pytest.mark.slow)],
     ids=["option_critic", "meta_critic", "meta_critic_one_step_a_batch"],
 )
 def test_options_end_where_another_one_is_better(make, batch_steps):
@@ -248,13 +248,6 @@ def test_ends_are_not_learned_where_the_episode_is_over_or_the_option_forbidden(
     rows["next_option_mask"][:32] = True
     critic.update_termination(rows)
     assert all(torch.equal(old, new) for old, new in zip(before, critic.termination.parameters(), strict=True))
-
-
-def test_options_end_with_the_initial_probability():
-    critic = make_critic(initial_termination=0.3)
-    td = TensorDict({keys.OBSERVATION: torch.rand(4000, SPECS.observation_dim), keys.OPTION: torch.zeros(4000).long()})
-    td.batch_size = [4000]
-    assert critic.ends(td).float().mean().item() == pytest.approx(0.3, abs=0.04)
 
 
 def test_options_end_with_the_initial_probability_as_often_as_they_are_random():

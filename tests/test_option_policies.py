@@ -13,32 +13,14 @@ from hpamdp.policies.high_level.meta_critic import MetaCritic
 
 OPTIONS = {
     MetaCritic: dict(
-        hidden_dims=[32, 32],
-        num_members=3,
-        exploration="epsilon",
-        epsilon_final=0.1,
-        epsilon_decisions=1000,
-        ucb_width=2.0,
-        gamma=1.0,
-        buffer_size=4000,
-        batch_size=64,
-        updates_per_decision=0.1,
-        max_updates=64,
-        warmup_decisions=200,
-        lr=3e-3,
-        tau=0.05,
+        hidden_dims=[32, 32], num_members=3, exploration="epsilon", epsilon_final=0.1, epsilon_decisions=1000,
+        ucb_width=2.0, gamma=1.0, buffer_size=4000, batch_size=64, updates_per_decision=0.1, max_updates=64,
+        warmup_decisions=200, lr=3e-3, tau=0.05,
     ),
     Actor: dict(
-        hidden_dims=[32, 32],
-        gamma=1.0,
-        epochs=4,
-        minibatch_size=64,
-        clip=0.2,
-        entropy=0.0,
-        lr=3e-3,
-        max_grad_norm=0.5,
+        hidden_dims=[32, 32], gamma=1.0, epochs=4, minibatch_size=64, clip=0.2, entropy=0.0, lr=3e-3, max_grad_norm=0.5
     ),
-}
+}  # fmt: skip
 
 
 def make(cls: type, seed: int = 0, **changes: object) -> MetaCritic | Actor:

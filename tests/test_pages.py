@@ -29,10 +29,15 @@ SHARED = {
 ALL = [(group, name) for group in FOLDERS for name in choices(group)]
 
 
-@pytest.fixture
-def hooks(monkeypatch):
+@pytest.fixture(scope="module")
+def hooks():
     """The module docs/hooks.py, which mkdocs loads."""
     return load_script(DOCS / "hooks.py")
+
+
+@pytest.fixture(scope="module")
+def site(hooks):
+    return hooks.Site()
 
 
 def page(group: str, name: str) -> Path:
@@ -69,15 +74,14 @@ def test_a_domains_page_names_its_actions_outcomes_and_observations(name):
     assert not [each for each in named if f"`{each}`" not in text]
 
 
-def test_no_link_and_no_directive_of_the_site_leads_nowhere(hooks):
-    site = hooks.Site()
+def test_no_link_and_no_directive_of_the_site_leads_nowhere(site):
     assert not site.problems
     expected = {"index.md", "studies/table1.md", "changelog.md", "api/hpamdp/env/base.md", "tutorials/python.md"}
     assert expected <= site.pages.keys()
 
 
-def test_the_first_page_of_the_reference_has_every_public_name_and_the_others_say_that_they_are_internal(hooks):
-    pages = hooks.Site().pages
+def test_the_first_page_of_the_reference_has_every_public_name_and_the_others_say_that_they_are_internal(hooks, site):
+    pages = site.pages
     for name in hpamdp.__all__:
         assert re.search(rf"\bhpamdp\.{name}\b", pages[hooks.PUBLIC_PAGE]), name
     internal = {place for place, text in pages.items() if "Internal: this module may change" in text}
@@ -235,8 +239,3 @@ def test_the_python_of_a_front_page_runs(name, tmp_path):
             assert hpamdp.load("platform.safetensors").evaluate(episodes=100)["score"] > 0.9
 
     assert forked(follow) == 0
-
-
-def test_the_python_of_the_readme_is_short():
-    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
-    assert len(code.splitlines()) <= 12

@@ -9,7 +9,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch
-from play_players import PLAYER, docked, events_of, played, random_events
+from play_players import docked, events_of, played, random_events
 
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
@@ -163,7 +163,10 @@ needs_node = pytest.mark.skipif(NODE is None, reason="needs node")
 
 @pytest.fixture(scope="module")
 def page_data():
-    return BoatPage(seed=0).data([], has_server=False)
+    """The data of a page with one block of rounds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 1)
+        return BoatPage(seed=0).data([], has_server=False)
 
 
 @needs_node
@@ -261,7 +264,7 @@ def test_the_plans_of_the_page_score_what_the_planner_says(tmp_path, page_data):
 
 def test_the_layouts_of_the_page_are_those_of_no_evaluation_and_follow_the_rules(page_data, monkeypatch):
     layouts = [layout for mode in page_data["layouts"].values() for layout in mode]
-    assert [len(page_data["layouts"][mode]) for mode in ("practice", "round")] == [10, 360]
+    assert [len(page_data["layouts"][mode]) for mode in ("practice", "round")] == [10, 60]
     start, goal = (np.array([layout[name] for layout in layouts]) for name in ("start", "goal"))
     assert np.linalg.norm(start, axis=1).max() <= 110.001 and np.linalg.norm(start - goal, axis=1).min() >= 29.999
     evaluated = torch.stack(harbour.fixed_layouts(1000, 0)[:2], -1).numpy()
@@ -282,7 +285,3 @@ def test_an_agent_of_other_rules_is_refused(settings, said):
     entry = {"name": "other", "title": "a", "score": None, "env": settings, "agent": {}}
     with pytest.raises(EpisodeError, match=f"^other: was trained with {re.escape(said)}$"):
         BoatPage(seed=0).data([entry], has_server=True)
-
-
-def test_the_example_player_number_is_one():
-    assert episodes.check(GOOD).player == PLAYER

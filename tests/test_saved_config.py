@@ -148,7 +148,7 @@ def test_a_file_names_no_code_by_any_way_in(way, of_toy, bait, command, tmp_path
         set_to("choices", "env", "../../bait"),
         set_to("choices", "low", "random,bait"),
     ]
-    for number, change in enumerate(forgeries if way == "eval" else forgeries[:1] + forgeries[-4:]):
+    for number, change in enumerate(forgeries if way == "eval" else [forgeries[0], forgeries[-3]]):
         folder = forged(of_toy, tmp_path / str(number), change)
         code, _, err = command(*(word.format(folder) for word in WAYS_IN[way]))
         assert (code, err.count("\n")) == (2, 1) or way == "low.checkpoint", err  # which takes the networks alone
@@ -273,10 +273,7 @@ def nested(depth: int) -> dict:
     "change",
     [
         set_to("choices", "env", "null"),
-        set_to("choices", "env", "3"),
-        set_to("choices", "env", "hydra"),
         set_to("choices", "env", "x" * 5000),
-        set_to("low", "per_option", {"a": "null"}),
         set_to("low", "per_option", {"a": {"name": ["random"]}}),
         set_to("env", "\x1b[31m", 1),
         set_to("logger", "deep", nested(500)),

@@ -35,18 +35,7 @@ from hpamdp.specs import PAMDPSpecs
 
 
 def make_actor(specs: PAMDPSpecs) -> Actor:
-    return Actor(
-        specs,
-        device=CPU,
-        hidden_dims=[16],
-        gamma=1.0,
-        epochs=1,
-        minibatch_size=8,
-        clip=0.2,
-        entropy=0.0,
-        lr=1e-3,
-        max_grad_norm=1.0,
-    )
+    return Actor(specs, device=CPU, hidden_dims=[16], gamma=1.0, epochs=1, minibatch_size=8, lr=1e-3)
 
 
 def make_exp3(specs: PAMDPSpecs) -> Exp3:
@@ -240,7 +229,12 @@ def test_the_random_agent_has_no_selector_where_there_are_no_options():
 
 
 @pytest.mark.parametrize(
-    "high", [high for high in choices("high") if high not in ("none", "oracle", "human", "uniform")]
+    "high",
+    [
+        pytest.param(high, marks=() if high in ("ucb", "meta_critic", "actor", "value") else pytest.mark.slow)
+        for high in choices("high")
+        if high not in ("none", "oracle", "human", "uniform")
+    ],
 )
 def test_exploring_choices_are_uniform_for_the_first_steps_and_greedy_ones_never(high):
     low = "hppo" if high == "value" else "random"
