@@ -61,25 +61,6 @@ def test_many_discrete_actions_are_passed_in_pieces_with_the_same_values(monkeyp
     torch.testing.assert_close(critics(state, unit), whole)
 
 
-def test_passes_of_a_thousand_discrete_actions_take_no_memory_of_their_square():
-    specs = specs_of(*(1,) * 1000)
-    critics = HybridCritics(specs, 1, [8], is_multipass=True)
-    largest = 0
-
-    class Largest(torch.utils._python_dispatch.TorchDispatchMode):
-        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-            nonlocal largest
-            out = func(*args, **(kwargs or {}))
-            for part in out if isinstance(out, (tuple, list)) else [out]:
-                if isinstance(part, Tensor):
-                    largest = max(largest, part.numel())
-            return out
-
-    with Largest():
-        critics(torch.randn(16, 4), (torch.rand(16, 1000) * 2 - 1).requires_grad_()).sum().backward()
-    assert largest <= 16 * 1000 * 8, "[B, K, H] and not [B, K, K]"
-
-
 WEIGHT = ((0.5, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0))
 INITIAL = replace(specs_of(1, 1), initial_weight=WEIGHT, initial_bias=(0.1, -0.8))
 

@@ -15,12 +15,9 @@ from hpamdp.policies.shared.networks import InvertingGradients
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
-    multipass=True, twin=True, double_q=False, target_smoothing=0.1, target_smoothing_clip=0.2, policy_delay=2,
-    n_step=1, bounding="tanh", hidden_dims=[64, 64], layer_norm=False, warmup_steps=1000, buffer_size=20_000,
-    batch_size=64, updates_per_step=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02,
-    critic_tau=0.02, max_grad_norm=None, parameter_noise=0.1, greedy_samples=0, greedy_noise=0.3, epsilon_final=0.1,
-    epsilon_steps=3000, epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final_fraction=1.0,
-    lr_steps=1000, preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
+    hidden_dims=[64, 64], warmup_steps=1000, buffer_size=20_000, batch_size=64, updates_per_step=0.12, gamma=0.9,
+    critic_lr=1e-3, actor_tau=0.02, critic_tau=0.02, epsilon_final=0.1, epsilon_steps=3000, initial_parameters="none",
+    lr_steps=1000,
 )  # fmt: skip
 PUBLISHED = dict(twin=False, target_smoothing=0.0, policy_delay=1)
 
@@ -167,15 +164,6 @@ def test_inverting_gradients_follow_the_formula_and_turn_back_past_the_bounds():
     torch.testing.assert_close(down, 2.0 * (raw.detach() + 1.0) / 2.0)
 
 
-@pytest.mark.parametrize("bounding", ["tanh", "inverting_gradients"])
-def test_parameters_stay_in_bounds(bounding):
-    learner = make(bounding=bounding, parameter_noise=1.0)
-    learner.policy.epsilon.fill_(0.1)
-    low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
-    td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 30}, [500]))
-    assert (td[keys.PARAMETERS] >= low).all() and (td[keys.PARAMETERS] <= high).all()
-
-
 def test_the_greedy_policy_samples_nothing_and_the_exploring_one_varies_the_whole_action():
     learner, td = make(), states(500)
     with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -252,27 +240,6 @@ def test_variations_of_greedy_parameters_change_neither_exploration_nor_training
         ends.append(learner.state_dict())
     assert ends[0].keys() == ends[1].keys()
     assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
-
-
-def test_discrete_actions_without_parameters_are_learned_too():
-    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_steps=100, greedy_samples=3)
-    td = learner.policy(states(200))
-    assert td[keys.PARAMETERS].shape == (200, 0)
-    is_end = torch.ones(200, 1, dtype=torch.bool)
-    reward = td[keys.DISCRETE].float().unsqueeze(-1)
-    td["next"] = {keys.OBSERVATION: td[keys.OBSERVATION], keys.REWARD: reward}
-    td["next"].update({keys.DONE: is_end, keys.TERMINATED: is_end})
-    for _ in range(4):
-        learner.learn(td.unsqueeze(-1), is_end)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert (learner.policy(states(100))[keys.DISCRETE] == 1).all()
-
-
-def test_a_policy_takes_any_batch_shape():
-    learner = make()
-    for shape in ((), (3,), (3, 2)):
-        td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(*shape, 4)}, shape))
-        assert td[keys.DISCRETE].shape == shape and td[keys.PARAMETERS].shape == (*shape, 3)
 
 
 def test_gradients_are_clipped_to_the_given_norm():
@@ -354,8 +321,7 @@ class TwoHills(torch.nn.Module):
 TWO_HILLS = replace(SPECS, parameter_dims=(0, 2, 1))
 
 
-@pytest.mark.parametrize("bounding", ["tanh", "inverting_gradients"])
-@pytest.mark.parametrize("search_samples", [0, 16])
+@pytest.mark.parametrize(("search_samples", "bounding"), [(0, "tanh"), (16, "tanh"), (16, "inverting_gradients")])
 def test_the_search_brings_the_actor_to_a_higher_hill_that_its_gradient_does_not_see(search_samples, bounding):
     torch.manual_seed(0)
     learner = make(TWO_HILLS, search_samples=search_samples, search_weight=10.0, bounding=bounding, actor_lr=1e-2)
@@ -393,15 +359,6 @@ def test_epsilon_can_fall_with_the_episodes_from_the_start():
     assert learner.policy.epsilon == pytest.approx(0.2)
 
 
-def test_the_learning_rates_fall_to_their_final_fraction():
-    learner = make(lr_final_fraction=0.1, lr_steps=1000, actor_lr=1e-3, critic_lr=3e-3)
-    rates = []
-    for frames in (0, 500, 1000, 5000):
-        learner.on_progress(frames)
-        rates.append([learner.optimizers[name].param_groups[0]["lr"] for name in ("actor", "critics")])
-    assert rates == [pytest.approx([f * 1e-3, f * 3e-3]) for f in (1.0, 0.55, 0.1, 0.1)]
-
-
 def test_updates_with_one_hidden_layer_do_not_count_as_worth_compiling():
     assert make(hidden_dims=[32]).num_updates(10**6) == 0
     assert make(hidden_dims=[32, 32]).num_updates(10**6) > 0
@@ -415,16 +372,9 @@ def test_rewards_are_stored_scaled():
     torch.testing.assert_close(learner.buffer[:]["reward"], 0.1 * td["next", keys.REWARD].flatten())
 
 
-def test_the_published_recipe_has_the_published_settings_and_runs_where_there_are_no_initial_parameters():
+def test_the_published_recipe_runs_where_there_are_no_initial_parameters():
     settings = make_config(["low=pdqn_published", "high=none", "env=platform"]).low.settings
-    expected = dict(
-        bounding="inverting_gradients", max_grad_norm=10.0, critic_lr=1e-3, actor_lr=1e-4, critic_tau=0.1,
-        actor_tau=0.001, epsilon_final=0.01, epsilon_episodes=1000, parameter_noise=1e-4, twin=False,
-        target_smoothing=0.0, policy_delay=1, initial_parameters="domain", multipass=True, random_parameters="actor",
-        noise_process="ornstein_uhlenbeck", hidden_dims=(128,), gamma=0.9, warmup_steps=500, buffer_size=10_000,
-        batch_size=128, n_step=1, double_q=False, updates_per_step=1.0,
-    )  # fmt: skip
-    assert {name: settings[name] for name in expected} == expected
-    learner = make(**{name: value for name, value in settings.items() if name != "budget"})
-    learn(learner, 3)
+    short = {"warmup_steps": 200, "updates_per_step": 0.05}
+    learner = make(**{name: value for name, value in (settings | short).items() if name != "budget"})
+    learn(learner, 2)
     assert learner.updates > 0

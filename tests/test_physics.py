@@ -99,14 +99,6 @@ def assert_agrees(case: Case, expected: Simulated) -> None:
     assert case.fuel - after.fuel.item() == pytest.approx(expected.burnt, abs=2e-3)
 
 
-@EACH
-@given(cases())
-def test_a_press_ends_at_the_event_that_small_time_steps_meet_first(case):
-    expected = simulate(case)
-    assume(expected.margin > 0.1)
-    assert_agrees(case, expected)
-
-
 def test_small_time_steps_agree_on_many_presses_of_every_outcome():
     rng = np.random.default_rng(0)
     met = dict.fromkeys((SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL), 0)

@@ -19,7 +19,7 @@ from hpamdp.env.primitives import players
 from hpamdp.env.primitives.environment import PrimitivesEnv
 from hpamdp.env.primitives.manipulation import OBSERVED, Manipulation
 from hpamdp.env.primitives.options import ACTIONS, Task
-from hpamdp.env.primitives.primitives import OPENING_STEPS, PRIMITIVES, STEPS, phases
+from hpamdp.env.primitives.primitives import OPENING_STEPS, STEPS, phases
 from hpamdp.env.registration import register
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -98,10 +98,6 @@ def test_a_negative_distance_counts_as_0():
     for name in ("lift", "drop", "left", "right", "forward", "backward"):
         (moved,) = PerfectHand().act(name, -0.5)
         np.testing.assert_allclose(moved, 0.0, atol=1e-9)
-
-
-def test_there_are_ten_primitives_with_twelve_arguments():
-    assert len(PRIMITIVES) == 10 and sum(action.num_arguments for action in PRIMITIVES) == 12
 
 
 def test_without_the_simulator_one_line_says_what_to_install(monkeypatch):
@@ -312,20 +308,6 @@ def test_the_ways_of_steering_are_options_that_refuse_the_actions_of_others():
     td = env.reset().update(env.full_action_spec.zero())
     with pytest.raises(ValueError, match="option=0, discrete=0"):
         env.step(td)
-
-
-@needs_simulator
-@pytest.mark.slow
-def test_worker_processes_play_the_same_episodes():
-    seen = []
-    for num_workers in (0, 2):
-        env = PrimitivesEnv(2, num_workers=num_workers, seed=3)
-        td = env.reset()
-        action = env.full_action_spec.zero()
-        action[keys.PARAMETERS].fill_(0.05)
-        seen.append(torch.stack([td[keys.OBSERVATION], env.step(td.update(action))["next", keys.OBSERVATION]]))
-        env.close()
-    torch.testing.assert_close(*seen)
 
 
 @needs_simulator

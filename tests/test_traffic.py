@@ -26,7 +26,6 @@ from hpamdp.env.traffic.environment import TrafficEnv
 from hpamdp.env.traffic.lights import TrafficLights
 from hpamdp.env.traffic.network import ARMS, GREENS, MAX_GREEN, MIN_GREEN, network_file, run_tool
 from hpamdp.env.traffic.options import PHASES, PLAYERS
-from hpamdp.env.traffic.process import SimulationProcess
 from hpamdp.env.traffic.simulation import Simulation, Task
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -120,20 +119,6 @@ def test_no_step_is_taken_before_an_episode_begins_or_after_it_ended(make):
         pass
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(action(0))
-
-
-def test_an_episode_may_have_no_vehicles(make):
-    env = make(TrafficLights, minutes=1, traffic=1e-6)
-    env.reset(seed=1)
-    *_, truncated, results = env.step(action(0, MAX_GREEN))
-    assert truncated and results["throughput"] == 0.0 and results["delay"] == 0.0
-
-
-def test_a_cache_that_cannot_be_written_is_told_in_one_line(monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
-    line = r"^/dev/null/hpamdp/traffic: Not a directory; set XDG_CACHE_HOME to a folder that can be written$"
-    with pytest.raises(SettingError, match=line):
-        network_file("crossing")
 
 
 def test_three_seconds_of_yellow_stand_between_different_phases_and_none_between_equal_ones(tmp_path):
@@ -365,13 +350,6 @@ def test_a_simulation_removes_no_folder_but_its_own(tmp_path):
     assert (tmp_path / "thesis.txt").is_file()
 
 
-def test_the_process_of_sumo_has_the_methods_of_a_simulation_alone():
-    process = SimulationProcess.__new__(SimulationProcess)
-    assert callable(process.act)
-    with pytest.raises(AttributeError, match="'SimulationProcess' object has no attribute 'acct'"):
-        process.acct(0, 1.0)
-
-
 def test_several_who_need_a_network_at_once_make_it_once(tmp_path, monkeypatch):
     monkeypatch.setattr(network, "user_cache_path", lambda name: tmp_path)
     made = []
@@ -397,18 +375,3 @@ def test_it_can_be_drawn(env_id):
     assert picture.dtype == np.uint8 and picture.shape == (480, 480, 3)
     assert (picture != empty).any()
     env.close()
-
-
-@pytest.mark.slow
-def test_copies_in_worker_processes_have_the_same_episodes_and_players(make):
-    one, other = make(TrafficEnv, 3), make(TrafficEnv, 3, num_workers=2)
-    results = []
-    for env in (one, other):
-        env.reset(env.fixed_episodes(1))
-        while not env._is_over.all():
-            discrete = torch.ones(3, dtype=torch.int64)
-            parameters = torch.full((3, 4), 30.0, dtype=torch.float32)
-            env.step(TensorDict({keys.DISCRETE: discrete, keys.PARAMETERS: parameters}, batch_size=[3]))
-        results.append((env.played(), env.references({})))
-    assert all((results[0][0][name] == column).all() for name, column in results[1][0].items())
-    assert results[0][1] == results[1][1]

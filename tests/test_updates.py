@@ -17,7 +17,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from toy_steps import SPECS, one_step_rows, sample
 
 from hpamdp.config.errors import ConfigError
-from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.policies.base import added_later
 from hpamdp.policies.low_level.dlpa.learner import DLPA
@@ -77,11 +76,6 @@ def test_a_learner_takes_its_options_as_a_whole_or_single_settings(cls):
     changed = cls.Options(gamma=0.5)
     assert cls(SPECS).options == cls.Options() != changed
     assert cls(SPECS, options=changed).options == cls(SPECS, gamma=0.5).options == changed
-
-
-def test_augment_auto_maps_samples_only_where_the_problem_declares_symmetries():
-    assert PDQN(SPECS, augment="auto").symmetry is None
-    assert PDQN(PAMDPSpecs.from_env(CatchPointEnv(1)), augment="auto").symmetry is not None
 
 
 def test_a_step_is_that_of_plain_adam_however_the_gradient_lies_in_memory():
