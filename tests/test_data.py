@@ -111,6 +111,17 @@ def test_demonstrations_hold_the_decisions_that_they_are_given_and_name_missing_
         Demonstrations(rows, decisions=decisions.exclude(keys.OPTION, ("next", keys.OPTION_RETURN)))
 
 
+def test_people_who_are_held_out_stand_beside_the_batch_and_must_be_told_apart():
+    rows = episodes(2, 3, 1)
+    with pytest.raises(DataError, match=r"held_out: the transitions do not say who acted \(person\)"):
+        Demonstrations(rows, held_out=[4])
+    rows["person"] = torch.tensor([4, 4, 6, 6, 6, 4])
+    split = Demonstrations(rows, held_out=[6])
+    assert split.batch["person"].tolist() == [[4, 4, 4]] and split.held_out["person"].tolist() == [[6, 6, 6]]
+    whole = Demonstrations(rows).batch[0]
+    assert (split.held_out[0] == whole[2:5]).all() and (split.batch[0] == whole[[0, 1, 5]]).all()
+
+
 def test_demonstrations_are_discounted_as_a_selector_asks():
     rows = episodes(2, 2)
     demonstrations = Demonstrations(rows)

@@ -190,6 +190,15 @@ def test_selected_episodes_meet_every_condition_and_keep_their_presses(data):
     of = data.episodes[data.presses["episode"]]
     kept = (of["person"] == best) & of["complete"] & (of["outcome"] == physics.SUCCESS) & (of["controller"] == 1)
     assert torch.equal(chosen.presses["duration"], data.presses["duration"][kept])
+    scores = scores_by_person(data)
+    assert select(data, worst_people=1).episodes["person"].unique().tolist() == [int(scores.argmin())]
+    assert select(data, people=[0, 2], best_people=1).episodes["person"].unique().tolist() == [
+        int(scores[::2].argmax()) * 2
+    ]
+    few = select(data, presses=30)
+    for person in range(3):
+        own, every = (each.episodes[each.episodes["person"] == person]["presses"] for each in (few, data))
+        assert own.sum() <= 30 < own.sum() + every[len(own)] and torch.equal(own, every[: len(own)])
     with pytest.raises(DataError, match="best_people=9, but must be 1 to 3"):
         select(data, best_people=9)
 

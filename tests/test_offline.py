@@ -258,6 +258,50 @@ def test_impossible_configs_are_refused_in_one_line(given, line):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize(("low", "shared"), [("pets", True), ("bc", False)])
+def test_metrics_show_the_losses_on_people_who_are_held_out(low, shared, path, tmp_path):
+    given = [*overrides(path, low), "data.held_out=[1]", "offline.updates=60", "offline.eval_every=20"]
+    assert run(compose_config(given), tmp_path, given) == 0
+    rows = [row for row in read_rows(tmp_path / "metrics.csv") if row["frames"] > 0]
+    name = "low/held_out_loss" if shared else "low/congruent/held_out_loss"
+    assert len(rows) == 3 and rows[-1][name] < rows[0][name]
+    resumed = ["mode=offline", f"resume={tmp_path}", "offline.updates=80"]
+    assert run(compose_config(resumed), tmp_path / "resumed", resumed) == 0
+    assert read_rows(tmp_path / "resumed" / "metrics.csv")[-1][name] < rows[0][name]
+
+
+def test_nothing_learns_from_people_who_are_held_out(path):
+    parts = assemble(make_config([*overrides(path, "pets", "linucb"), "data.held_out=[0,2]"]))
+    data = parts.data
+    assert data.batch["person"].unique().tolist() == data.decisions["person"].unique().tolist() == [1]
+    assert data.held_out["person"].unique().tolist() == [0, 2]
+    parts.agent.add_demonstrations(data.batch, data.decisions)
+    learner = parts.agent.learners[0]
+    stored = learner.buffer[:].clone()
+    assert len(stored) == data.batch.numel()
+    parts.agent.update(2)
+    weights = {name: value.clone() for name, value in parts.agent.state_dict().items()}
+    assert parts.agent.held_out_losses(data.held_out)["low/held_out_loss"] > 0.0
+    assert (learner.buffer[:] == stored).all()
+    assert all(torch.equal(value, weights[name]) for name, value in parts.agent.state_dict().items())
+
+
+PEOPLE_REFUSED = [
+    ("data.held_out=[7]", "held_out: the transitions have nobody with the number 7"),
+    ("data.held_out=[0,1,2]", "held_out: the transitions are of nobody else"),
+    ("data.people=[5]", "people: nobody has the number 5; the numbers are 0 to 2"),
+    ("data.people=[]", "people"),
+    ("data.worst_people=4", "worst_people=4, but must be 1 to 3"),
+]
+
+
+@pytest.mark.parametrize(("word", "line"), PEOPLE_REFUSED, ids=[word for word, _ in PEOPLE_REFUSED])
+def test_a_choice_of_people_that_leaves_nothing_is_refused_in_one_line(word, line, path):
+    with pytest.raises(ConfigError, match=line) as refusal:
+        assemble(make_config([*overrides(path, "pets"), word]))
+    assert "\n" not in str(refusal.value)
+
+
 def test_an_offline_run_can_be_resumed_and_fine_tuned_online(path, tmp_path):
     given = overrides(path, "iql")
     assert run(compose_config(given), tmp_path / "a", given) == 0

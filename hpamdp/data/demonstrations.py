@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
 from hpamdp.data import DataError
 from hpamdp.data.row_checks import (
+    PERSON,
     TRAJECTORY,
     check_actions,
     check_decisions,
@@ -37,35 +40,48 @@ class Demonstrations:
             may allow nothing; `check` opens it.
             `pair_mask`, `parameter_low` and `parameter_high` are required if the environment gives them.
             `("next", "duration")`, finite and at least 0, goes with environments whose steps take different times.
-            Without it learners discount all these steps alike.
+            Without it learners discount all these steps alike. `person` `[M]` int64 is the number of who acted.
         device: where the tensors are kept.
         decisions: `[K]`, for selectors, if more is known of the options' returns than the transitions show. At the root
             `option`; under `next` `decision_observation`, `option_return`, `option_steps`, `observation`, `done` and
             `is_decision`, which is true. If None, selectors learn from the decisions in the transitions.
+        held_out: numbers of people whose transitions and decisions nothing learns from. Both then need a `person`.
 
     Attributes:
         batch: the transitions `[1, M]`, with the sums that `with_option_sums` adds.
         decisions: `[1, K]` or None.
+        held_out: the transitions of held-out people, `[1, H]`; None if there are none.
 
     Raises:
         SettingError: this machine does not have the device.
-        DataError: a key is missing, the episodes are out of order, or a value is wrong; the message names its row.
+        DataError: a key is missing, the episodes are out of order, or a value is wrong; the message names its row. Or
+            a held-out person is not in the data, or nobody else is.
     """
 
     batch: TensorDict
     decisions: TensorDict | None
+    held_out: TensorDict | None
 
     def __init__(
-        self, transitions: TensorDict, device: torch.device | str | None = None, *, decisions: TensorDict | None = None
+        self,
+        transitions: TensorDict,
+        device: torch.device | str | None = None,
+        *,
+        decisions: TensorDict | None = None,
+        held_out: Sequence[int] = (),
     ) -> None:
         device = None if device is None else checked_device(self, device)
         check_transitions(transitions)
         with_sums = with_option_sums(transitions)
         check_returns(with_sums)
+        self.held_out = self.decisions = None
+        if held_out:
+            with_sums, held_out_rows = _split("the transitions", with_sums, held_out)
+            self.held_out = _batch(held_out_rows, device)
         self.batch = _batch(with_sums, device)
-        self.decisions = None
         if decisions is not None:
             check_decisions(decisions)
+            decisions = _split("the decisions", decisions, held_out)[0] if held_out else decisions
             self.decisions = _batch(decisions, device)
 
     def check(self, specs: PAMDPSpecs) -> None:
@@ -78,6 +94,9 @@ class Demonstrations:
         """
         check_actions(self.batch.squeeze(0), specs)
         self.batch = _with_open_masks(self.batch, specs)
+        if self.held_out is not None:
+            check_actions(self.held_out.squeeze(0), specs)
+            self.held_out = _with_open_masks(self.held_out, specs)
         if self.decisions is not None and specs.num_options:
             check_options("the decisions", self.decisions.squeeze(0), specs)
             self.decisions = _with_open_masks(self.decisions, specs)
@@ -93,6 +112,20 @@ class Demonstrations:
         if self.decisions is not None:
             raise DataError("its decisions' returns are known only undiscounted; use 1")
         self.batch = with_option_sums(self.batch.squeeze(0), gamma).unsqueeze(0)
+
+
+def _split(what: str, rows: TensorDict, held_out: Sequence[int]) -> tuple[TensorDict, TensorDict]:
+    """Return the rows `[N]` of the people who are not held out, and those of the people who are."""
+    if PERSON not in rows.keys():
+        raise DataError(f"held_out: {what} do not say who acted ({PERSON})")
+    person = rows[PERSON]
+    absent = set(held_out).difference(person.tolist())
+    if absent:
+        raise DataError(f"held_out: {what} have nobody with the number {min(absent)}")
+    is_held_out = torch.isin(person, torch.tensor(held_out, device=person.device))
+    if is_held_out.all():
+        raise DataError(f"held_out: {what} are of nobody else")
+    return rows[~is_held_out], rows[is_held_out]
 
 
 def _with_open_masks(batch: TensorDict, specs: PAMDPSpecs) -> TensorDict:

@@ -19,6 +19,7 @@ from hpamdp.specs import PAMDPSpecs
 
 TRAJECTORY = ("collector", "traj_ids")  # the number of a row's episode, where TorchRL's collectors write it
 DURATION = ("next", keys.DURATION)
+PERSON = "person"  # who acted
 
 _Key = str | tuple[str, ...]
 _FLOAT, _INT, _BOOL = torch.float32, torch.int64, torch.bool
@@ -46,6 +47,7 @@ _DECISIONS: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
     ("next", keys.IS_DECISION): (_BOOL, (1,)),
 }
 _OPTIONAL: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
+    PERSON: (_INT, ()),
     keys.OPTION: (_INT, ()),
     keys.ACTION_MASK: (_BOOL, (None,)),
     ("next", keys.ACTION_MASK): (_BOOL, (None,)),

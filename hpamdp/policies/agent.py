@@ -545,6 +545,13 @@ class HierarchicalAgent(nn.Module):
             scalars.update({f"{self._prefix_of(i)}/{name}": value for name, value in learned.items()})
         return scalars
 
+    def held_out_losses(self, batch: TensorDictBase) -> dict[str, float]:
+        """Return the learners' losses on transitions `[*B, T]` that nothing learns from, by their names in logs."""
+        scalars: dict[str, float] = {}
+        for view in self._views(batch):
+            scalars |= view.named(view.learner.held_out_losses(view.batch, view.mask))
+        return scalars
+
     def without_update(self) -> list[str]:
         """Return the names, as in logs, of the selector and the learners that have made no update yet."""
         levels: list[tuple[str, Level]] = [] if self.selector is None else [("high", self.selector)]

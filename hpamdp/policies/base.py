@@ -667,6 +667,14 @@ class Learner(Level, nn.Module):
         """
         raise NotImplementedError
 
+    def held_out_losses(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
+        """Return losses on transitions in `mask` that the learner has not learned from, without learning from them.
+
+        Called before a row of metrics with `mode=offline`, if the data set holds people out. Override it if a held-out
+        loss tells how good the learner is.
+        """
+        return {}
+
     def compile_updates(self) -> None:
         """Make updates by code that `torch.compile` compiles. Override it if the learner can.
 

@@ -98,7 +98,8 @@ def _assemble(config: Config, env: PAMDPEnv, device: torch.device) -> AssembledR
     if run.mode != "eval":
         set_up_updates(config, agent)
     is_new = run.mode != "eval" and run.resume is None
-    data = make_data(config, env, _gamma(agent)) if is_new else None
+    holds_out = run.mode == "offline" and bool(getattr(config.data.options, "held_out", ()))
+    data = make_data(config, env, _gamma(agent)) if is_new or holds_out else None
     if is_new and run.low.checkpoint is not None:
         checkpoint.load_learners(checkpoint.find(run.low.checkpoint, "low.checkpoint"), agent, device)
     capacity.check_length(config, agent, with_learners(config, agent))

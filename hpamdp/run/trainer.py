@@ -300,6 +300,9 @@ class Trainer:
             to_next_row = [every - self.frames % every for every in (run.eval_every, run.log_every) if every > 0]
             num = min(_UPDATES_A_TURN, run.num_frames - self.frames, *to_next_row)
             scalars = self.parts.agent.update(num)
+            held_out = None if self.parts.data is None else self.parts.data.held_out
+            if held_out is not None and num in (run.num_frames - self.frames, *to_next_row):
+                scalars |= self.parts.agent.held_out_losses(held_out)
             check_scalars(scalars)
             self.recorder.take(None, scalars)
             return num

@@ -16,6 +16,7 @@ from hpamdp.data.human.options import CARDS, HumanOptions, PeoplesOptions, Playe
 from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.data.human.rest_to_rest import to_rest_to_rest
 from hpamdp.data.human.transitions import decisions, transitions
+from hpamdp.data.row_checks import PERSON
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.settings import SettingError
@@ -47,7 +48,7 @@ class HumanDemonstrations(Demonstrations):
         path = None if self.options.path is None else Path(self.options.path)
         data = read(path, checksum=self.options.checksum, one_frame=True)
         rows, recorded = _as_returned(data, boats, self.options, complete=self.options.complete)
-        super().__init__(rows, boats.device, decisions=recorded)
+        super().__init__(rows, boats.device, decisions=recorded, held_out=self.options.held_out)
 
 
 class PlayedDemonstrations(Demonstrations):
@@ -69,7 +70,7 @@ class PlayedDemonstrations(Demonstrations):
         boats = _boats(env)
         data = played_file.read(self.options.path, practice=self.options.practice)
         rows, recorded = _as_returned(data, boats, self.options)
-        super().__init__(rows, boats.device, decisions=recorded)
+        super().__init__(rows, boats.device, decisions=recorded, held_out=self.options.held_out)
 
 
 def _boats(env: object) -> BoatDockEnv:
@@ -95,10 +96,16 @@ def _as_returned(
         data,
         complete=complete,
         successes=options.successes,
+        people=options.people,
         best_people=options.best_people,
+        worst_people=options.worst_people,
+        presses=options.presses,
         controller=_controller_of(env),
     )
-    recorded = decisions(data, reward=rules.reward, observation=rules.observation) if env.has_choice else None
+    recorded = None
+    if env.has_choice:
+        recorded = decisions(data, reward=rules.reward, observation=rules.observation)
+        recorded[PERSON] = data.episodes["person"].clone()
     if options.rest_to_rest and len(data.presses):
         data = to_rest_to_rest(data, clean=options.rest_to_rest == "clean")
         if not len(data.presses):
@@ -106,6 +113,7 @@ def _as_returned(
     if isinstance(rules.keymap, int):
         data = with_keymap(data, rules.keymap)
     rows = transitions(data, reward=rules.reward, observation=rules.observation, has_choice=env.has_choice)
+    rows[PERSON] = data.episodes["person"][data.presses["episode"]]
     return rows, recorded
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -47,12 +49,27 @@ def check_conditions(complete: object, successes: object, best_people: object, c
         raise DataError(f"controller={as_code(controller)}, but must be one of {', '.join(harbour.CONTROLLERS)}")
 
 
+def _best_first(data: HumanData, people: Collection[int] | None) -> list[int]:
+    """Return the numbers of the people in `data`, or of those in `people`, by their mean scores, the highest first."""
+    scores = scores_by_person(data)
+    present = scores.isfinite().nonzero().squeeze(1).tolist()
+    unknown = set(() if people is None else people).difference(present)
+    if unknown:
+        raise DataError(
+            f"people: nobody has the number {min(unknown)}; the numbers are {min(present)} to {max(present)}"
+        )
+    return sorted(present if people is None else set(people), key=lambda person: -float(scores[person]))
+
+
 def select(
     data: HumanData,
     *,
     complete: bool = False,
     successes: bool = False,
+    people: Collection[int] | None = None,
     best_people: int | None = None,
+    worst_people: int | None = None,
+    presses: int | None = None,
     controller: str | None = None,
 ) -> HumanData:
     """Return the episodes that meet every condition.
@@ -60,8 +77,11 @@ def select(
     Args:
         complete: only episodes with a complete log of presses.
         successes: only episodes that ended in the dock.
-        best_people: only episodes of this many people with the highest mean scores over all their episodes in `data`.
-            If None, of all people.
+        people: only episodes of the people with these numbers. If None, of all people.
+        best_people, worst_people: of these, only episodes of this many people with the highest, or the lowest, mean
+            scores over all their episodes in `data`. If None, of all of them.
+        presses: only the first episodes of each person that meet the other conditions and have at most this many
+            logged presses together. If None, all of them.
         controller: only episodes with the `congruent` or the `incongruent` controller. If None, with either.
 
     Raises:
@@ -74,14 +94,20 @@ def select(
         mask &= episodes["complete"]
     if successes:
         mask &= episodes["outcome"] == physics.SUCCESS
-    if best_people is not None:
-        scores = scores_by_person(data).nan_to_num(nan=-torch.inf)
-        num_people = int(scores.isfinite().sum())
-        if not 1 <= best_people <= num_people:
-            raise DataError(f"best_people={best_people}, but must be 1 to {num_people}")
-        mask &= torch.isin(episodes["person"], scores.topk(best_people).indices)
+    ranked = _best_first(data, people)
+    chosen = set(ranked)
+    for name, count, end in (("best_people", best_people, ranked), ("worst_people", worst_people, ranked[::-1])):
+        if count is not None:
+            if not 1 <= count <= len(ranked):
+                raise DataError(f"{name}={count}, but must be 1 to {len(ranked)}")
+            chosen &= set(end[:count])
+    mask &= torch.isin(episodes["person"], torch.tensor(sorted(chosen)))
     if controller is not None:
         mask &= episodes["controller"] == harbour.CONTROLLERS.index(controller)
+    if presses is not None:
+        for person in chosen:
+            of_person = mask & (episodes["person"] == person)
+            mask &= ~of_person | ((episodes["presses"] * of_person).cumsum(0) <= presses)
     if not mask.any():
         raise DataError("no episode meets all the conditions")
     return keep(data, mask)

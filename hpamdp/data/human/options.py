@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import PositiveInt
+from pydantic import Field, PositiveInt
 
 from hpamdp.cards import DataCard
-from hpamdp.settings import Settings
+from hpamdp.settings import Indices, Settings
 
 SHA256 = "9de16874b43de9e377c2c10749cb2bd435a6db3ca7cead445b826d64ec399d20"
 
@@ -17,8 +17,16 @@ class PeoplesOptions(Settings):
 
     successes: bool = False
     """Take only episodes that ended in the dock."""
+    people: Annotated[Indices, Field(min_length=1)] | None = None
+    """Take only episodes of the people with these numbers, such as [0, 7]. If null, of all people."""
     best_people: PositiveInt | None = None
-    """Take only episodes of this many people with the highest mean scores. If null, of all people."""
+    """Of these, take only this many people with the highest mean scores. If null, all of them."""
+    worst_people: PositiveInt | None = None
+    """Of these, take only this many people with the lowest mean scores. If null, all of them."""
+    held_out: Indices = ()
+    """Numbers of people from whom nothing learns. `metrics.csv` shows the learners' losses on their presses."""
+    presses: PositiveInt | None = None
+    """Take only each person's first episodes, with at most this many logged presses together. If null, all."""
     rest_to_rest: Literal["clean"] | bool = True
     """Convert interrupted presses to rest-to-rest presses, the only presses that the environment has.
 

@@ -23,7 +23,7 @@ from hpamdp.policies.low_level.bc_options import CARDS, BCOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
 from hpamdp.policies.shared.options import ReplayOptions
-from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.replay import ReplayLearner, unpacked_states
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -68,3 +68,9 @@ class BC(ReplayLearner):
         discrete_log_prob, parameter_log_prob = (self.specs.components.total(each) for each in log_probs)
         scalars = {"discrete_log_prob": discrete_log_prob.mean(), "parameter_log_prob": parameter_log_prob.mean()}
         return -(discrete_log_prob + parameter_log_prob).mean(), scalars
+
+    def stored_losses(self) -> dict[str, Tensor]:
+        """Return the negative log-likelihood of all stored actions, and its parts."""
+        rows = unpacked_states(self.buffer[:], self.specs)
+        loss, parts = self.loss(rows, self.allowed(rows))
+        return {"loss": loss, **parts}

@@ -6,6 +6,7 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import torch
@@ -230,15 +231,33 @@ class ReplayLearner(Learner):
 
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
         """Return the rows that the buffer would store of a batch `[*B, T]`."""
+        with self._storing_only(batch, torch.ones(batch.shape, dtype=torch.bool, device=self.frames.device)):
+            return {"buffer": self.buffer[:]}
+
+    @contextmanager
+    def _storing_only(self, batch: TensorDictBase, mask: Tensor) -> Iterator[None]:
+        """Let the buffer hold only the transitions in `mask` of a batch `[*B, T]` while the block runs."""
         own, last_rows = self.buffer, None if self.links is None else self.links.last_rows
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(batch.numel(), device=self.frames.device))
         try:
-            self.store(batch, torch.ones(batch.shape, dtype=torch.bool, device=self.frames.device))
-            return {"buffer": self.buffer[:]}
+            self.store(batch, mask)
+            yield
         finally:
             self.buffer = own
             if self.links is not None and last_rows is not None:
                 self.links.last_rows = last_rows
+
+    @torch.no_grad()
+    def held_out_losses(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
+        """Return the losses of `stored_losses` on transitions that the buffer does not hold, named `held_out_...`."""
+        if self.memory_key is not None or not mask.any():
+            return {}
+        with self._storing_only(batch, mask):
+            return {f"held_out_{name}": value.item() for name, value in self.stored_losses().items()}
+
+    def stored_losses(self) -> dict[str, Tensor]:
+        """Return the loss on all stored transitions, and its parts. A subclass may implement it; it has no memory."""
+        return {}
 
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Yield samples for `num_batches` updates, each with transitions `[batch_size]`."""

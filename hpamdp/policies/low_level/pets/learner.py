@@ -187,6 +187,12 @@ class PETS(ReplayLearner):
         loss = self.options.transition_weight * parts["change"] + parts["termination"] + parts["reward"]
         return loss * self.model.num_members, parts
 
+    def stored_losses(self) -> dict[str, Tensor]:
+        """Return the members' mean loss on all stored steps, and its parts, at the model's present scales."""
+        rows = self.prepared(fits=False)
+        loss, parts = self.loss(rows.expand(self.model.num_members, len(rows)))
+        return {"loss": loss / self.model.num_members, **parts}
+
     def _context(self, sample: TensorDictBase) -> Tensor | None:
         """Return what is remembered of the observations before those of a sample, `[E, B, context_dim]`, if anything.
 
@@ -222,8 +228,8 @@ class PETS(ReplayLearner):
                 sample.update(past.unflatten(0, places.shape))
             yield sample
 
-    def prepared(self) -> TensorDict:
-        """Fit the model's scales to all stored steps; return these in the canonical frame, as the model sees them."""
+    def prepared(self, *, fits: bool = True) -> TensorDict:
+        """Return all stored steps in the canonical frame, as the model sees them; first fit its scales, if `fits`."""
         stored = self.buffer[:].select("state", "discrete", "unit", "next_state", "reward", "terminated")
         frame = self.model.frame
         if self.symmetry is not None and not frame.turns:
@@ -250,7 +256,8 @@ class PETS(ReplayLearner):
             kind, own, reward, terminated = (torch.cat([part, part]) for part in (kind, own, reward, terminated))
             certainty = None if certainty is None else torch.cat([certainty, certainty])
         action = self.model.action_inputs(kind, own, certainty)
-        self.model.fit_scales(turned[0], action, turned[1], reward, terminated)
+        if fits:
+            self.model.fit_scales(turned[0], action, turned[1], reward, terminated)
         mean, scale = self.model.reward_mean, self.model.reward_scale
         which = terminated.long()
         contexts: dict[str, Tensor] = {}
