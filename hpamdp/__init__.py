@@ -4,7 +4,7 @@ The names below are all that a user needs. Everything else is internal and may c
 
 - `make`, `make_gymnasium`: a problem as a TorchRL or as a Gymnasium environment.
 - `train`, `load`: train an agent, or load a trained one. Both return an `Agent`, which acts, is evaluated and saved.
-- `report`: statistics over seeds of the runs in a folder.
+- `report`: statistics over seeds of the runs in a folder. `judge`: what recorded transitions say of trained agents.
 - `Callback`: the base of code that runs during training. `BestAgent`, `Patience`, `TimeLimit` and `OwnMetrics` are
   callbacks to choose from.
 - `PAMDPSpecs`: sizes and bounds of a problem, `PAMDPSpecs.from_env(env)`. Learners and selectors are built from it.

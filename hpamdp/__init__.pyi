@@ -1,6 +1,7 @@
 """The public names of the package, with their modules."""
 
 from .api.agent import Agent as Agent
+from .api.judging import judge as judge
 from .api.making import make as make
 from .api.making import make_gymnasium as make_gymnasium
 from .api.reporting import report as report

@@ -48,7 +48,12 @@ from hpamdp.search_path import protect_children, put_working_directory_last, unp
 from hpamdp.shell import program
 
 # Further commands, and the modules whose `main` gets the words that follow and a parser.
-_COMMANDS = {"watch": "hpamdp.run.watch", "play": "hpamdp.run.play", "report": "hpamdp.analysis.seed_report"}
+_COMMANDS = {
+    "watch": "hpamdp.run.watch",
+    "play": "hpamdp.run.play",
+    "report": "hpamdp.analysis.seed_report",
+    "judge": "hpamdp.run.judge",
+}
 # Errors that Hydra raises for a wrong command line or yaml file.
 _BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError)
 # Errors that no other setting can avoid: a full disk, limits of the process, a medium that is read only.

@@ -51,6 +51,8 @@ Examples
       films the agent of a run; see {program} watch --help
   {program} report FOLDER
       compares the runs in a folder by their means over seeds; see {program} report --help
+  {program} judge FOLDER... data=human
+      orders agents by recorded actions, without their problem; see {program} judge --help
   {program} low=hyar --cfg job
       shows every value and setting without running
   {program} --hydra-help

@@ -153,12 +153,9 @@ class PETSModel(nn.Module):
             precision: of the networks.
         """
         context, state = self.split(state)
-        direction, certainty = self._pointing(context, state, discrete)
+        turned, direction, x = self._turned(context, state, discrete, own)
         if self.frame.is_revealed:
             context = None
-        turned = state if direction is None else self.frame.turn(state, direction)
-        kind = discrete if direction is None else self.frame.kind[discrete]
-        x = self._inputs(turned, self.action_inputs(kind, own, certainty))
         seen = self._with_context(context, x)
         if self.is_probabilistic:
             change = self._changed(self._sampled(self.transition(seen, precision)))
@@ -175,6 +172,22 @@ class PETSModel(nn.Module):
             terminating * scale[1] + mean[1],
             logit,
         )
+
+    def _turned(
+        self, context: Tensor | None, state: Tensor, discrete: Tensor, own: Tensor
+    ) -> tuple[Tensor, Tensor | None, Tensor]:
+        """Return turned states, the directions that they were turned by, if any, and the networks' inputs."""
+        direction, certainty = self._pointing(context, state, discrete)
+        turned = state if direction is None else self.frame.turn(state, direction)
+        kind = discrete if direction is None else self.frame.kind[discrete]
+        return turned, direction, self._inputs(turned, self.action_inputs(kind, own, certainty))
+
+    def inputs(self, state: Tensor, discrete: Tensor, own: Tensor) -> Tensor:
+        """Return what the networks see of states and actions in the canonical frame, `[*B, in]`, without a memory.
+
+        The arguments are those of `forward`, of any batch.
+        """
+        return self._turned(None, state, discrete, own)[2]
 
     def scaled_change(self, state: Tensor, discrete: Tensor, next_state: Tensor) -> Tensor:
         """Return predicted changes in the canonical frame and in units of the usual change, `[E, B, observation_dim]`.

@@ -1,0 +1,44 @@
+"""Judge trained agents by recorded transitions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hpamdp.api.arguments import path_argument
+from hpamdp.config.errors import ConfigError
+from hpamdp.messages import as_code
+from hpamdp.run.judge import DEFAULT_EPISODES, judged
+
+
+def judge(*agents: str | Path, data: str, episodes: int = DEFAULT_EPISODES, **settings: Any) -> list[dict[str, Any]]:
+    """Return what recorded transitions say of trained agents, as `hpamdp judge` prints it.
+
+    An ensemble (`low=pets`) learns the recorded transitions and rolls the agents out. No environment is stepped.
+
+    Args:
+        agents: folders of runs, or names of agents that come with the package, all of one problem.
+        data: the data set, such as `human`. If the agents' runs hold out the same people, their transitions are taken.
+        episodes: recorded episodes from whose starts the agents act.
+        settings: further settings of `mode=offline low=pets`, such as `**{"data.held_out": [3, 4]}`.
+
+    Returns:
+        A row for each agent, the highest return first:
+        - `agent`; `return`: the mean undiscounted return; `interval`: its 95 % interval over people (Student's t), or
+          over starts if the data tell of no people;
+        - `between_members`: standard deviation of the mean over the members of the ensemble;
+        - `coverage`: fraction of the actions that are like a recorded one in a recorded state;
+        - `steps`, and `unfinished`: probability that an episode lasts longer than all recorded ones;
+        - `doubts`: what the data cannot tell.
+
+    Raises:
+        ConfigError: an argument is wrong, an agent does not exist, or the data cannot judge it.
+
+    Example:
+        >>> import hpamdp
+        >>> rows = hpamdp.judge("outputs/a", "outputs/b", data="human")  # doctest: +SKIP
+    """
+    if isinstance(episodes, bool) or not isinstance(episodes, int) or episodes < 1:
+        raise ConfigError(f"episodes={as_code(episodes)}: must be a whole number of at least 1")
+    paths = [str(path_argument("agents", agent)) for agent in agents]
+    return judged(paths, [f"data={data}"], list(settings.items()), episodes=episodes)

@@ -1,0 +1,177 @@
+"""Run `hpamdp judge`: order trained agents by recorded transitions alone, and say where these do not suffice."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from hpamdp import keys
+from hpamdp.analysis.study import mean_interval
+from hpamdp.config.compose import choosing, read, setting_of
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.outside_jobs import composed
+from hpamdp.config.schema import Config
+from hpamdp.env.decisions import decision_tracker
+from hpamdp.messages import say
+from hpamdp.run.assemble import make_data, option_length
+from hpamdp.run.off_policy import RecordedProblem, Rollout, starts_of
+from hpamdp.run.players import LoadedAgent, add_config_dir, load_agent, whole_number, with_config_dirs
+from hpamdp.specs import PAMDPSpecs
+
+DEFAULT_EPISODES = 100
+_DESCRIPTION = """\
+Order trained agents by recorded transitions, without their environment. A model of the transitions predicts what each
+agent gets. Let it learn from people of whom the agents know nothing:
+
+  python run.py mode=offline data=human data.held_out=[0,3,6,9,12] high=linucb low=iql    # a run, and others like it
+  hpamdp judge outputs/DATE/TIME outputs/DATE/TIME data=human data.rest_to_rest=clean
+
+SETTING=VALUE are those of `mode=offline low=pets`. If the runs hold out the same people, data.held_out is theirs.
+"""
+_LEAST_COVERED, _MOST_UNFINISHED = 0.8, 0.05
+
+
+def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
+    """Print a line for each agent, the best first, and what the data cannot tell; return the exit code.
+
+    Raises:
+        ConfigError: a word is wrong, an agent does not exist, or the data cannot judge it.
+    """
+    parser.description = _DESCRIPTION
+    parser.add_argument("words", nargs="+", metavar="AGENT or SETTING=VALUE", help="the agents, and the data")
+    parser.add_argument(
+        "--episodes",
+        type=whole_number(1, 10_000),
+        default=DEFAULT_EPISODES,
+        help=f"starts of recorded episodes ({DEFAULT_EPISODES})",
+    )
+    add_config_dir(parser)
+    options = parser.parse_intermixed_args(words)
+    paths = [word for word in options.words if "=" not in word or os.path.exists(word)]
+    settings = with_config_dirs([word for word in options.words if word not in paths], options.config_dir)
+    rows = judged(paths, settings, episodes=options.episodes)
+    say(_table(rows))
+    return 0
+
+
+def judged(
+    paths: Sequence[str], words: Sequence[str], settings: Sequence[tuple[str, Any]] = (), *, episodes: int
+) -> list[dict[str, Any]]:
+    """Return what recorded transitions say of agents, the one with the highest return first; see `hpamdp.judge`."""
+    if not paths:
+        raise ConfigError("judge: nobody to judge; give the folders of runs")
+    agents = [load_agent(path, []) for path in paths]
+    first = agents[0]
+    for path, other in zip(paths, agents, strict=True):
+        if other.config.env != first.config.env:
+            raise ConfigError(f"judge: {path} is of another problem than {paths[0]}; judge them one by one")
+        _check_reads_observations(path, other)
+    held_out = _common([_people_of(each).get("held_out") for each in agents])
+    given = {setting_of(word) for word in words} | {name for name, _ in settings}
+    more = [f"data.held_out={held_out}".replace(" ", "")] if held_out and not given & _PEOPLE else []
+    with composed(["mode=offline", "low=pets", choosing("env", first.config.env.name), *words, *more], settings) as cfg:
+        config = read(cfg)
+    if config.data.target is None:
+        raise ConfigError("judge: no recorded transitions; name a data set, such as data=human")
+    torch.set_num_threads(config.run.threads)
+    data = make_data(config, first.env, 1.0)
+    assert data is not None
+    rows = (data.batch if data.held_out is None else data.held_out).squeeze(0)
+    starts, people = starts_of(rows, episodes, config.run.seed)
+    max_steps = int(rows["next", keys.OPTION_STEPS].max())
+    specs = PAMDPSpecs.from_env(first.env)
+    torch.manual_seed(config.run.seed)
+    learner = config.low.build(specs=specs.with_option_observed() if specs.num_options else specs)
+    problem = RecordedProblem(learner, specs, rows, config.run.offline.updates)
+    found = []
+    for path, each in zip(paths, agents, strict=True):
+        tracker = decision_tracker(each.env, option_length=option_length(each.config))
+        rollout = problem.roll_out(each.agent, tracker, starts, max_steps)
+        doubts = [*_doubts(rollout, max_steps), *_is_known(each, config, data.held_out is not None)]
+        found.append({"agent": path, **_row(rollout, people), "doubts": doubts})
+    return sorted(found, key=lambda row: -row["return"])
+
+
+_PEOPLE = {"data.held_out", "data.people"}
+
+
+def _check_reads_observations(path: str, loaded: LoadedAgent) -> None:
+    """Refuse an agent that reads what a model of observations does not predict."""
+    for level in (loaded.config.high, *loaded.config.learners):
+        if level.card.needs:
+            raise ConfigError(f"judge: {path}: {level} asks the environment itself, which is not there")
+    selector = loaded.agent.selector
+    if selector is not None and keys.OPTION_RETURN in selector.in_keys:
+        raise ConfigError(f"judge: {path}: {loaded.config.high} chooses by the rewards of earlier trips")
+
+
+def _people_of(loaded: LoadedAgent) -> Mapping[str, Any]:
+    """Return the settings of the data that an agent learned from; empty if it learned from none."""
+    saved = loaded.progress.get("config", {})
+    return saved.get("data", {}) if saved.get("choices", {}).get("data", "none") != "none" else {}
+
+
+def _common(lists: Sequence[Any]) -> list[int]:
+    """Return the people that all runs with data hold out, if they are the same."""
+    given = [list(each) for each in lists if each]
+    return given[0] if given and all(each == given[0] for each in given) else []
+
+
+def _row(rollout: Rollout, people: np.ndarray | None) -> dict[str, Any]:
+    mean = rollout.returns.mean(0).double().cpu().numpy()
+    units = mean if people is None else np.array([mean[people == each].mean() for each in np.unique(people)])
+    by_member = rollout.returns.double().mean(1)
+    return {
+        "return": float(mean.mean()),
+        "interval": mean_interval(units.tolist() if len(units) > 1 else mean.tolist()),
+        "between_members": float(by_member.std()) if len(by_member) > 1 else 0.0,
+        "coverage": rollout.coverage,
+        "steps": rollout.steps,
+        "unfinished": rollout.unfinished,
+    }
+
+
+def _doubts(rollout: Rollout, max_steps: int) -> list[str]:
+    """Return what the data cannot tell of an agent."""
+    doubts = []
+    if rollout.coverage < _LEAST_COVERED:
+        doubts.append(
+            f"only {rollout.coverage:.0%} of its actions are like recorded ones; of the others nothing is known"
+        )
+    if rollout.unfinished > _MOST_UNFINISHED:
+        doubts.append(f"{rollout.unfinished:.0%} of its episodes go on after {max_steps} steps, the longest recorded")
+    return doubts
+
+
+def _is_known(loaded: LoadedAgent, config: Config, are_held_out: bool) -> list[str]:
+    """Return a doubt if an agent may have learned from the transitions that judge it."""
+    learned = _people_of(loaded)
+    if not learned or loaded.progress["config"]["choices"]["data"] != config.data.name:
+        return []
+    apart = set(getattr(config.data.options, "held_out", ())) if are_held_out else None
+    if apart is not None and apart <= set(learned.get("held_out") or ()):
+        return []
+    return ["it may have learned from the transitions that judge it; hold people out of its data (data.held_out)"]
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    header = ["", "return", "95 % over people", "between members", "covered", "steps"]
+    cells = [
+        [
+            row["agent"],
+            f"{row['return']:.3f}",
+            "{:.3f} to {:.3f}".format(*row["interval"]),
+            f"{row['between_members']:.3f}",
+            f"{row['coverage']:.0%}",
+            f"{row['steps']:.2f}",
+        ]
+        for row in rows
+    ]
+    widths = [max(map(len, column)) for column in zip(header, *cells, strict=True)]
+    lines = ["   ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in [header, *cells]]
+    return "\n".join([*lines, *(f"{row['agent']}: {doubt}" for row in rows for doubt in row["doubts"])])
