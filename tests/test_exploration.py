@@ -2,6 +2,7 @@
 
 import signal
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -41,7 +42,14 @@ from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 EXPLORING = ["hppo", "pdqn", "paddpg", "hsac", "hyar", "qpamdp", "dlpa", "pets"]
-QUICK = [low if low in ("hppo", "hyar", "pets") else pytest.param(low, marks=pytest.mark.slow) for low in EXPLORING]
+
+
+def pairs(*quick: tuple[str, str]) -> list:
+    """Return all pairs of a learner and an exploration; tests of those that are not named are slow."""
+    others = [pair for pair in product(EXPLORING, ("held", "novelty", "counts")) if pair not in quick]
+    return [*quick, *(pytest.param(*pair, marks=pytest.mark.slow) for pair in others)]
+
+
 PLATFORM = ["env=platform", "high=none"]
 
 
@@ -147,7 +155,7 @@ def test_the_share_of_steps_that_begin_a_hold_is_epsilon_and_falls():
     assert explored.scalars["held"] == rows[keys.IS_HELD].float().mean().item() and explored.bonus is None
 
 
-@pytest.mark.parametrize("name", ["hppo", "pdqn", "hyar", "qpamdp"])
+@pytest.mark.parametrize("name", ["hppo", "hyar"])
 def test_held_actions_are_allowed_ones(name):
     env = with_decisions(Forbidden(8), 1.0)
     learner = make_learner(name, PAMDPSpecs.from_env(env))
@@ -388,15 +396,18 @@ def test_cells_that_share_a_place_in_the_table_are_counted_all_the_same():
     assert table.num_cells() == pytest.approx(len(cells), rel=0.01), "visits again are no new cells"
 
 
-@pytest.mark.parametrize("resolution", [[0.0, 0.0, 0.0, 0.0], 1e-50, [1.0, 1e-50, 0.0, 0.0], 1e30])
-def test_counts_refuse_resolutions_out_of_bounds_and_lists_of_zeros(resolution):
-    with pytest.raises(SettingError, match=r"^resolution=.*: must (have a number above 0|be from 1e-12 to 1e\+06)"):
+@pytest.mark.parametrize(
+    ("resolution", "line"),
+    [
+        ([0.0, 0.0, 0.0, 0.0], r"must have a number above 0"),
+        ([1.0, 1e-50, 0.0, 0.0], r"must be from 1e-12 to 1e\+06"),
+        (1e30, r"must be from 1e-12 to 1e\+06"),
+        ([1.0, 2.0], "must have a number for each of 4 entries"),
+    ],
+)
+def test_counts_refuse_resolutions_out_of_bounds_lists_of_zeros_and_of_another_length(resolution, line):
+    with pytest.raises(SettingError, match=rf"^resolution=.*: {line}"):
         Counts(HPPO(SPECS), resolution=resolution)
-
-
-def test_counts_refuse_a_list_of_resolutions_of_another_length():
-    with pytest.raises(SettingError, match=r"resolution=\[1\.0, 2\.0\]: must have a number for each of 4 entries"):
-        Counts(HPPO(SPECS), resolution=[1.0, 2.0])
 
 
 @pytest.mark.parametrize("kind", [DLPA, PETS])
@@ -513,15 +524,6 @@ def test_novelty_sees_pictures_through_untrained_copies_of_the_encoder():
 # The group.
 
 
-def test_without_exploration_nothing_stands_beside_the_learners():
-    parts = assemble(make_config([*PLATFORM, "low=hppo", "eval.layouts=4"]))
-    agent = parts.agent
-    assert len(agent.explorations) == 0 and not agent.learners[0].is_overruled and agent.learners[0].bonus is None
-    assert agent.router.policies[0] is agent.learners[0].policy
-    assert not [name for name in (*agent.state_dict(), *agent.stateful()) if "exploration" in name]
-    parts.close()
-
-
 def test_each_options_learner_has_its_own_exploration():
     for sharing, num in (("per_option", 2), ("shared", 1)):
         words = ["high=ucb", "low=hppo", "exploration=novelty", f"agent.sharing={sharing}", "num_envs=8"]
@@ -533,9 +535,8 @@ def test_each_options_learner_has_its_own_exploration():
         parts.close()
 
 
-@pytest.mark.parametrize("kind", ["held", "novelty", "counts"])
-@pytest.mark.parametrize("low", QUICK)
-def test_every_learner_that_takes_an_exploration_trains_with_it_and_is_reloaded(kind, low, tmp_path):
+@pytest.mark.parametrize(("low", "kind"), pairs(("hyar", "held"), ("pets", "novelty"), ("hppo", "counts")))
+def test_every_learner_that_takes_an_exploration_trains_with_it_and_is_reloaded(low, kind, tmp_path):
     words = [*PLATFORM, f"low={low}", f"exploration={kind}", *SHORT.get(low, []), *SMALL, "film=false"]
     assert run(compose_config(words), tmp_path, words) == 0
     header = (tmp_path / "metrics.csv").read_text().splitlines()[0].split(",")
@@ -567,13 +568,11 @@ REFUSED = [
         "low=planner env=platform exploration=novelty",
         "exploration=novelty: changes rewards, which low=planner does not",
     ),
-    ("low=td3_bc exploration=held", "exploration=held: changes actions, which low=td3_bc does not take"),
     ("low=iql exploration=novelty", "exploration=novelty: changes rewards, which low=iql does not take"),
     ("low=bc mode=offline data=human exploration=held", "exploration=held: mode=offline takes no steps"),
     ("low=hppo low.freeze=true exploration=held", "exploration=held: low.freeze=true keeps the learners as they are"),
     ("low=hppo exploration=held exploration.mu=1", "exploration.mu=1: must be greater than 1 (Held"),
     ("low=pdqn low.augment=true exploration=novelty", "exploration: low.augment=true: maps states to others that were"),
-    ("low=pdqn low.augment=true exploration=counts", "exploration: low.augment=true: maps states to others that were"),
     (
         "low=hppo env=catch_point_picture exploration=counts",
         "exploration: no picture is seen twice; use exploration=novelty",
@@ -613,16 +612,7 @@ def test_an_exploration_is_chosen_from_python_and_is_part_of_the_saved_config(gi
         assert saved["choices"]["exploration"] == name
 
 
-RESUMED = [("pdqn", "held"), ("hppo", "novelty"), ("hppo", "counts")]
-RESUMED += [
-    pytest.param(low, kind, marks=pytest.mark.slow)
-    for low in EXPLORING
-    for kind in ("held", "novelty", "counts")
-    if (low, kind) not in RESUMED
-]
-
-
-@pytest.mark.parametrize(("low", "kind"), RESUMED)
+@pytest.mark.parametrize(("low", "kind"), pairs(("pdqn", "held"), ("hppo", "novelty")))
 def test_a_run_with_exploration_resumes_to_the_last_bit(low, kind, tmp_path, monkeypatch):
     given = ["high=ucb", f"low={low}", *SHORT.get(low, []), *SMALL, f"exploration={kind}"]
     given += ["exploration.epsilon=0.3", "exploration.epsilon_final=0.1"] if kind == "held" else []
@@ -639,8 +629,9 @@ def test_a_run_with_exploration_in_worker_processes_resumes_to_the_last_bit(low,
 def test_an_agent_that_held_actions_is_exported(tmp_path):
     pytest.importorskip("onnxruntime")
     small = {"num_envs": 8, "steps_per_batch": 8, "total_frames": 64, "eval.layouts": 4, "film": False}
-    settings = {**small, "low.minibatch_size": 16}
-    agent = hpamdp.train("platform", low="hppo", exploration="held", progress=False, **settings)
+    agent = hpamdp.train(
+        "platform", low="hppo", exploration="held", progress=False, **small, **{"low.minibatch_size": 16}
+    )
     agent.export(tmp_path / "policy.onnx")
     assert (tmp_path / "policy.onnx").is_file()
 
