@@ -94,11 +94,10 @@ def test_of_several_components_each_is_chosen_by_its_own_values():
 
 
 def test_the_learners_of_policies_reach_the_best_pair_of_a_step():
-    for settings in ({}, {"autoregressive": True}):
-        torch.manual_seed(0)
-        learner = HPPO(PAMDPSpecs.from_env(OneStep()), **FAST, **settings)
-        train(learner, OneStep(256), 40)
-        assert greedy_reward(learner) > 0.97, settings
+    torch.manual_seed(0)
+    learner = HPPO(PAMDPSpecs.from_env(OneStep()), **FAST)
+    train(learner, OneStep(256), 25)
+    assert greedy_reward(learner) > 0.97
 
 
 @pytest.mark.parametrize(
@@ -124,16 +123,15 @@ def test_planners_reach_the_best_pair_of_a_step(learner_class):
 
 
 @pytest.mark.parametrize("learner_class", [BC, IQL])
-@pytest.mark.parametrize("autoregressive", [False, True])
-def test_learners_from_data_reach_the_best_pair_of_a_step(learner_class, autoregressive):
+def test_learners_from_data_reach_the_best_pair_of_a_step(learner_class):
     torch.manual_seed(0)
     env = OneStep()
-    learner = learner_class(PAMDPSpecs.from_env(env), autoregressive=autoregressive, hidden_dims=(32,), batch_size=128)
+    learner = learner_class(PAMDPSpecs.from_env(env), hidden_dims=(32,), batch_size=128)
     data = random_steps(env, 3000)
     if learner_class is BC:
         data = data[data["next", "reward"].flatten() > 0.9]
     learner.add_demonstrations(data, torch.ones(data.shape, dtype=torch.bool))
-    learner.update(150 if learner_class is BC else 400)
+    learner.update(100 if learner_class is BC else 400)
     assert greedy_reward(learner) > 0.9
 
 
@@ -154,24 +152,14 @@ def test_imitation_of_matching_pairs_needs_autoregressive_heads():
     assert sampled[True] > 0.97
 
 
-@pytest.mark.parametrize(
-    ("learner_class", "settings", "reaches"),
-    [
-        (HPPO, {}, False),
-        (HPPO, {"credit": "summed"}, False),
-        (HPPO, {"credit": "mixed"}, False),
-        (HPPO, {"autoregressive": True}, True),
-    ],
-)
-def test_a_pair_off_the_marginals_is_reached_by_autoregressive_policies_alone(learner_class, settings, reaches):
+@pytest.mark.parametrize("autoregressive", [False, True])
+def test_a_pair_off_the_marginals_is_reached_by_autoregressive_policies_alone(autoregressive):
     torch.manual_seed(0)
-    faster = FAST | {"lr": 6e-3, "anneal_steps": 10_000, "minibatch_size": 256}
-    learner = learner_class(
-        PAMDPSpecs.from_env(OneStep()), **faster, **settings, discrete_entropy=0.1, entropy_final=0.01
-    )
+    settings = FAST | {"lr": 6e-3, "anneal_steps": 10_000, "minibatch_size": 256, "autoregressive": autoregressive}
+    learner = HPPO(PAMDPSpecs.from_env(OneStep()), **settings, discrete_entropy=0.1, entropy_final=0.01)
     train(learner, OneStep(256, pays="climbing"), 40)
     reward = greedy_reward(learner, pays="climbing")
-    assert (reward > 0.95) if reaches else (0.4 < reward < 0.55)
+    assert reward > 0.95 if autoregressive else 0.4 < reward < 0.55
 
 
 @pytest.mark.parametrize("autoregressive", [False, True])
@@ -350,10 +338,8 @@ def test_an_option_is_possible_where_it_has_an_allowed_action_of_each_component(
 @pytest.mark.parametrize(
     "learner",
     [
-        lambda specs: HPPO(specs, **FAST),
         lambda specs: HPPO(specs, **FAST, autoregressive=True),
         lambda specs: HSAC(specs, warmup_steps=100, updates_per_step=0.02),
-        lambda specs: IQL(specs, warmup_steps=100, updates_per_step=0.02),
     ],
 )
 def test_updates_in_bfloat16_have_nearly_the_same_likelihoods(learner):
@@ -381,10 +367,9 @@ def test_updates_in_bfloat16_have_nearly_the_same_likelihoods(learner):
         (lambda specs: HPPO(specs, **FAST, autoregressive=True), True),
         (lambda specs: IQL(specs, warmup_steps=64, updates_per_step=0.05, autoregressive=True), True),
         (lambda specs: HSAC(specs, warmup_steps=64, updates_per_step=0.05, autoregressive=True), False),
-        (lambda specs: HSAC(specs, warmup_steps=64, updates_per_step=0.05), False),
         (lambda specs: PDQN(specs, warmup_steps=64, updates_per_step=0.05), False),
     ],
-    ids=["hppo", "iql", "hsac autoregressive", "hsac", "pdqn"],
+    ids=["hppo", "iql", "hsac", "pdqn"],
 )
 def test_updates_of_several_components_can_be_compiled(learner, forbids_pairs):
     torch.manual_seed(0)

@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_steps import SPECS, one_step_rows
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
@@ -18,7 +19,6 @@ from hpamdp.policies.low_level.dlpa.planner import Plan, Planner
 from hpamdp.policies.shared.planning import Prediction
 from hpamdp.specs import PAMDPSpecs
 
-SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 FORMS = ["parallel", "masking", "sequential"]
 
 SEARCH = dict(
@@ -207,9 +207,7 @@ def test_windows_follow_an_episode_across_batches_and_cross_no_end_environment_o
 
 
 @pytest.mark.parametrize("are_learned", [False, True])
-@pytest.mark.parametrize("is_shared", [False, True])
-@pytest.mark.parametrize("buffer_size", [5000, 40, 20])
-@pytest.mark.parametrize("num_steps", [1, 2, 5])
+@pytest.mark.parametrize(("is_shared", "buffer_size", "num_steps"), [(False, 5000, 1), (True, 40, 2), (False, 20, 5)])
 def test_windows_cross_no_option_that_changes_inside_an_episode(num_steps, buffer_size, is_shared, are_learned):
     option_length = 2
     learner = make(horizon=4, buffer_size=buffer_size, batch_size=min(512, buffer_size), warmup_steps=1000)
@@ -315,23 +313,11 @@ def test_the_copies_of_a_policy_get_the_weights_of_its_end_values():
     assert any(name.startswith("end_value.end.") for name in names)
 
 
-def one_step_rows(learner: DLPA, num: int) -> TensorDict:
-    """Act in a one-step problem: only action 1 is rewarded, the more the nearer its parameters are to (s0, -s1)."""
-    td = TensorDict({keys.OBSERVATION: torch.rand(num, 1, 4) * 2 - 1}, [num, 1])
-    td = learner.policy(td)
-    unit, state = learner.specs.to_unit(td[keys.PARAMETERS]), td[keys.OBSERVATION]
-    error = (unit[..., 1] - state[..., 0]).square() + (unit[..., 2] + state[..., 1]).square()
-    done = torch.ones(num, 1, 1, dtype=torch.bool)
-    reward = torch.where(td[keys.DISCRETE] == 1, 1.0 - error, -0.5).unsqueeze(-1)
-    td["next"] = {keys.OBSERVATION: state, keys.REWARD: reward, keys.DONE: done, keys.TERMINATED: done}
-    return td
-
-
 @pytest.fixture(scope="module")
 def trained() -> DLPA:
     torch.manual_seed(0)
-    learner = make(horizon=1)
-    for _ in range(12):
+    learner = make(horizon=1, warmup_steps=300, num_iterations=4)
+    for _ in range(8):
         learner.learn(one_step_rows(learner, 100), torch.ones(100, 1, dtype=torch.bool))
     return learner
 
@@ -340,7 +326,7 @@ def test_the_learner_finds_the_best_action_and_its_parameters(trained):
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(trained, 500)
     assert (rows[keys.DISCRETE] == 1).float().mean() > 0.98
-    assert rows["next", keys.REWARD].mean() > 0.85, "random actions earn about -0.4, the optimum 1"
+    assert rows["next", keys.REWARD].mean() > 0.85, "the optimum is 1"
 
 
 def test_a_greedy_action_is_determined_by_the_seed_and_lies_in_bounds(trained):
