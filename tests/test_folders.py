@@ -183,7 +183,10 @@ def test_an_error_file_that_no_sweep_has_written_is_never_removed_and_one_of_a_s
     start(tmp_path, "overwrite=true")
     assert (tmp_path / ERROR_NAME).read_text() == "my own errors\n", "in the folder of a run, too"
     (tmp_path / ERROR_NAME).unlink()
-    assert write_error(tmp_path, ValueError("a bug"))  # as a sweep does
+    try:
+        raise ValueError("a bug")
+    except ValueError as error:
+        assert write_error(tmp_path, error)  # as a sweep does
     start(tmp_path, "overwrite=true")
     assert not (tmp_path / ERROR_NAME).exists()
 
