@@ -15,7 +15,7 @@ from hpamdp.run_files import saved_summary
 ALL = ["learning_curves.png", "trajectories.png", "choices.png"]
 
 
-def write_evaluation(folder, num=30, without=(), **changed):
+def write_evaluation(folder, num=6, without=(), **changed):
     rng = np.random.default_rng(0)
     start, goal = rng.uniform(-70, 70, (2, num, 2))
     path = np.full((num, 5, 2), np.nan)
@@ -105,59 +105,35 @@ def test_choices_show_the_probability_of_the_congruent_boat_in_each_bin_with_its
     assert segments == pytest.approx(np.tile([0.3968, 0.8922], (6, 1)), abs=1e-3)  # Wilson's, of 7 in 10
 
 
-def test_an_empty_folder_gives_no_figure(tmp_path):
-    assert names(tmp_path) == []
+@pytest.mark.parametrize(
+    ("text", "drawn"),
+    [
+        (None, []),
+        ("", []),
+        ("frames,eval/score\n", []),
+        ("frames,loss\n1,2\n", []),
+        ("frames,eval/score,eval/success\n1,nan,nan\n", ALL[:1]),
+        ("frames,wall_s,eval/score,eval/success\n1,1,nan,nan\n2,,,\n3,3,inf,0.5\n,4,1.0,0.5\n5,nan,x\n6,1.7", ALL[:1]),
+    ],
+)
+def test_curves_come_from_whatever_metrics_there_are(tmp_path, text, drawn):
+    if text is not None:
+        (tmp_path / "metrics.csv").write_text(text)
+    assert names(tmp_path) == drawn
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "frames,eval/score\n", "frames,eval/score\n1,2", "frames,loss\n1,2\n"],
+    ("changes", "drawn"),
+    [
+        ({"option": np.full(6, -1), "optimum": np.full((6, 2), np.nan)}, ALL[1:2]),
+        ({"num": 1}, ALL[1:]),
+        ({"num": 7, "without": ("optimum", "controller", "fuel", "steps", "start")}, ALL[1:]),
+        ({"without": ("path",)}, ALL[2:]),
+    ],
 )
-def test_metrics_without_a_curve_give_no_figure(tmp_path, text):
-    (tmp_path / "metrics.csv").write_text(text)
-    assert names(tmp_path) == []
-
-
-@pytest.mark.parametrize("columns", [("eval/score",), ("train/success",), ("train/score", "eval/oracle_agreement")])
-def test_learning_curves_come_from_whatever_columns_there_are(tmp_path, columns):
-    write_metrics(tmp_path, columns, num=1)
-    assert names(tmp_path) == ["learning_curves.png"]
-
-
-def test_a_truncated_metrics_file_with_holes_gives_a_figure(tmp_path):
-    (tmp_path / "metrics.csv").write_text(
-        "frames,wall_s,eval/score,eval/success\n1,1,nan,nan\n2,,,\n3,3,inf,0.5\n,4,1.0,0.5\n5,nan,1.5,x\n6,6,1.7"
-    )
-    assert names(tmp_path) == ["learning_curves.png"]
-
-
-def test_a_metrics_file_of_nothing_but_nan_gives_a_figure(tmp_path):
-    (tmp_path / "metrics.csv").write_text("frames,eval/score,eval/success\n1,nan,nan\n")
-    (tmp_path / "summary.json").write_text(json.dumps({"references": {}}))
-    assert names(tmp_path) == ["learning_curves.png"]
-
-
-def test_an_evaluation_without_a_choice_gives_trajectories_only(tmp_path):
-    write_evaluation(tmp_path, option=np.full(30, -1), optimum=np.full((30, 2), np.nan))
-    assert names(tmp_path) == ["trajectories.png"]
-
-
-def test_chosen_options_are_the_boats_of_the_pictures(tmp_path):
-    write_evaluation(tmp_path, without=("controller",))
-    assert names(tmp_path) == ALL[1:]
-
-
-@pytest.mark.parametrize("num", [1, 7])
-def test_few_episodes_make_a_smaller_sheet(tmp_path, num):
-    write_evaluation(tmp_path, num=num)
-    assert names(tmp_path) == ALL[1:]
-
-
-def test_missing_arrays_leave_out_only_what_needs_them(tmp_path):
-    write_evaluation(tmp_path, without=("optimum", "controller", "fuel", "steps", "start"))
-    assert names(tmp_path) == ALL[1:]
-    write_evaluation(tmp_path, without=("path",))
-    assert names(tmp_path) == ["choices.png"]
+def test_missing_arrays_leave_out_only_what_needs_them(tmp_path, changes, drawn):
+    write_evaluation(tmp_path, **changes)
+    assert names(tmp_path) == drawn
 
 
 def test_labels_stand_apart_near_their_lines_and_in_order():
@@ -211,7 +187,7 @@ def test_only_episodes_with_a_known_best_boat_count_in_the_agreement(num_unknown
 def test_only_episodes_with_a_known_better_boat_count_in_the_choice_of_people_s(tmp_path):
     optimum = np.tile([0.0, 1.0], (30, 1))
     optimum[:20] = np.nan
-    write_evaluation(tmp_path, option=np.ones(30, int), optimum=optimum)
+    write_evaluation(tmp_path, num=30, option=np.ones(30, int), optimum=optimum)
     axes = boats.draw(arrays_of(tmp_path), {})["choices.png"].axes[0]
     title = axes.get_title() + axes.get_title(loc="left")
     assert title == "Congruent boat chosen (better boat in 100%)"
@@ -226,7 +202,7 @@ def test_a_problem_that_draws_nothing_gets_its_learning_curves(tmp_path):
 
 def test_the_choice_of_other_boats_is_drawn_by_their_names(tmp_path):
     rng = np.random.default_rng(1)
-    write_evaluation(tmp_path, option=rng.integers(0, 3, 30), optimum=rng.uniform(2, 4, (30, 3)))
+    write_evaluation(tmp_path, option=rng.permutation(6) % 3, optimum=rng.uniform(2, 4, (6, 3)))
     write_metrics(tmp_path, ("eval/score", "eval/option_a", "eval/option_b", "eval/option_c"))
     (tmp_path / "summary.json").write_text(json.dumps({"boats": ["a", "b", "c"], "references": {}}))
     assert names(tmp_path) == ALL

@@ -7,32 +7,12 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
-from conftest import make_config
 from PIL import Image, ImageSequence
 
 from hpamdp.analysis import film
 from hpamdp.env.boatdock import film as boat_film
 from hpamdp.env.boatdock import physics
-from hpamdp.run.players import load_agent, split_words
-
-SECONDS = torch.linspace(0.0, 2.0, 41, dtype=torch.float64)
-
-
-def test_the_way_of_a_press_is_the_integral_of_its_speed():
-    for duration in (0.05, 0.4, 1.3):
-        press = torch.tensor(duration, dtype=torch.float64)
-        time = torch.linspace(0.0, 1.95 * duration, 20_001, dtype=torch.float64)
-        virtual = torch.where(time <= duration, time, duration - (time - duration) / physics.GLIDE)
-        way = torch.cumulative_trapezoid(physics.speed(virtual.clamp(min=0.0)), time)
-        np.testing.assert_allclose(physics.distance_at(press, time)[1:], way, atol=1e-5)
-        assert physics.distance_at(press, time)[-1] == pytest.approx(physics.total_distance(press).item())
-
-
-def test_the_time_of_a_distance_is_the_inverse_of_the_distance_at_a_time():
-    for duration in (0.05, 0.4, 1.3):
-        press = torch.tensor(duration, dtype=torch.float64)
-        time = torch.linspace(0.01, 1.94, 50, dtype=torch.float64) * duration
-        np.testing.assert_allclose(physics.time_at(press, physics.distance_at(press, time)), time, atol=1e-6)
+from hpamdp.run.players import load_agent
 
 
 def test_a_boat_rests_where_its_press_ends_and_stays_there():
@@ -85,13 +65,6 @@ def test_other_problems_are_filmed_by_their_own_pictures():
     assert len(pictures) == 2 * len(track) and pictures[0].shape == (60, 60, 3)
 
 
-def test_a_gif_holds_the_pictures_for_as_long_as_asked(tmp_path):
-    pictures = [np.full((8, 8, 3), value, np.uint8) for value in (0, 120, 255)]
-    film.write(tmp_path / "a.gif", pictures, 10.0)
-    with Image.open(tmp_path / "a.gif") as image:
-        assert image.n_frames == 3 and image.info["duration"] == 100 and image.info["loop"] == 0
-
-
 def test_a_film_without_pictures_or_of_another_ending_is_refused(tmp_path):
     with pytest.raises(film.NoPictureError, match="no picture"):
         film.write(tmp_path / "a.gif", [], 10.0)
@@ -105,16 +78,12 @@ def test_an_mp4_without_imageio_names_what_to_install(tmp_path, monkeypatch):
         film.write(tmp_path / "a.mp4", [np.zeros((2, 2, 3), np.uint8)], 10.0)
 
 
-def test_nothing_is_filmed_where_it_is_turned_off(played):
-    config = make_config(["high=uniform", "low=random", "film=false"])
-    assert not config.run.film and make_config(["film=true"]).run.film
-
-
-@pytest.mark.parametrize("fps", [7, 25, 29, 30, 34, 40, 45, 50])
+@pytest.mark.parametrize("fps", [7, 29, 50])
 def test_a_gif_plays_at_its_mean_rate_in_pictures_of_at_least_two_hundredths_of_a_second(tmp_path, fps):
     striped = np.tile(np.array([0, 200], np.uint8)[:, None], (4, 2, 3))
     film.write(tmp_path / "a.gif", (np.roll(striped, i, 1) for i in range(3 * fps)), float(fps))
     with Image.open(tmp_path / "a.gif") as image:
+        assert image.info["loop"] == 0
         durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
     assert len(durations) == 3 * fps and sum(durations) == 3000
     assert min(durations) >= 20 and max(durations) - min(durations) <= 10
@@ -154,11 +123,6 @@ def test_pictures_that_stay_the_same_are_kept_once(tmp_path):
     assert peak < 30 * noise.nbytes
 
 
-def test_a_path_is_told_from_settings(tmp_path):
-    assert split_words(["low=random", "outputs/x"]) == ("outputs/x", ["low=random"])
-    assert split_words([str(tmp_path)]) == (str(tmp_path), [])
-
-
 def test_watch_writes_a_film(tmp_path, command):
     file = tmp_path / "a.gif"
     words = ["high=uniform", "low=random", "--to", str(file), "--episodes", "2", "--size", "60", "--fps", "5"]
@@ -175,17 +139,13 @@ def test_watch_writes_a_film(tmp_path, command):
         (["nowhere"], "no checkpoint there"),
         (["a", "b"], "several agents"),
         (["low=planner", "--to", "film.avi"], r"must end in .gif or .mp4"),
-        (["low=planner", "--episodes", "0"], "must be a whole number"),
         (["low=planner", "--size", "19"], "19: must be a whole number from 20 to 4096"),
         (["low=planner", "--fps", "60"], "--fps 60: a GIF shows at most 50 pictures a second; write an .mp4"),
-        (["low=planner", "--fps", "241", "--to", "a.mp4"], "--fps: 241: must be a whole number from 1 to 240"),
         (
             ["low=planner", "--size", "4096", "--episodes", "4"],
             "--size 4096 --episodes 4: a picture would have 12288 x 8192 px, but at most 8192 px on each side",
         ),
-        (["low=planner", "--size", "20", "--episodes", "2000"], "--size 20 --episodes 2000: a picture would have 60 x"),
         (["low=planner", "--colour", "red"], "--help"),
-        (["low=nobody"], "nobody"),
         (["low=random", "high=none"], "needs a selector"),
     ],
 )
