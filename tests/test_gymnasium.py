@@ -55,10 +55,9 @@ def test_the_environment_receives_the_chosen_action(form):
             assert equal(native(env, row)[-1], native_action(form, int(discrete[row]), parameters[row].numpy()))
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_all_tensors_are_as_the_specs_say(form):
+def test_all_tensors_are_as_the_specs_say():
     # Toy refuses actions outside its space, and samples of the specs have rounded bounds.
-    check_env_specs(make(3, form=form, max_steps=2), return_contiguous=True)
+    check_env_specs(make(3, max_steps=2), return_contiguous=True)
 
 
 def test_values_outside_their_bounds_are_clipped():
@@ -80,7 +79,6 @@ def test_values_outside_their_bounds_are_clipped():
         ([0, 0], [[0.0, 20.0, 0.2], [0.0, np.nan, 0.2]], r"environment 1 got discrete=0 \(allowed 0 to 2\), .*nan"),
         ([0, 2], [[0.0, 20.0, 0.2], [0.0, 20.0, np.inf]], "environment 1 got discrete=2"),
         ([3, 0], [[0.0, 20.0, 0.2]] * 2, "environment 0 got discrete=3"),
-        ([0, -1], [[0.0, 20.0, 0.2]] * 2, "environment 1 got discrete=-1"),
         ([0.0, 1.0], [[0.0, 20.0, 0.2]] * 2, "has type float32, but must be integer"),
         ([0, 0], [[0.0, 20.0]] * 2, r"'parameters'\) has shape \[2, 2\], but must be \[2, 3\]"),
         ([[0], [0]], [[0.0, 20.0, 0.2]] * 2, r"'discrete'\) has shape \[2, 1\], but must be \[2\]"),
@@ -270,31 +268,21 @@ def mistake_in(**options) -> str:
     [
         ({}, "set env.id=Name-v0 or env.entry_point=package.module:name; neither is set"),
         ({"id": "Toy-v0", "entry_point": TOY}, "both are set"),
-        ({"id": "Toy-v0", "max_steps": 0}, "max_steps=0: must be greater than 0"),
         ({"id": "Nowhere-v0"}, "Nowhere-v0: Environment `Nowhere` doesn't exist"),
-        ({"id": "Toy-v3"}, "Toy-v3: Environment version `v3`"),
         ({"id": "nowhere:Toy-v0"}, "nowhere:Toy-v0: No module named 'nowhere'"),
-        ({"id": "not an id"}, "not an id: Malformed environment ID"),
         ({"id": "Endless-v0"}, "Endless-v0: has no time limit of its own; set env.max_steps"),
         (
             {"entry_point": "toy_environments:Texting", "max_steps": 5},
             "Texting: action space Tuple(Discrete(2), Text(1, 5, ",
         ),
         ({"id": "Toy-v0", "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
-        ({"entry_point": TOY, "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
         (
             {"id": "hpamdp/CatchPoint-v0", "kwargs": {"wide": 1}},
             "hpamdp/CatchPoint-v0: wide: no such setting of CatchPointOptions",
         ),
-        ({"entry_point": "nowhere:Toy"}, "nowhere:Toy: No module named 'nowhere'"),
         ({"entry_point": "toy_environments:Nobody"}, "there is no class or function Nobody in toy_environments"),
         ({"entry_point": "toy_environments"}, "must be a class or function, as package.module:name"),
         ({"entry_point": "builtins:object", "max_steps": 5}, "wrap an environment of gym with shimmy"),
-        ({"id": "Toy-v0", "parameter_dims": [1, 1, 1]}, "is for one Box for all discrete actions, but each has"),
-        (
-            {"entry_point": "toy_environments:Mixed", "max_steps": 5, "kwargs": {"is_text": True}},
-            "observation space Text(1, 5, ",
-        ),
     ],
 )
 def test_a_mistake_is_explained_in_one_line(options, complaint):
@@ -316,12 +304,8 @@ STEP = (np.zeros(2), 0.5, False, False, {})
         (STEP[:3], "step returned 3 values, not observation, reward, terminated, truncated and info"),
         (None, "step returned NoneType, not observation"),
         ((STEP[0], None, *STEP[2:]), "step returned None as reward, which must be a number"),
-        ((STEP[0], np.ones(2), *STEP[2:]), r"step returned array([1., 1.]) as reward, which must be a number"),
         ((*STEP[:2], None, *STEP[3:]), "step returned None as terminated, which must be True or False"),
-        ((*STEP[:2], "False", *STEP[3:]), "step returned 'False' as terminated, which must be True or False"),
-        ((*STEP[:3], float("nan"), {}), "step returned nan as truncated, which must be True or False"),
         ((*STEP[:4], {"is_success": float("nan")}), "step returned nan as info['is_success'], which must be True or"),
-        ((*STEP[:4], {"success": np.ones(2)}), "step returned array([1., 1.]) as info['success'], which must be Tr"),
         ((*STEP[:4], None), "step returned None as info, which must be a dictionary"),
         ((None, *STEP[1:]), "gave an observation whose value is None, not numbers that NumPy can hold"),
         ((np.zeros((2, 1)), *STEP[1:]), "gave an observation whose value has shape (2, 1), but its space has (2,)"),

@@ -57,18 +57,9 @@ def test_a_mask_can_be_ignored():
         ),
         ({"action_mask": "info"}, "gave None as action_mask, which must be 2 numbers, 0 or 1"),
         (
-            {"source": "info", "action_mask": "info", "mask": [0.0, -1e9]},
-            r"gave \[0\.0, -1000000000\.0\] as action_mask, ",
-        ),
-        (
             {"source": "info", "action_mask": "info", "mask": [1, float("nan")]},
             r"gave \[1, nan\] as action_mask, which ",
         ),
-        (
-            {"source": "info", "action_mask": "info", "mask": [[1, 1]]},
-            r"gave \[\[1, 1\]\] as action_mask, which must be 2",
-        ),
-        ({"source": "info", "action_mask": "info", "mask": "ab"}, "gave 'ab' as action_mask, which must be 2 numbers"),
         ({"source": "info", "action_mask": "info", "mask": [1]}, r"gave \[1\] as action_mask, which must be 2 numbers"),
     ],
 )
@@ -99,8 +90,9 @@ class Misplaced(Masked):
         return {} if self.where == "late info" and self.steps == 0 else said
 
 
-@pytest.mark.parametrize("name", ["action_mask", "action_masks", "option_mask"])
-@pytest.mark.parametrize("where", ["info", "late info", "attribute"])
+@pytest.mark.parametrize(
+    ("where", "name"), [("info", "option_mask"), ("late info", "action_mask"), ("attribute", "action_masks")]
+)
 def test_a_mask_that_is_not_read_is_reported_in_one_line(where, name):
     kind = name.removesuffix("s")
     expected = rf"^GymnasiumEnv: .*gave an {kind} as .*{name}.*, which is not read; give it as {kind} in a Dict of obs"
@@ -128,17 +120,10 @@ def test_a_method_that_gives_a_mask_is_reported_in_one_line_unless_masks_are_ign
         assert GymnasiumEnv(**arguments, action_mask="ignore").reset()[keys.OBSERVATION].shape == (1, 1)
 
 
-def test_a_mask_that_allows_nothing_is_told_in_one_line():
-    env = make(2, source="info", action_mask="info", mask=np.zeros(2))
-    with pytest.raises(ProblemError, match="Masked: environment 0 gave an action_mask that allows nothing"):
-        env.reset()
-
-
 @pytest.mark.parametrize(
     ("names", "said"),
     [
         (5, "is 5, but must be a list of names"),
-        ("slow", "is 'slow', but must be a list of names"),
         (("slow", 1, "fast"), "is ('slow', 1, 'fast'), but must"),
         (["slow", "slow", "fast"], "has a name twice: slow, slow, fast"),
     ],
@@ -181,12 +166,9 @@ def test_an_entry_named_option_without_an_action_beside_it_is_the_action():
     assert specs.num_discrete == 2 and specs.num_options == 0
 
 
-@pytest.mark.parametrize("key", ["speed", "action"])
-def test_an_option_key_that_names_no_discrete_entry_is_told_in_one_line(key):
-    with pytest.raises(
-        ValueError, match=f"option_key={key}: must name a Discrete beside the action, in the action space"
-    ):
-        make(form="dict", option_key=key)
+def test_an_option_key_that_names_no_discrete_entry_is_told_in_one_line():
+    with pytest.raises(ValueError, match="option_key=action: must name a Discrete beside the action, in the action"):
+        make(form="dict", option_key="action")
 
 
 def test_the_actions_of_a_one_of_are_its_spaces():

