@@ -13,22 +13,14 @@ from conftest import compose_config
 import hpamdp
 from hpamdp import files
 from hpamdp.config.errors import ConfigError
-from hpamdp.files import remove_link, replacing
-from hpamdp.metrics_file import Metrics, rows_up_to
+from hpamdp.files import replacing
 from hpamdp.run import play
 from hpamdp.run.folder import locked
 from hpamdp.run.sweep import Job, Records
 from hpamdp.run.train import run
 
-TINY = [
-    "low=hppo",
-    "low.minibatch_size=8",
-    "num_envs=4",
-    "steps_per_batch=2",
-    "eval.layouts=2",
-    "eval.every=0",
-    "log_every=8",
-]
+TINY = ["low=hppo", "low.minibatch_size=8", "num_envs=4", "steps_per_batch=2", "eval.layouts=2", "eval.every=0"]
+TINY += ["log_every=8"]
 
 
 def outside_copies(folder, outside):
@@ -143,23 +135,6 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
-
-
-def test_only_links_are_removed(tmp_path):
-    (tmp_path / "own").write_text("own")
-    (tmp_path / "dangling").symlink_to(tmp_path / "gone")
-    for name in ("own", "dangling", "missing"):
-        remove_link(tmp_path / name)
-    assert [path.name for path in tmp_path.iterdir()] == ["own"]
-
-
-def test_metrics_that_are_no_file_are_neither_read_nor_replaced(tmp_path):
-    os.mkfifo(tmp_path / "metrics.csv")
-    metrics = Metrics(tmp_path / "metrics.csv", rows_up_to(1.0, tmp_path / "metrics.csv"))
-    assert metrics.rows() == []
-    with pytest.raises(OSError, match="is a named pipe"):
-        metrics.append({"frames": 1.0})
-    assert stat.S_ISFIFO((tmp_path / "metrics.csv").stat().st_mode)
 
 
 def test_a_named_pipe_and_a_socket_are_never_replaced_by_a_file(tmp_path):
