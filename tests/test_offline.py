@@ -42,11 +42,13 @@ def human_batch(path: str, rest_to_rest: bool = False, **env):
 
 
 def overrides(path: str, low: str, high: str = "human") -> list[str]:
-    return [*SMALL, f"data.path={path}", f"low={low}", f"high={high}"]
+    plans = ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"] if low == "dlpa" else []
+    return [*SMALL, f"data.path={path}", f"low={low}", f"high={high}", *plans]
 
 
 @pytest.mark.parametrize(
-    "low", ["bc", "iql", "pets", *(pytest.param(low, marks=pytest.mark.slow) for low in ("td3_bc", "pdqn", "hsac"))]
+    "low",
+    ["bc", "iql", "pets", "dlpa", *(pytest.param(low, marks=pytest.mark.slow) for low in ("td3_bc", "pdqn", "hsac"))],
 )
 def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, path, tmp_path):
     given = overrides(path, low)
@@ -268,6 +270,20 @@ def test_metrics_show_the_losses_on_people_who_are_held_out(low, shared, path, t
     resumed = ["mode=offline", f"resume={tmp_path}", "offline.updates=80"]
     assert run(compose_config(resumed), tmp_path / "resumed", resumed) == 0
     assert read_rows(tmp_path / "resumed" / "metrics.csv")[-1][name] < rows[0][name]
+
+
+def test_windows_of_dlpa_end_where_a_data_set_lacks_a_step(path):
+    parts = assemble(make_config([*overrides(path, "dlpa", "none"), "env.controller=congruent"]))
+    (learner,), rows = parts.agent.learners, parts.data.batch
+    episode = rows["collector", "traj_ids"][0]
+    of_one = rows[:, episode == episode.bincount().argmax()]
+    with_gap = of_one[:, [0, *range(2, of_one.shape[1])]]
+    learner.add_demonstrations(with_gap, torch.ones(with_gap.shape, dtype=torch.bool))
+    assert learner.buffer[:]["successor"].tolist() == [-1, *range(2, of_one.shape[1] - 1), -1]
+    learner.update(1)
+    before = parts.agent.held_out_losses(with_gap)["low/held_out_loss"]
+    learner.update(40)
+    assert parts.agent.held_out_losses(with_gap)["low/held_out_loss"] < before
 
 
 def test_nothing_learns_from_people_who_are_held_out(path):

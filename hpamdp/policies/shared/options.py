@@ -335,7 +335,7 @@ class SequenceSearchOptions(SearchOptions):
 class PlanningOptions(SearchOptions, EndValueOptions, ReplayOptions):
     """Settings of a learner that plans in a learned model."""
 
-    warmup_steps: PositiveInt = 1000
+    warmup_steps: Annotated[PositiveInt, OwnSteps()] = 1000
     """Random steps of a learner before its first update. The updates that are due for them are then made at once."""
     num_members: PositiveInt = 2
     """Members of the ensemble of models."""

@@ -155,6 +155,16 @@ class DLPA(ReplayLearner):
         super().take_bonus(bonus)
         self.policy.bonus = bonus.scaled(self.options.reward_scale)
 
+    def start(self) -> None:
+        """Let the policy plan, also in the model of a data set."""
+        self.on_progress(0)
+
+    def stored_losses(self) -> dict[str, Tensor]:
+        """Return the H-step loss on the windows that start at all stored steps, and its parts."""
+        windows = self.windows(torch.arange(len(self.buffer), device=self.frames.device))
+        loss, parts = self.loss(windows.select(*_STORED, "terminated", "valid"), windows[:, 0].select("state"))
+        return {"loss": loss, **parts}
+
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the model from windows `[batch_size, horizon]`, and the values from the first step of each."""
         first = sample[:, 0]
@@ -253,6 +263,8 @@ class DLPA(ReplayLearner):
         if keys.IS_DECISION in batch.keys():  # the option of the batch before may have ended, see `known_ends`
             follows[:, 0] &= ~batch.get(keys.IS_DECISION).reshape(-1, num_steps)[:, 0]
         follows[:, 1:] = mask[:, 1:] & mask[:, :-1] & ~ends[:, :-1]
+        # A data set may lack steps: then the next row does not begin where this one led.
+        follows[:, 1:] &= rows["next_state"][:, :-1].isclose(rows["state"][:, 1:], atol=1e-4).all(-1)
 
         # New trajectories are numbered on from those in the buffer.
         num_stored = len(self.buffer)

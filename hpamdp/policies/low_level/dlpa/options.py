@@ -10,7 +10,7 @@ from typing_extensions import Self
 
 from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import REPLAY_CARD, PlanningOptions, ReplayMemoryOptions
-from hpamdp.settings import PositiveFraction, Widths
+from hpamdp.settings import OwnSteps, PositiveFraction, Widths
 
 
 class DLPAOptions(ReplayMemoryOptions, PlanningOptions):
@@ -39,7 +39,7 @@ class DLPAOptions(ReplayMemoryOptions, PlanningOptions):
     """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
     batch_size: PositiveInt = 256
     """Windows in an update."""
-    updates_per_step: PositiveFloat = 1.0
+    updates_per_step: Annotated[PositiveFloat, OwnSteps()] = 1.0
     """Updates for each step that the learner collects; the first ones make up for the warm-up."""
     momentum: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
     """Weight of the old distribution in the new one."""
@@ -59,7 +59,6 @@ CARDS = {
     "DLPA": replace(
         REPLAY_CARD,
         options=DLPAOptions,
-        modes=("train",),
         takes=frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS}),
         has_value=True,
         value_setting="end_values",
