@@ -16,16 +16,9 @@ from scipy.stats import binomtest
 from hpamdp.env.boatdock.harbour import CONGRUENT, INCONGRUENT, NOT_CHOSEN
 from hpamdp.env.boatdock.physics import DOCK_RADIUS, HARBOUR_RADIUS, OUTCOMES, SUCCESS
 from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
+from hpamdp.env.boatdock.task import OUTCOME_TABLE
 from hpamdp.figure_style import AGENT, FAINT, INK, REFERENCES, label_ends
 
-_OUTCOME_COLOURS = {
-    "success": "#009E73",
-    "too_fast": "#D55E00",
-    "out_of_bounds": "#AA4499",
-    "out_of_fuel": "#332288",
-    "time_limit": "#7FC8F2",
-    "sailing": "#8c8c8c",
-}
 _WATER, _RIM, _DOCK, _DOCK_EDGE = "#eef4f6", "#9fb9c2", "#f4dfb0", "#c8963e"
 
 _SHEET = (4, 6)  # rows and columns of the sheet of trajectories
@@ -81,7 +74,7 @@ def _trajectories(evaluation: Mapping[str, np.ndarray], names: tuple[str, ...]) 
 
 
 def _colour(outcome: str) -> str:
-    return _OUTCOME_COLOURS.get(outcome, FAINT)
+    return OUTCOME_TABLE[outcome].colour
 
 
 def _words(name: str) -> str:

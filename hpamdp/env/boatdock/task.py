@@ -22,14 +22,31 @@ def speed(duration: Any) -> Any:
     return duration * duration * (100.0 - (20.0 / 3.0) * duration)
 
 
-# A new outcome, or another rule for docking, also has to be written where the rules are written again:
-# - `physics.press` and `kernel.press`;
-# - `planner`, which knows only docking at rest, and would give a wrong ceiling without an error;
-# - `play/page/physics.js` (rule and score) and `play/page/game.js` (its words for outcomes);
-# - `play/episodes.py` (`Episode.outcome` and `score`), `figures.py` (colours), `reference.py` (people's figures).
-# tests/test_rule_copies.py compares the names and constants, and the planner's docking with `physics`.
-# In this order: going on, success, the failures, the time limit. `physics` and `kernel` determine the outcome.
-OUTCOMES = ("sailing", "success", "too_fast", "out_of_bounds", "out_of_fuel", "time_limit")
+MAX_PRESSES = 25
+SUCCESS_REWARD, FAILURE_REWARD = 5.0, -1.0
+
+
+class Outcome(NamedTuple):
+    """How the game in the browser tells of an outcome, and its colour in figures."""
+
+    words: str
+    colour: str
+
+
+# The outcomes by their names, in this order: going on, success, the failures, the time limit. Numbers, rewards, tables,
+# figures, files and the page follow from it. When an outcome occurs is written where presses are: for columns in
+# `physics.press`, for one row in `kernel.press`, and in `play/page/physics.js`. `planner` knows only docking at rest:
+# if a rule forbids some of its plans, it would give a wrong ceiling without an error.
+# tests/test_rule_copies.py compares names and constants, tests/test_planner.py plays the plans.
+OUTCOME_TABLE = {
+    "sailing": Outcome("Sailing", "#8c8c8c"),
+    "success": Outcome("Docked", "#009E73"),
+    "too_fast": Outcome("Too fast", "#D55E00"),
+    "out_of_bounds": Outcome("Out of the harbour", "#AA4499"),
+    "out_of_fuel": Outcome("Out of fuel", "#332288"),
+    "time_limit": Outcome(f"{MAX_PRESSES} presses and no dock", "#7FC8F2"),
+}
+OUTCOMES = tuple(OUTCOME_TABLE)
 SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL, TIME_LIMIT = range(len(OUTCOMES))
 
 # With no more fuel than this (seconds) the tank counts as empty. The remainder is a rounding error of float32.
@@ -58,8 +75,6 @@ INDEX_ANGLE = 3 * LAYOUT_TRIES
 INDEX_CONTROLLER = 3 * LAYOUT_TRIES + 1
 INDEX_KEYMAP = 3 * LAYOUT_TRIES + 2
 
-MAX_PRESSES = 25
-SUCCESS_REWARD, FAILURE_REWARD = 5.0, -1.0
 # The scaled observation divides by these, so that entries lie in about [-1, 1].
 SPEED_SCALE = speed(MAX_DURATION)  # px/s
 

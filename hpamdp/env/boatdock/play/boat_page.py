@@ -18,7 +18,7 @@ from hpamdp.env.boatdock.reference import (
     HUMAN_SUCCESS_BY_BLOCK,
     OFFSET_EDGES,
 )
-from hpamdp.env.boatdock.task import MAX_PRESSES, Boats, Rules
+from hpamdp.env.boatdock.task import MAX_PRESSES, OUTCOME_TABLE, Boats, Rules
 from hpamdp.env.play_page import EpisodeError
 
 BLOCK, NUM_BLOCKS = 60, 6  # as in the recording of people
@@ -33,8 +33,8 @@ MOST_AGENTS = 8  # the colours of agents in `game.js`
 _FOLDER = Path(__file__).resolve().parent / "page"
 
 
-def shared_rules() -> dict[str, float]:
-    """Return the constants of the boats' motion and of an episode, which every page of boats needs."""
+def shared_rules() -> dict[str, Any]:
+    """Return what every page of boats needs: the constants of motion and episode, and the words for outcomes."""
     return {
         "harbour_radius": physics.HARBOUR_RADIUS,
         "dock_radius": physics.DOCK_RADIUS,
@@ -43,6 +43,7 @@ def shared_rules() -> dict[str, float]:
         "tank": physics.TANK,
         "max_duration": physics.MAX_DURATION,
         "max_presses": MAX_PRESSES,
+        "outcomes": {name: outcome.words for name, outcome in OUTCOME_TABLE.items()},
     }
 
 

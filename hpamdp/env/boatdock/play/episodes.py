@@ -20,7 +20,7 @@ from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.play.replay import HELD, Press, Replay, replay, settle
-from hpamdp.env.boatdock.task import MAX_PRESSES
+from hpamdp.env.boatdock.task import FAILURE_REWARD, MAX_PRESSES, SUCCESS_REWARD
 from hpamdp.env.play_page import EpisodeError
 from hpamdp.files import read_regular
 from hpamdp.json_lines import left_out, lines_of, read_json
@@ -87,9 +87,9 @@ class Trip(BaseModel):
     goal: Point
     events: Annotated[list[RawEvent], Field(min_length=1, max_length=_MAX_EVENTS)]
     presses: Annotated[list[SettledPress], Field(min_length=1, max_length=MAX_PRESSES)]
-    outcome: Literal["success", "too_fast", "out_of_bounds", "out_of_fuel", "time_limit"]
+    outcome: Literal[physics.OUTCOMES[1:]]  # type: ignore[valid-type]
     fuel: Annotated[float, Field(ge=0.0, le=1.0)]
-    score: Annotated[float, Field(ge=-1.0, le=5.0)]
+    score: Annotated[float, Field(ge=FAILURE_REWARD, le=SUCCESS_REWARD)]
     end: Point
 
 

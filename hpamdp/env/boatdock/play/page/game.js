@@ -69,10 +69,6 @@ function playGame(makeTask) {
   };
   const AGENTS = ["#D55E00", "#AA4499", "#0072B2", "#8c6d1f", "#6a3fb5", "#b00020", "#00979c", "#7d7d7d"];
   const COLOURS = { you: "#1d3f58", glide: "#86aecb", plan: "#3c8a55", agents: AGENTS };
-  const OUTCOMES = {
-    success: "Docked", too_fast: "Too fast", out_of_bounds: "Out of the harbour", out_of_fuel: "Out of fuel",
-    time_limit: `${rules.max_presses} presses and no dock`,
-  };
 
   const $ = (selector) => document.querySelector(selector);
   const harbour = $("#harbour");
@@ -358,7 +354,7 @@ function playGame(makeTask) {
   function outcomeText(result) {
     const why = result.outcome === "too_fast"
       ? ` at ${game.state.speed.toFixed(0)} px/s; the limit is ${rules.docking_speed.toFixed(0)}` : "";
-    return `<h3 class="${result.outcome === "success" ? "good" : "bad"}">${OUTCOMES[result.outcome]}${why}</h3>`;
+    return `<h3 class="${result.outcome === "success" ? "good" : "bad"}">${rules.outcomes[result.outcome]}${why}</h3>`;
   }
 
   // A table from its caption, its head and its rows, whose first cell is a class.
