@@ -24,7 +24,6 @@ from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
-from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.batched_env import GOING_ON, BatchedEnv
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium_adapter import (
@@ -35,6 +34,7 @@ from hpamdp.env.gymnasium_adapter import (
     RenderMode,
 )
 from hpamdp.env.gymnasium_checks import as_array, describe, parameter_arrays
+from hpamdp.env.gymnasium_form import VectorForm
 from hpamdp.env.kernel_rows import KernelRows, Results
 from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW
 from hpamdp.settings import SettingError
@@ -165,7 +165,7 @@ class NumpyBatchedEnv(NumpyRows):
         if not env.components.is_single or any(env.integer_parameters):
             raise ProblemError(f"{env.title}: the Gymnasium form of a BatchedEnv has one component of real parameters")
         super().__init__(rows_of(env), batch)
-        self.action_space = _action_space(env)
+        self.action_space = VectorForm(env).action_space
         self._env = env
         self._picture = env.observation_entries[0].shape if env.observation_entries else None
         if self._picture is None:
@@ -258,16 +258,6 @@ def _load(problem: str) -> type[Any]:
     """Return the class that `package.module:Class` names."""
     module, _, name = problem.partition(":")
     return getattr(importlib.import_module(module), name)
-
-
-def _action_space(env: PAMDPEnv) -> spaces.Tuple:
-    """Return the space of the actions of one environment, `Tuple(Discrete, Tuple(Box, ...))`, behind any options."""
-    bounds = env.full_action_spec_unbatched[keys.PARAMETERS].space
-    ends = np.cumsum(env.parameter_dims)[:-1]
-    lows, highs = (np.split(side.cpu().numpy().reshape(-1), ends) for side in (bounds.low, bounds.high))
-    boxes = [spaces.Box(low, high, dtype=np.float32) for low, high in zip(lows, highs, strict=True)]
-    options = [spaces.Discrete(len(env.option_names))] if env.has_choice else []
-    return spaces.Tuple((*options, spaces.Discrete(len(boxes)), spaces.Tuple(boxes)))
 
 
 def to_numpy(tensor: torch.Tensor) -> np.ndarray:

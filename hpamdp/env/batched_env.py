@@ -34,6 +34,7 @@ from hpamdp.settings import SettingError, Settings
 
 # If a tensordict has only these keys and the problem's extra ones, there is nothing else to carry into its next root.
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
+_PLAN = "plan_"  # before the names of an oracle's columns in an `env_state`
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
 
@@ -84,6 +85,28 @@ class Action(NamedTuple):
     option: Tensor | None
 
 
+class PlanningOracle(Protocol):
+    """What knows the best actions of N environments by plans that it makes when episodes begin.
+
+    A problem whose best actions follow from the state alone defines `BatchedEnv.scripted_action` instead.
+    """
+
+    def spec(self) -> Composite:
+        """Return the spec of what `read` returns."""
+
+    def plan(self, state: Any, rows: Tensor) -> None:
+        """Plan for the environments of `rows`, bool `[N]`, from their states."""
+
+    def read(self, state: Any) -> TensorDict:
+        """Return the next action of each plan, and what else is known."""
+
+    def plans(self) -> dict[str, Tensor]:
+        """Return the plans for a checkpoint, first dimension `N`."""
+
+    def set_plans(self, plans: Mapping[str, Tensor]) -> None:
+        """Restore the result of `plans`."""
+
+
 class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     """`num_envs` copies of a problem in one batch dimension.
 
@@ -132,6 +155,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     reset_returns_all_rows = True
     num_envs: int
     rows: KernelRows | None = None  # the state that the kernel moves; None if the tensor functions do
+    planning_oracle: PlanningOracle | None = None  # which `_prepare` makes, if `_has_oracle` asks for it
     limit_terminates = False  # whether the time limit terminates an episode instead of truncating it
     float_type = torch.float32  # of observations and rewards
     seconds_per_step: ClassVar[float] = 0.25  # in films
@@ -358,9 +382,10 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         return {}
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return the columns of the state and the checksums of files, `[N]` each."""
+        """Return the columns of the state, the checksums of files and the oracle's plans, first dimension `N`."""
         checksums = {name: checksum.repeat(self.num_envs) for name, checksum in self.file_checksums().items()}
-        return self.state._asdict() | checksums
+        plans = {} if self.planning_oracle is None else self.planning_oracle.plans()
+        return self.state._asdict() | checksums | {_PLAN + name: plan for name, plan in plans.items()}
 
     def film_state(self, num: int) -> dict[str, Tensor]:
         """Return the columns of the state alone, of the first `num` environments."""
@@ -390,9 +415,12 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         if not columns:
             self._reset()
             return
-        checksums = self.file_checksums()
-        own = {name: column for name, column in columns.items() if name not in checksums}
+        plans = {name.removeprefix(_PLAN): plan for name, plan in columns.items() if name.startswith(_PLAN)}
+        others = self.file_checksums().keys() | {_PLAN + name for name in plans}
+        own = {name: column for name, column in columns.items() if name not in others}
         self._put(restored(own, self._state, type(self).__name__))
+        if self.planning_oracle is not None and plans:
+            self.planning_oracle.set_plans(plans)
 
     def seed_evaluation(self, seed: int) -> None:
         """Begin with the episodes of an evaluation, which training never has, whatever its seed."""
@@ -436,6 +464,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _knowledge_specs(self) -> dict[str, TensorSpec]:
         """Return the specs of what is known beside the observation, such as the action of a scripted player."""
+        if self.planning_oracle is not None:
+            return {"oracle": self.planning_oracle.spec()}
         if not self._has_oracle:
             return {}
         shape, device = self._shape_of_plans, self.device
@@ -448,6 +478,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _knowledge(self) -> dict[str, Any]:
         """Return what `_knowledge_specs` describes, for the current states."""
+        if self.planning_oracle is not None:
+            return {"oracle": self.planning_oracle.read(self._state)}
         if not self._has_oracle:
             return {}
         plan = zip(("discrete", "parameters"), self.scripted_action(self._state), strict=True)
@@ -548,6 +580,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _on_start(self, mask: Tensor) -> None:
         """Prepare what episodes that have just begun or were put elsewhere, in the rows of `mask` `[N]`, need."""
+        if self.planning_oracle is not None:
+            self.planning_oracle.plan(self._state, mask)
 
     def _given_columns(self, tensordict: TensorDictBase | None) -> dict[str, Tensor]:
         """Return the columns of the state that `reset` was given."""

@@ -27,7 +27,7 @@ from hpamdp.env.boatdock.form import BoatForm
 from hpamdp.env.boatdock.human_choices import choice_probabilities, human_spec
 from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.options import CARDS, BoatDockOptions
-from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
+from hpamdp.env.boatdock.oracle import BoatDockOracle
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.boatdock.task import BoatState
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
     from hpamdp.env.boatdock.play.boat_page import BoatPage
 
-_PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
 _MOST_SWAPPED = 4  # controllers; if there are more, symmetries swap none
 
 _CONTROLLER_ENTRY = task.OBSERVATION_NAMES.index("controller")
@@ -134,7 +133,8 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         self.rules = options.rules
         self.observation_names = task.observation_names(self.rules.observation)
         self._played = None if options.recording is None else _figures_of(options.recording, options.controller)
-        self._oracle = BoatDockOracle(self.num_envs, self.rules, self.device) if self._has_oracle else None
+        if self._has_oracle:
+            self.planning_oracle = BoatDockOracle(self.num_envs, self.rules, self.device)
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the rules in numbers."""
@@ -341,11 +341,6 @@ class BoatDockEnv(BatchedEnv[BoatState]):
 
         return BoatPage(seed, self.rules)
 
-    def env_state(self) -> dict[str, Tensor]:
-        """Return the columns of the state and, with `oracle`, its plans, first dimension `N`."""
-        plans = {} if self._oracle is None else {_PLAN + name: plan for name, plan in self._oracle.plans().items()}
-        return {**self.state._asdict(), **plans}
-
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Refuse controllers, key maps, counters and outcomes that do not exist.
 
@@ -355,37 +350,14 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         super().check_env_state(columns)
         check_range(columns, {"controller": (-1, len(self.rules.names)), "keymap": (0, 3)})
 
-    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Continue from an `env_state`.
-
-        Raises:
-            ValueError: it is not the state of this many environments.
-        """
-        super().set_env_state({name: column for name, column in columns.items() if not name.startswith(_PLAN)})
-        plans = {name.removeprefix(_PLAN): plan for name, plan in columns.items() if name.startswith(_PLAN)}
-        if self._oracle is not None and plans:
-            self._oracle.set_plans(plans)
-
-    def _on_start(self, mask: Tensor) -> None:
-        if self._oracle is not None:
-            self._oracle.plan(self._state, mask)
-
     def _knowledge_specs(self) -> dict[str, TensorSpec]:
-        specs: dict[str, TensorSpec] = {}
-        if self._has_human:
-            specs["human"] = human_spec(self.num_envs, self.device)
-        if self._has_oracle:
-            specs["oracle"] = oracle_spec(self.num_envs, self.rules, self.device)
-        return specs
+        human = {"human": human_spec(self.num_envs, self.device)} if self._has_human else {}
+        return human | super()._knowledge_specs()
 
     def _knowledge(self) -> dict[str, Any]:
         """Return how often people choose each controller, and what the planner knows."""
-        known: dict[str, Any] = {}
-        if self._has_human:
-            known["human"] = {"option": choice_probabilities(self._state)}
-        if self._oracle is not None:
-            known["oracle"] = self._oracle.read(self._state)
-        return known
+        human = {"human": {"option": choice_probabilities(self._state)}} if self._has_human else {}
+        return human | super()._knowledge()
 
 
 def _figures_of(recording: str, controller: str) -> dict[str, float]:

@@ -13,17 +13,6 @@ from hpamdp.env.boatdock import harbour, physics, planner
 from hpamdp.env.boatdock.task import BoatState, Rules
 
 
-def oracle_spec(num_envs: int, rules: Rules, device: torch.device) -> Composite:
-    """Return the spec of the entries that `BoatDockOracle.read` returns."""
-    shape = (num_envs, _num_plans(rules))
-    return Composite(
-        option=Categorical(len(rules.names), shape=(num_envs,), device=device),
-        discrete=Categorical(harbour.NUM_KEYS, shape=shape, device=device),
-        parameters=Bounded(0.0, physics.MAX_DURATION, shape=shape, device=device, dtype=torch.float32),
-        shape=(num_envs,),
-    )
-
-
 def _num_plans(rules: Rules) -> int:
     """Return the number of plans per environment: one for each controller that the agent may choose."""
     return len(rules.names) if rules.controller == "choose" else 1
@@ -52,6 +41,16 @@ class BoatDockOracle:
         self.keys = torch.zeros(shape, dtype=torch.long, device=device)
         self.durations = torch.zeros(shape, device=device, dtype=torch.float32)
         self.planned_at = torch.zeros(num_envs, dtype=torch.long, device=device)
+
+    def spec(self) -> Composite:
+        """Return the spec of the entries that `read` returns."""
+        shape, device = self.keys.shape[:2], self.option.device
+        return Composite(
+            option=Categorical(len(self.rules.names), shape=shape[:1], device=device),
+            discrete=Categorical(harbour.NUM_KEYS, shape=shape, device=device),
+            parameters=Bounded(0.0, physics.MAX_DURATION, shape=shape, device=device, dtype=torch.float32),
+            shape=shape[:1],
+        )
 
     def plans(self) -> dict[str, Tensor]:
         """Return the plans for a checkpoint, with `planned_at` if a boat was put in the middle of an episode."""

@@ -16,26 +16,11 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng
+from hpamdp.env.boatdock import task
 
 OUTCOMES = ("sailing", "success", "wall", "out_of_fuel", "time_limit")
 SAILING, SUCCESS, WALL, OUT_OF_FUEL, TIME_LIMIT = range(5)
-OBSERVATION_NAMES = (
-    "start_x",
-    "start_y",
-    "goal_x",
-    "goal_y",
-    "centre_x",
-    "centre_y",
-    "radius",
-    "controller",
-    "keymap",
-    "boat_x",
-    "boat_y",
-    "velocity_x",
-    "velocity_y",
-    "fuel",
-    "distance",
-)
+OBSERVATION_NAMES = (*task.OBSERVATION_NAMES[:8], "keymap", *task.OBSERVATION_NAMES[8:])
 SCALED_NAMES = (*OBSERVATION_NAMES, "to_goal_x", "to_goal_y")
 
 # Screen px. Start and goal are integers in [LOW, LOW + SIZE); the boat is clamped to [LOW, HIGH].

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -30,7 +30,6 @@ from hpamdp.geometry import PlaneGeometry
 from hpamdp.settings import SettingError
 
 _SIMILARITY, _COST = "similarity", "cost"
-_PLAN = "plan_"  # before the names of the known circuits in an `env_state`
 
 # Final scores of the best published learner, read off a figure, to within 0.02: means of 8 seeds after 1.05 million
 # steps. A run there has one random target, in training as in the evaluation.
@@ -111,9 +110,8 @@ class CircuitEnv(BatchedEnv[CircuitState]):
             raise SettingError(f"task={options.task}: nobody knows its best circuits with the published gates")
         if self._has_oracle and options.begin == "near_target":
             raise SettingError("begin=near_target: nobody knows the best circuits from there; use begin=known or empty")
-        self._oracle = (
-            CircuitOracle(self.num_envs, self.design, options.task, self.device) if self._has_oracle else None
-        )
+        if self._has_oracle:
+            self.planning_oracle = CircuitOracle(self.num_envs, self.design, options.task, self.device)
         num = sum(self.parameter_dims)
         self.parameter_low, self.parameter_high = (-math.pi,) * num, (math.pi,) * num
 
@@ -226,11 +224,6 @@ class CircuitEnv(BatchedEnv[CircuitState]):
             ceiling["ceiling"]["oracle_agreement"] = 1.0
         return {**known, **ceiling}
 
-    def env_state(self) -> dict[str, Tensor]:
-        """Return the columns of the state and, with `oracle`, the known circuits, first dimension `N`."""
-        known = {} if self._oracle is None else {_PLAN + name: plan for name, plan in self._oracle.plans().items()}
-        return {**self.state._asdict(), **known}
-
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Refuse gates, gate sets, depths, counters and outcomes that do not exist.
 
@@ -241,27 +234,6 @@ class CircuitEnv(BatchedEnv[CircuitState]):
         limits = {"gate_set": (0, len(self.design.gate_sets)), "gate": (-1, len(self.discrete_names))}
         depths = {f"depth_{wire}": (0, self.design.task.depth + 1) for wire in range(self.design.task.n)}
         check_range(columns, limits | depths)
-
-    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Continue from an `env_state`.
-
-        Raises:
-            ValueError: it is not the state of this many environments.
-        """
-        super().set_env_state({name: column for name, column in columns.items() if not name.startswith(_PLAN)})
-        plans = {name.removeprefix(_PLAN): plan for name, plan in columns.items() if name.startswith(_PLAN)}
-        if self._oracle is not None and plans:
-            self._oracle.set_plans(plans)
-
-    def _on_start(self, mask: Tensor) -> None:
-        if self._oracle is not None:
-            self._oracle.plan(self._state, mask)
-
-    def _knowledge_specs(self) -> dict[str, TensorSpec]:
-        return {} if self._oracle is None else {"oracle": self._oracle.spec()}
-
-    def _knowledge(self) -> dict[str, Any]:
-        return {} if self._oracle is None else {"oracle": self._oracle.read(self._state)}
 
     def draw(self, track: Sequence[CircuitState]) -> np.ndarray:
         """Return a picture of the circuit so far, uint8 `[480, 480, 3]`."""
