@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import hydra
 import yaml
@@ -34,9 +34,8 @@ from hpamdp.messages import (
     FAILED,
     INTERRUPTED,
     MISTAKE,
+    exit_code,
     first_line,
-    lenient_streams,
-    lost_output,
     one_line,
     reason_of,
     say,
@@ -65,8 +64,9 @@ def main() -> None:
 
     The exit code is 0, 1 (a bug, with its traceback), 2 (a user's mistake, in one line) or 130 (interrupted).
     """
-    with lenient_streams():
-        _main()
+    code = exit_code(_main)
+    if code:
+        sys.exit(code)
 
 
 def _main() -> None:
@@ -83,12 +83,11 @@ def _main() -> None:
             with _limits_explained():
                 sys.exit(_run_command(sys.argv[1], sys.argv[2:]))
         conf = conf_dir()
-        line = _parse(conf)
+        line = parse(sys.argv[1:], conf)
         if line.flags["help"]:
             from hpamdp.config.help import help_page
 
             say(help_page(line, conf))
-            _check_shown()
             return
         _run_hydra(line, conf)
     except OverrideParseException as error:
@@ -99,20 +98,8 @@ def _main() -> None:
         warn(error.line)
         sys.stderr.write(error.frames)
         sys.exit(FAILED)
-    except _LostOutputError as error:
-        if isinstance(error.__cause__, BrokenPipeError):  # the reader has seen enough
-            sys.exit(FAILED)
-        _exit_with(f"stdout: {reason_of(error.__cause__)}", FAILED)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-
-
-def _parse(conf: Path) -> CommandLine:
-    try:
-        return parse(sys.argv[1:], conf)
-    except SystemExit:  # --version
-        _check_shown()
-        raise
 
 
 _NEEDS = {"files": "more open files, see ulimit -n", "memory": "more memory, see ulimit -v"}
@@ -156,25 +143,6 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message}; see {self.prog} --help")
 
-    def print_help(self, file: Any = None) -> None:
-        super().print_help(file)
-        _check_shown()
-
-
-class _LostOutputError(Exception):
-    """Raised if text that the user asked for was not written; the cause is the stream's error."""
-
-
-def _check_shown() -> None:
-    """Check that all text for stdout has been written.
-
-    Raises:
-        _LostOutputError: some text was lost.
-    """
-    error = lost_output()
-    if error is not None:
-        raise _LostOutputError from error
-
 
 def _run_hydra(line: CommandLine, conf: Path) -> None:
     """Let Hydra run the job or the sweep, and report mistakes in the command line in one line."""
@@ -193,8 +161,6 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         sys.argv[1:] = line.argv()  # which Hydra parses
         hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()
     except (Exception, KeyboardInterrupt, SystemExit) as error:
-        if line.only_shows and isinstance(error, SystemExit):
-            _check_shown()
         if sweep.has_begun(start):
             sys.exit(sweep.report(start, error))
         if isinstance(error, RuntimeError) and "srun" in str(error):  # which submitit looks for
@@ -206,12 +172,9 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         raise
     finally:
         unprotect_children()
-    if line.only_shows:
-        _check_shown()
-        return
     if sweep.has_begun(start):
         sys.exit(sweep.report(start))
-    if line.is_multirun:
+    if line.is_multirun and not line.only_shows:
         raise ConfigError(f"{' '.join(line.words)}: no job to run; give every swept setting a value")
 
 

@@ -115,12 +115,6 @@ def _finish(stream: LenientStream) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def lost_output() -> OSError | ValueError | None:
-    """Return the last error of a write to stdout, if there was one."""
-    sys.stdout.flush()
-    return getattr(sys.stdout, "error", None)
-
-
 def exit_code(program: Callable[[], int | None]) -> int:
     """Run a program and return its exit code, or 1 if some of its text could not be written to stdout.
 
@@ -134,10 +128,11 @@ def exit_code(program: Callable[[], int | None]) -> int:
         try:
             code = program() or 0
         except SystemExit as stop:
-            if stop.code or lost_output() is None:
+            if stop.code:
                 raise
             code = 0  # argparse has printed its help
-        error = lost_output()
+        sys.stdout.flush()
+        error = getattr(sys.stdout, "error", None)
         if code or error is None:
             return code
         if not isinstance(error, BrokenPipeError):
