@@ -488,13 +488,17 @@ def _nested(tree: dict[str, object]) -> Iterator[object]:
 
 
 def on_config(config):
-    """Put the studies and the API into the navigation."""
+    """Put the studies, the API and the pages of single choices into the navigation."""
     for item in config.nav:
         if "Results" in item:
             item["Results"] += studies()
         for inner in item.get("Reference", []):
             if "Internal modules" in inner:
                 inner["Internal modules"] = api_nav()
+            for title, folder in {**PAGES_OF_CHOICES, "Problems": "domains"}.items():
+                if title in inner:
+                    found = sorted(str(page.relative_to(ROOT / DOCS)) for page in (ROOT / DOCS / folder).glob("*.md"))
+                    inner[title] += [page for page in found if page not in inner[title]]
     return config
 
 

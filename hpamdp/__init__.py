@@ -8,8 +8,7 @@ The names below are all that a user needs. Everything else is internal and may c
 - `Callback`: the base of code that runs during training. `BestAgent`, `Patience`, `TimeLimit` and `OwnMetrics` are
   callbacks to choose from.
 - `PAMDPSpecs`: sizes and bounds of a problem, `PAMDPSpecs.from_env(env)`. Learners and selectors are built from it.
-- Learners: `BC`, `DLPA`, `HPPO`, `HSAC`, `HyAR`, `IQL`, `PADDPG`, `PDQN`, `PETS`, `QPAMDP`, `TD3BC`.
-- Selectors: `Actor`, `EpsilonGreedy`, `Exp3`, `LinThompson`, `LinUCB`, `MetaCritic`, `OptionCritic`, `Thompson`, `UCB`.
+- Learners, such as `HPPO`, and selectors, such as `UCB`: `dir(hpamdp)` lists them.
 - `PAMDPEnv`, `Learner`, `Selector`: the bases of a problem, a learner and a selector of your own.
 - `ConfigError`: raised for a user's mistake, with one line that says what is allowed. `DivergedError`: raised if
   training reaches numbers that are not finite. `EnvironmentFaultError`: raised if an environment's own code fails.

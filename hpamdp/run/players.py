@@ -18,7 +18,7 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.errors import closed_on_error
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import check_built, choose_selector, make_agent_of_run, make_env, make_evaluation
+from hpamdp.run.assemble import check_built, choose_selector, make_agent, make_env, make_evaluation
 from hpamdp.run.compatibility import check, check_effects
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.resume import check_saved_options, resolve, saved_words
@@ -134,7 +134,7 @@ def load_agent(
         env = make_env(config, 1, device, config.run.seed)
         with closed_on_error(env):
             check_built(config, env)
-            agent = make_agent_of_run(config, PAMDPSpecs.from_env(env), device)
+            agent = make_agent(config, PAMDPSpecs.from_env(env), device)
             if source is None:
                 return LoadedAgent(config, agent, env, {})
             check_saved_options(config, env)

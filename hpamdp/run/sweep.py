@@ -24,12 +24,12 @@ from omegaconf import DictConfig, OmegaConf
 from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO
-from hpamdp.files import read_regular, remove_link, replacing
+from hpamdp.files import replacing
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, MISTAKE, one_line, reason_of, say, warn
-from hpamdp.run.folder import check_no_link, has_foreign_error, is_about_folder, locked, remove_error, write_error
+from hpamdp.run.folder import has_foreign_error, is_about_folder, locked, remove_error, write_error
 from hpamdp.run.search import first_job_of_search, has_numbered_folders
 from hpamdp.run.stopping import exits_explained, pass_on_signal
-from hpamdp.run_files import ERROR_NAME, MAX_TEXT_BYTES, saved_summary
+from hpamdp.run_files import ERROR_NAME, saved_summary
 from hpamdp.shell import path_setting
 
 _PATIENCE_S = 30.0  # for the running batch, after the sweep's process was killed
@@ -37,7 +37,6 @@ _LOCK_PATIENCE_S = 2 * _PATIENCE_S  # for jobs of a killed sweep, which still sa
 # Settings of Hydra that only a sweep reads, and those that only a single run reads.
 _OF_SWEEPS = ("hydra.sweep.", "hydra.sweeper.", "hydra.launcher.", "hydra/sweeper", "hydra/launcher")
 _OF_RUNS = ("hydra.run.",)
-_HYDRA_NAME = "multirun.yaml"  # which Hydra writes into the sweep's folder
 # States of a job. The first one holds until the job ends.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
 _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
@@ -92,7 +91,7 @@ def _check_fixed(config: DictConfig, name: str) -> None:
 
 
 def _check_sweep_dir(folder: Path) -> None:
-    """Refuse the working directory, and a folder whose `multirun.yaml` Hydra would replace but has not written.
+    """Refuse the working directory.
 
     Raises:
         ConfigError: the folder is refused.
@@ -101,20 +100,6 @@ def _check_sweep_dir(folder: Path) -> None:
         raise ConfigError(
             "hydra.sweep.dir: the working directory; give a folder of the sweep's own, or leave hydra.sweep.dir out"
         )
-    file = folder / _HYDRA_NAME
-    if not os.path.lexists(file):
-        return
-    try:
-        is_hydras = read_regular(file, MAX_TEXT_BYTES).startswith(b"hydra:\n")
-    except OSError:
-        is_hydras = False
-    if not is_hydras:
-        raise ConfigError(
-            f"{_shown(folder)}: holds {_HYDRA_NAME}, which no sweep has written and a sweep would replace; take "
-            "another hydra.sweep.dir"
-        )
-    with suppress(OSError):  # Hydra fails for the same reason
-        remove_link(file)
 
 
 def _check_output_subdir(config: DictConfig) -> None:
@@ -162,7 +147,6 @@ class Records:
 
     def write(self, job: Job) -> None:
         """Save the state of a job."""
-        check_no_link(self._folder.parent)
         self._folder.mkdir(parents=True, exist_ok=True)
         with replacing(self._folder / f"{job.number}.json") as partial:
             partial.write_text(json.dumps(asdict(job)))

@@ -22,11 +22,10 @@ from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, raised_by
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import CollectionError
 from hpamdp.run.compatibility import check_effects_on, need_of_evaluations, settings_without_effect
-from hpamdp.run.folder import check_no_link, check_no_training, check_unused
+from hpamdp.run.folder import check_no_training, check_unused
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.stopping import ProgramExitError, exits_explained
 from hpamdp.run.trainer import DivergedError, Trainer
-from hpamdp.run_files import TENSORBOARD_NAME, WANDB_NAME
 from hpamdp.shell import path_setting, program
 
 
@@ -113,8 +112,6 @@ def begin(
     is_training = config.run.mode != "eval"
     is_own = is_training and _is_in(source, output_dir)
     if output_dir is not None:
-        for name in (TENSORBOARD_NAME, WANDB_NAME):
-            check_no_link(output_dir / name)
         if not is_training:
             check_no_training(output_dir)
         if not is_own:
