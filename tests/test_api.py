@@ -26,7 +26,7 @@ from hpamdp.env.boatdock.gymnasium_adapter import BoatDockVector
 from hpamdp.run_files import CHECKPOINT_NAME, METRICS_NAME
 
 USAGE = Path(__file__).resolve().parent.parent / "docs" / "usage.md"
-TINY = {"total_frames": 1024, "num_envs": 8, "steps_per_batch": 64, "eval.layouts": 4, "progress": False}
+TINY = {"total_frames": 1024, "num_envs": 32, "steps_per_batch": 16, "eval.layouts": 4, "progress": False}
 OWN = {**TINY, "env.max_steps": 5, "low": "hppo"}
 
 
