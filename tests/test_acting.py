@@ -25,7 +25,7 @@ class Recorder(Toy):
 def steps_of_a_training() -> Counter:
     STEPS.clear()
     options = {"num_envs": 4, "steps_per_batch": 16, "eval.layouts": 2, "env.max_steps": 5, "progress": False}
-    hpamdp.train(Recorder, low="hppo", total_frames=640, **options)
+    hpamdp.train(Recorder, low="hppo", total_frames=256, **options, **{"low.minibatch_size": 64})
     return Counter(STEPS)
 
 
@@ -56,5 +56,6 @@ def test_a_training_explores_while_another_thread_acts_greedily():
     while thread.is_alive():
         agent.act(observation)
         agent.reset()
-    assert steps == [alone] and alone[ExplorationType.RANDOM] == 640
+        thread.join(0.005)
+    assert steps == [alone] and alone[ExplorationType.RANDOM] == 256
     assert exploration_type() == before
