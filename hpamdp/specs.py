@@ -61,8 +61,8 @@ class PAMDPSpecs:
     parameter_dims: tuple[int, ...]
     parameter_low: tuple[float, ...]
     parameter_high: tuple[float, ...]
-    initial_weight: tuple[tuple[float, ...], ...] | None = None
-    initial_bias: tuple[float, ...] | None = None
+    initial_weight: tuple[tuple[float, ...], ...] | None = field(default=None, compare=False)
+    initial_bias: tuple[float, ...] | None = field(default=None, compare=False)
     has_action_mask: bool = False
     has_option_mask: bool = False
     option_actions: tuple[tuple[bool, ...], ...] | None = None

@@ -23,6 +23,7 @@ from toy_environments import Toy
 import hpamdp
 from hpamdp import keys
 from hpamdp.env.boatdock.gymnasium_adapter import BoatDockVector
+from hpamdp.env.errors import ProblemError
 from hpamdp.run_files import CHECKPOINT_NAME, METRICS_NAME
 
 USAGE = Path(__file__).resolve().parent.parent / "docs" / "usage.md"
@@ -476,6 +477,24 @@ def test_a_folder_with_another_run_is_refused_and_stays(tmp_path):
 def test_an_agent_is_refused_at_a_problem_of_other_sizes(platform_agent):
     with pytest.raises(hpamdp.ConfigError, match="env=goal has observation_dim=17, but the agent's problem 9"):
         platform_agent.evaluate("goal", episodes=2)
+
+
+@pytest.mark.parametrize(("agent", "env_id"), [("pdqn_goal", "Goal"), ("hppo_moving", "Moving")])
+def test_an_agent_plays_its_problem_in_gymnasiums_form_also_in_a_wrapper(agent, env_id):
+    # Goal's form has no published initial parameters. Moving's has bounds, by which observations would be scaled.
+    loaded, env = hpamdp.load(agent), gymnasium.make(f"hpamdp/{env_id}-v0")
+    played = loaded.evaluate(env, episodes=30, per_episode=True)
+    doubled = gymnasium.wrappers.TransformReward(env, lambda reward: 2.0 * reward)
+    assert loaded.evaluate(doubled, episodes=30)["return"] == pytest.approx(2.0 * float(played["return"].mean()))
+    own = loaded.evaluate(episodes=100, per_episode=True)["return"]
+    assert float(played["return"].mean()) == pytest.approx(float(own.mean()), abs=float(own.std()))
+
+
+def test_an_agent_that_reads_scaled_observations_is_refused_at_the_problem_itself():
+    env = gymnasium.make("hpamdp/Moving-v0")
+    agent = hpamdp.train(env, **TINY, low="random")
+    with pytest.raises(ProblemError, match="learned with scaled observations, which this problem does not have"):
+        agent.evaluate("moving", episodes=2)
 
 
 @pytest.mark.parametrize(("name", "problem"), [("meta_critic_hppo_rooms", "rooms"), ("linucb_hppo", "boatdock")])

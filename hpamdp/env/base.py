@@ -433,7 +433,17 @@ class PAMDPEnv(EnvBase):
         return {}
 
     def set_scaling_from(self, other: PAMDPEnv) -> None:
-        """Scale observations as the other environment does, now and later, if their scale is learned."""
+        """Scale observations as the other environment does, now and later, if their scale is learned.
+
+        Raises:
+            ProblemError: the other one scales observations, and this problem does not.
+        """
+        scaling = getattr(other, "scaling", None)
+        if scaling is not None and not scaling.is_unscaled:
+            raise ProblemError(
+                f"{self.title}: the agent has learned with scaled observations, which this problem does not have; "
+                "give it in Gymnasium's form"
+            )
 
     def make_action_spec(self, low: Tensor, high: Tensor, *, has_option: bool = False) -> Composite:
         """Return the spec of the action leaves, given the bounds `[num_parameters]` of all parameters.

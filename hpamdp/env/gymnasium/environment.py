@@ -208,15 +208,19 @@ class GymnasiumEnv(PAMDPEnv):
         self._reports_success |= bool(success.any())
         return {_SUCCESS: success} if self._reports_success else {}
 
-    def set_scaling_from(self, other: GymnasiumEnv) -> None:
+    def set_scaling_from(self, other: PAMDPEnv) -> None:
         """Scale observations by the running statistics of `other`, now and later, without updating them.
 
-        Without running statistics this changes nothing.
+        Without running statistics this changes nothing. If `other` is a problem of this package, whose agents read its
+        observations as they are, these are not scaled.
 
         Raises:
             ValueError: the two differ in their scaling or in the length of their observations.
         """
-        self.scaling.share(other.scaling)
+        if isinstance(other, GymnasiumEnv):
+            self.scaling.share(other.scaling)
+        else:
+            self.scaling = ObservationScaling(self._copies.observations, "none")
 
     def seed_evaluation(self, seed: int) -> None:
         """Seed the episodes of an evaluation, which reports rewards as they are."""

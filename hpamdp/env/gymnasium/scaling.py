@@ -34,6 +34,7 @@ class ObservationScaling:
 
     Attributes:
         statistics: of all observations so far, with `running`; else None.
+        is_unscaled: whether all observations stay as they are.
 
     Raises:
         ValueError: there is no such scaling or entry.
@@ -50,7 +51,8 @@ class ObservationScaling:
         self._half_width = np.ones(self.dim)
         if scaling == "bounds":
             self._read_bounds(*space.bounds())
-        self._is_unscaled = bool((self._centre == 0.0).all() and (self._half_width == 1.0).all())
+        is_identity = bool((self._centre == 0.0).all() and (self._half_width == 1.0).all())
+        self.is_unscaled = self.statistics is None and is_identity
 
     def _read_bounds(self, low: np.ndarray, high: np.ndarray) -> None:
         has_both = np.isfinite(low) & np.isfinite(high)
@@ -71,7 +73,7 @@ class ObservationScaling:
         return scaled if self._is_raw is None else np.where(self._is_raw, vectors.astype(np.float32), scaled)
 
     def _all_scaled(self, vectors: np.ndarray) -> np.ndarray:
-        if self.statistics is None and self._is_unscaled:
+        if self.is_unscaled:
             return vectors.astype(np.float32)
         if self.statistics is None:
             return ((vectors - self._centre) / self._half_width).astype(np.float32)
