@@ -674,7 +674,7 @@ def test_random_numbers_stay_the_callers(tmp_path):
     ("source", "settings", "message"),
     [
         ("hppo_platform", {"mode": "train"}, "has no effect on a trained agent"),
-        ("hppo_platform", {"low": "hppo"}, "low: has no effect on a trained agent"),
+        ("hppo_platform", {"low": "hppo"}, "low: a trained agent keeps it; pass its class"),
         ("hppo_platform", {"eval": {"seed": 1, "layouts": 3}}, "has no effect on a trained agent"),
         ("hppo_platform", {"trust": "false"}, "must be True or False"),
         ("hppo_platform", {"max_stps": 5}, r"did you mean env\.max_steps"),

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -175,6 +176,30 @@ def test_an_agent_of_passed_classes_is_loaded_without_them_in_the_same_process(o
     assert hpamdp.load(of_classes)._config.low.settings["width"] == 3
 
 
+def of_module(module: str) -> type[hpamdp.HPPO]:
+    """Return a learner's class as a module of this name would have it."""
+
+    class Twin(hpamdp.HPPO):
+        __module__ = module
+
+    Twin.__qualname__ = "Twin"
+    return Twin
+
+
+def test_classes_of_one_name_from_two_modules_are_trained_and_loaded_in_one_process(tmp_path):
+    classes = {name: of_module(name) for name in ("old", "new")}
+    for name, cls in [*classes.items(), *classes.items()]:
+        agent = hpamdp.train("platform", low=cls, folder=tmp_path / name, overwrite=True, **TINY)
+        assert agent._config.low.cls is cls
+    for name, cls in classes.items():
+        assert hpamdp.load(tmp_path / name, low=cls)._config.low.cls is cls
+        again = {"low": cls, "folder": tmp_path / name, "resume": "auto"}
+        assert hpamdp.train("platform", **again, **TINY)._config.low.cls is cls
+    for call in (partial(hpamdp.load, tmp_path / "old"), partial(hpamdp.train, resume=tmp_path / "old")):
+        with pytest.raises(hpamdp.ConfigError, match=r"^low=Twin: several classes have this name; pass that of"):
+            call()
+
+
 def test_an_agent_of_a_forgotten_class_asks_for_the_class(of_classes, monkeypatch):
     forget(monkeypatch, high=Softmax)
     line = r"high/Softmax, which is not there; is a --config-dir missing\? Pass a class from Python again, as high$"
@@ -186,8 +211,8 @@ def test_an_agent_of_a_forgotten_class_asks_for_the_class(of_classes, monkeypatc
     ("group", "value", "line"),
     [
         ("high", hpamdp.Exp3, "high=Exp3: the agent was trained with high=Softmax; pass that class, or leave it out"),
-        ("low", "hppo", "low: has no effect on a trained agent; leave it out"),
-        ("low", {"name": Sized}, "low: a trained agent keeps its settings; pass the class Sized alone"),
+        ("low", "hppo", "low: a trained agent keeps it; pass its class alone, or leave it out"),
+        ("low", {"name": Sized}, "low: a trained agent keeps it; pass its class alone"),
         ("exploration", int, "exploration=int: int is no Exploration (hpamdp.policies.exploration.base)"),
     ],
 )

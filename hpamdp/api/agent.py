@@ -20,7 +20,7 @@ from hpamdp.acting import acting
 from hpamdp.api.arguments import flag, path_argument, problem_of, without_env_prefix
 from hpamdp.api.export import export_onnx
 from hpamdp.complaints import as_json
-from hpamdp.config.components import TARGET, Component, component
+from hpamdp.config.components import TARGET, Component, component, name_of_passed
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.config.outside_jobs import composed
@@ -258,8 +258,7 @@ class Agent:
         if env is None:
             own = self._config.env
             assert own.cls is not None
-            target = f"{own.cls.__module__}.{own.cls.__qualname__}"
-            changed = component("env", own.name, {TARGET: target, **own.settings, **settings})
+            changed = component("env", own.name, {TARGET: name_of_passed(own.cls), **own.settings, **settings})
             return self._fitting(replace(changed, objects=own.objects))
         problem = problem_of(env)
         given = problem.with_settings((f"env.{name}", value) for name, value in settings.items())

@@ -20,7 +20,7 @@ from hpamdp.api.arguments import Problem, choices_and_settings, flag, path_argum
 from hpamdp.config.command_line import SEARCH_PATH
 from hpamdp.config.compose import conf_dir, job_overrides, setting_of
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.outside_jobs import check_no_sweep, choosing_class, composed, searching
+from hpamdp.config.outside_jobs import check_is_single, check_no_sweep, choosing_class, composed, own_hydra, searching
 from hpamdp.config.saved import choices_of
 from hpamdp.config.schema import RESUME_AUTO, Config, RunConfig
 from hpamdp.env.errors import closed_on_error
@@ -102,10 +102,9 @@ def train(
     _check_what_needs_runs(settings, output_dir)
     if goes_on:
         settings = {**settings, "resume": None}
-    choices, own = _given(problem, settings, config_dirs)
     with _torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
         stack.enter_context(_warned_if_concurrent())
-        with composed(choices, own) as cfg:
+        with own_hydra(), composed(*_given(problem, settings, config_dirs)) as cfg:
             words = job_overrides()
             check_no_sweep(cfg, words)
             config, source = resolve(cfg, words, problem.objects)
@@ -173,6 +172,7 @@ def _given(
     words = [*searching(config_dirs), *problem.words, *choices]
     if settings.get("resume") is not None:
         resumed, trust = str(settings["resume"]), ["trust=true"] if settings.get("trust") is True else []
+        _check_shared_names(checkpoint.find(resumed, "resume"), words)
         words = [*saved_words(resumed, "resume", [*words, *trust]), *words]
         if not problem.words and not problem.objects:
             _check_problem(checkpoint.find(resumed, "resume"), [*settings, *dict(problem.settings)], "resume")
@@ -266,6 +266,7 @@ def _torch_restored() -> Iterator[None]:
         torchrl.logger.setLevel(level)
 
 
+@own_hydra()
 def load(
     source: str | Path,
     env: Any = None,
@@ -311,6 +312,7 @@ def load(
     words = [*searching(config_dirs), *problem.words, *choices, *(["trust=true"] if trust else [])]
     if env is None:
         _check_problem(file, given, "load")
+    _check_shared_names(file, [*settings, *words])
     return _loaded(file, words, own, problem.objects)
 
 
@@ -350,17 +352,21 @@ def _check_classes(file: Path, settings: Mapping[str, Any]) -> None:
     choices = choices_of(checkpoint.progress_of(file)["config"]) if given else {}
     for group in given:
         cls = settings[group]
-        if isinstance(cls, Mapping) and isinstance(cls.get("name"), type):
-            raise ConfigError(
-                f"{group}: a trained agent keeps its settings; pass the class {cls['name'].__name__} alone"
-            )
         if not isinstance(cls, type):
-            raise ConfigError(f"{group}: has no effect on a trained agent; leave it out")
+            raise ConfigError(f"{group}: a trained agent keeps it; pass its class alone, or leave it out")
         if choosing_class(group, cls) != choices[group]:
             raise ConfigError(
                 f"{group}={cls.__name__}: the agent was trained with {group}={choices[group]}; pass that class, or "
                 "leave it out"
             )
+
+
+def _check_shared_names(file: Path, words: Sequence[str]) -> None:
+    """Refuse a saved agent if a class of it, which these words do not name, is not the only one of its name."""
+    given = {setting_of(each) for each in words}
+    for group, name in choices_of(checkpoint.progress_of(file)["config"]).items():
+        if group not in given:
+            check_is_single(group, name)
 
 
 def _check_problem(file: Path, settings: Iterable[str], where: str) -> None:

@@ -62,7 +62,7 @@ def composed(words: Sequence[str], settings: Iterable[tuple[str, Any]] = ()) -> 
         ConfigError: the words cannot be composed, or a setting does not exist or has no value that a yaml file can
             hold.
     """
-    with _own_hydra():
+    with own_hydra():
         cfg = _compose(words, conf_dir())
         _change(cfg, settings, conf_dir())
         HydraConfig.instance().set_config(cfg)  # `compose` takes the searched folders from it
@@ -75,7 +75,7 @@ def searched(words: Sequence[str]) -> Iterator[None]:
 
     This takes no time, because nothing is composed. Other threads wait until the block ends.
     """
-    with _own_hydra():
+    with own_hydra():
         own = [each for each in words if each.startswith("hydra.searchpath=")]
         node: Any = OmegaConf.create({"hydra": {"overrides": {"hydra": own}}})  # what `compose` reads
         HydraConfig.instance().cfg = node
@@ -83,7 +83,7 @@ def searched(words: Sequence[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _own_hydra() -> Iterator[None]:
+def own_hydra() -> Iterator[None]:
     """Let the block change Hydra's state. Afterwards the state from before comes back."""
     with _HYDRA:
         outer, outer_config = GlobalHydra.instance().hydra, HydraConfig.instance().cfg  # of a program that uses Hydra
@@ -210,11 +210,27 @@ def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list
     return [search_word([folder_path(folder, where) for folder in folders])] if folders else []
 
 
+# Groups and names of passed classes that several modules have.
+_shared_names: set[tuple[str, str]] = set()
+
+
+def check_is_single(group: str, name: str) -> None:
+    """Refuse the name that a saved run gives for a class, if classes of several modules had it in this process.
+
+    Raises:
+        ConfigError: there are several.
+    """
+    if (group, name) in _shared_names:
+        raise ConfigError(f"{group}={name}: several classes have this name; pass that of the saved run as {group}")
+
+
 def choosing_class(group: str, cls: type) -> str:
     """Return the name of a class in a group: that of its yaml file, or a choice of its own, which Hydra then knows.
 
+    Until `composed` ends, no other thread may choose a class of the same name, so call it within `own_hydra`.
+
     Raises:
-        ConfigError: the class does not fit the group, or has the name of another choice.
+        ConfigError: the class does not fit the group, or has the name of a yaml file.
     """
     dotted = name_of_passed(cls)
     files = {file.stem: yaml.safe_load(file.read_text()) for file in sorted((conf_dir() / group).glob("*.yaml"))}
@@ -226,7 +242,7 @@ def choosing_class(group: str, cls: type) -> str:
         raise ConfigError(f"{group}: {dotted} has the name of {file_of(group, name)}; rename the class")
     stored = ConfigStore.instance().repo.get(group, {}).get(f"{name}.yaml")
     if stored is not None and stored.node.get(TARGET) != dotted:
-        raise ConfigError(f"{group}: {dotted} has the name of another choice in Hydra's ConfigStore; rename the class")
+        _shared_names.add((group, name))
     check_base_class(group, name, dotted)
     budget = {"budget": _BUDGET} if group == "low" else {}
     settings = defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group]))
