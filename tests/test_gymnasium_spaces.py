@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.spaces import Box, Dict, Discrete, Graph, OneOf, Sequence, Text, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiDiscrete, OneOf, Sequence, Text, Tuple
 from toy_environments import FORMS, MIXED
 
+from hpamdp.env.gymnasium import action_parts
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 from hpamdp.env.gymnasium.scaling import ObservationScaling
 
 UNIT = Box(0, 1, (1,))
+MANY = 1 << 31
 TWO_BOXES = Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
 
 
@@ -42,6 +44,36 @@ def test_another_action_space_is_refused_in_one_line(space, reason):
 def native(space: ActionSpace, discrete: int, parameters) -> tuple:
     (action,) = space.to_native(np.array([discrete]), np.float32([parameters]))
     return action
+
+
+@pytest.mark.parametrize(
+    ("space", "sizes", "dims"),
+    [
+        (Dict(mode=Discrete(2), count=Discrete(MANY)), (2, 1), (0, 0, 1)),
+        (Dict(count=Discrete(MANY, start=-5), x=UNIT), (), (1, 1)),
+        (Discrete(MANY), (), (1,)),
+        (MultiDiscrete([MANY, 3]), (), (2,)),
+        (Discrete(1000), (), (0,) * 1000),
+    ],
+    ids=str,
+)
+def test_entries_with_very_many_values_are_read_as_ordered_numbers_with_a_warning(space, sizes, dims, capsys):
+    action_parts._warn_once.cache_clear()
+    read = ActionSpace(space)
+    assert sorted(read.component_sizes) == sorted(sizes) or not sizes
+    assert sorted(read.parameter_dims) == sorted(dims)
+    choice = np.zeros((1, read.num_components) if read.component_sizes else 1, np.int64)
+    assert read.to_native(choice, read.high[None].astype(float))[0] in space
+    told = capsys.readouterr().err
+    assert ("has more than 1,000 values, so it is an ordered parameter" in told) == (len(dims) < 1000)
+
+
+def test_observed_entries_with_very_many_values_are_numbers():
+    space = ObservationSpace(Dict(m=MultiDiscrete([MANY, 3]), n=Discrete(MANY, start=4)))
+    assert space.flat({"m": np.array([7, 2]), "n": np.int64(5)}).tolist() == [7.0, 2.0, 5.0]
+    vector = np.zeros(3)
+    space.writer(vector, np.zeros(0, np.uint8))({"m": np.array([9, 1]), "n": 6})
+    assert vector.tolist() == [9.0, 1.0, 6.0]
 
 
 @pytest.mark.parametrize(

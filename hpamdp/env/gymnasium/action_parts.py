@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,11 @@ from gymnasium import spaces
 
 from hpamdp.env.gymnasium.parameter_trees import NotAcceptedError, ParameterTree, by_row
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers
+from hpamdp.messages import warn
 
+# Discrete actions of one choice, each of which has outputs of networks. More are too many to learn one by one.
+MOST_VALUES = 1000
+_warn_once = cache(warn)
 # Lower and upper bounds in the current state, in the space's own numbers, float64 `[M, size]` each.
 Bounds = tuple[np.ndarray, np.ndarray]
 
@@ -216,12 +221,17 @@ class PlainChoices(Part):
 
 
 class BoxComponent(Part):
-    """A `Box`: a component with one discrete action, whose parameters are the numbers of the box."""
+    """A `Box`: a component with one discrete action, whose parameters are the numbers of the box.
+
+    Whole numbers with more than `MOST_VALUES` values are read as such a box, with a warning.
+    """
 
     sizes = (1,)
     starts = (0,)
 
-    def __init__(self, space: spaces.Box) -> None:
+    def __init__(self, space: spaces.Box | spaces.Discrete | spaces.MultiDiscrete) -> None:
+        if not isinstance(space, spaces.Box):
+            _warn_once(f"action space: {space} has more than {MOST_VALUES:,} values, so it is an ordered parameter")
         self._tree = ParameterTree(space)
         self.trees = (self._tree,)
         self.parameter_dims = (self._tree.size,)
@@ -355,13 +365,19 @@ def _form_of_two(first: spaces.Space, second: spaces.Space, names: tuple[str, st
     is_divided = isinstance(second, spaces.Tuple | spaces.Dict) and len(second.spaces) == first.n
     if is_divided and not _is_conventional(second):
         return ChoiceForm(first, second, names=names)
-    return ChoiceForm(first, second, names=names) if isinstance(second, spaces.Box) else None
+    is_shared = isinstance(second, spaces.Box) and first.n <= MOST_VALUES
+    return ChoiceForm(first, second, names=names) if is_shared else None
 
 
 def _is_conventional(space: spaces.Space) -> bool:
     """Return whether a space is a `Discrete(K)` and the `Tuple` or `Dict` of its K parts, a choice by itself."""
     form = choice_form(space)
     return form is not None and not (form.is_shared or form.is_flat)
+
+
+def max_values(space: spaces.Discrete | spaces.MultiDiscrete) -> int:
+    """Return how many values a `Discrete` has, or the number of a `MultiDiscrete` with most values."""
+    return int(space.n if isinstance(space, spaces.Discrete) else space.nvec.max())
 
 
 def read_part(space: spaces.Space, *, finds_choices: bool) -> Part:
@@ -376,6 +392,8 @@ def read_part(space: spaces.Space, *, finds_choices: bool) -> Part:
     """
     if isinstance(space, spaces.OneOf) or (finds_choices and choice_form(space) is not None):
         return Choice(space)
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and max_values(space) > MOST_VALUES:
+        return BoxComponent(space)
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         return PlainChoices(space)
     if isinstance(space, spaces.Box):

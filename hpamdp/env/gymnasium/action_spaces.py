@@ -26,7 +26,8 @@ A part may be any tree of spaces. Its discrete entries become integer parameters
 
 **Several components.** Every other tree has the components of its parts, one after another:
 
-- a `Discrete` is a component without parameters, and so is every entry of a `MultiDiscrete` or `MultiBinary`;
+- a `Discrete` is a component without parameters, and so is every entry of a `MultiDiscrete` or `MultiBinary`. With
+  more than 1,000 values they are read as a `Box` of integers;
 - a `Box` is a component of one discrete action, whose parameters are its numbers;
 - a `Tuple` or `Dict` that has one of the forms above by itself is one component. Otherwise it has the components of its
   parts. A `Discrete(2)` and `Tuple(Discrete(K), Tuple(K parts))` are two components, since the latter is a choice.
@@ -50,7 +51,7 @@ from typing import Any, get_args
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.gymnasium.action_parts import Bounds, Choice, Part, choice_form, read_part
+from hpamdp.env.gymnasium.action_parts import MOST_VALUES, Bounds, Choice, Part, choice_form, read_part
 from hpamdp.env.gymnasium.options import ActionForm
 from hpamdp.env.gymnasium.parameter_trees import NotAcceptedError
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers
@@ -236,10 +237,10 @@ class OptionSpace:
                 return
             option_key = "option"
         option = entries.pop(option_key, None)
-        if not isinstance(option, spaces.Discrete) or not entries:
-            given = written(space)
+        if not isinstance(option, spaces.Discrete) or option.n > MOST_VALUES or not entries:
             raise SettingError(
-                f"option_key={option_key}: must name a Discrete beside the action, in the action space {given}"
+                f"option_key={option_key}: must name a Discrete beside the action, of at most {MOST_VALUES:,} options, "
+                f"in the action space {written(space)}"
             )
         self._key = option_key
         self._option = option

@@ -10,6 +10,7 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim, flatten
 
 from hpamdp.env.errors import ProblemError
+from hpamdp.env.gymnasium.action_parts import max_values
 from hpamdp.env.gymnasium.options import OutOfBounds
 from hpamdp.env.gymnasium.values import as_numbers, shown
 from hpamdp.settings import SettingError
@@ -18,6 +19,8 @@ from hpamdp.settings import SettingError
 _ROUNDING = 4.0
 # The dtype of the agent's observations.
 _OBSERVED = np.dtype(np.float32)
+# Longest one-hot vector.
+_MOST_ONE_HOT = 100_000
 # Types of a plain value of a Discrete.
 _INTEGERS = (int, np.int64, np.int32)
 _WHOLE = [np.dtype(name) for name in ("bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32")]
@@ -282,12 +285,17 @@ def leaves(
 ) -> Iterator[Leaf]:
     """Yield the leaves of a space, in the order of its flattened vector.
 
+    Entries of more than 100,000 values are boxes of integers.
+
     Raises:
         ValueError: `out_of_bounds` has no allowed value.
     """
     if out_of_bounds not in get_args(OutOfBounds):
         raise SettingError(f"out_of_bounds={out_of_bounds}, but must be one of {', '.join(get_args(OutOfBounds))}")
     entries = children(space)
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and max_values(space) > _MOST_ONE_HOT:
+        sizes: Any = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        space = spaces.Box(space.start, space.start + sizes - 1, space.shape, np.int64)
     if not isinstance(space, spaces.Tuple | spaces.Dict):
         yield Leaf(space, path, lengths, out_of_bounds)
     for entry, child in entries.items():
