@@ -76,6 +76,19 @@ def test_observed_entries_with_very_many_values_are_numbers():
     assert vector.tolist() == [9.0, 1.0, 6.0]
 
 
+@pytest.mark.parametrize(("high", "is_told"), [(500_000.0, True), (2.0, False), (np.inf, False)])
+def test_bounds_far_wider_than_what_is_seen_are_told_once(high, is_told, capsys):
+    space = Dict(mode=Discrete(3), position=Box(-50_000.0 if is_told else -2.0, high, (2,)))
+    scaling = ObservationScaling(ObservationSpace(space), "bounds")
+    seen = np.linspace([0.0, 0.0, 0.0, -3e-3, -3e-3], [0.0, 0.0, 1.0, 3e-3, 3e-3], 8)
+    for _ in range(500):
+        scaling.scaled(seen)
+    (*lines,) = capsys.readouterr().err.splitlines()
+    assert len(lines) == is_told
+    assert all("observation position[0]: seen from -0.003 to " in line for line in lines)
+    assert all("use env.observation_scaling=running" in line for line in lines)
+
+
 @pytest.mark.parametrize(
     ("low", "high"), [(1.7e9, 1.7e9 + 3600.0), (-5e4, -5e4 + 1e-3), (0.0, 1e-320), (1e30, 1e30 + 1e20), (99.0, 100.0)]
 )

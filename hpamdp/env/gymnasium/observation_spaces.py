@@ -122,6 +122,11 @@ class ObservationSpace:
             is_place[own] |= bool(leaf.path) and leaf.path[0] in entries
         return is_place
 
+    def name_of(self, place: int) -> str:
+        """Return what errors call a number of the vectors, such as `speed[0]`."""
+        leaf, own = next(each for each in zip(self.leaves, self.slices, strict=True) if place < each[1].stop)
+        return f"{_name(leaf)}[{place - own.start}]"
+
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds of the vectors, float64 `[dim]` each."""
         if not self.leaves:

@@ -13,10 +13,14 @@ from torch import Tensor
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 from hpamdp.env.gymnasium.options import Scaling
+from hpamdp.messages import warn
 from hpamdp.settings import SettingError
 
 # Bounds further apart than this count as none: some environments write 1e10 or the largest float.
 _WIDEST = 1e6
+# After so many observations, bounds more than 1,000 times as wide as what was seen are told.
+_WATCHED = 1000
+_WIDE = 1e3
 _CLIP = 10.0
 _LARGEST_REWARD = 1e30  # its square, and sums of many, are finite
 _SMALLEST = 1e-6  # standard deviation that is not counted as 0
@@ -49,6 +53,9 @@ class ObservationScaling:
         self._is_frozen = False
         self._centre = np.zeros(self.dim)
         self._half_width = np.ones(self.dim)
+        self._space = space
+        self._seen = np.full(self.dim, np.inf), np.full(self.dim, -np.inf)
+        self._num_to_watch = _WATCHED if scaling == "bounds" else 0
         if scaling == "bounds":
             self._read_bounds(*space.bounds())
         is_identity = bool((self._centre == 0.0).all() and (self._half_width == 1.0).all())
@@ -65,7 +72,25 @@ class ObservationScaling:
         """Return new observations `[M, dim]` scaled, float32; with `running`, they update the statistics first."""
         if self.statistics is not None and not self._is_frozen:
             self.statistics.update(vectors)
+        if self._num_to_watch > 0 and not self._is_frozen and len(vectors):
+            self._watch(vectors)
         return self.rescaled(vectors)
+
+    def _watch(self, vectors: np.ndarray) -> None:
+        """Warn of the first entry whose bounds are so wide that it is scaled to a constant."""
+        low, high = self._seen
+        self._seen = low, high = np.minimum(low, vectors.min(0)), np.maximum(high, vectors.max(0))
+        self._num_to_watch -= len(vectors)
+        is_narrow = (high > low) & (_WIDE * (high - low) < 2.0 * self._half_width) & (self._half_width > 1.0)
+        if self._is_raw is not None:
+            is_narrow &= ~self._is_raw
+        if self._num_to_watch <= 0 and is_narrow.any():
+            place = int(is_narrow.argmax())
+            warn(
+                f"observation {self._space.name_of(place)}: seen from {low[place]:.6g} to {high[place]:.6g}, but "
+                f"bounds {2.0 * self._half_width[place]:,.6g} apart scale it to a constant; use "
+                "env.observation_scaling=running, or narrower bounds"
+            )
 
     def rescaled(self, vectors: np.ndarray) -> np.ndarray:
         """Return observations `[M, dim]` scaled as by `scaled`, but without updating the statistics."""
