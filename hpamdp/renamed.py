@@ -40,6 +40,15 @@ _ELSEWHERE: dict[str, tuple[str, ...]] = {
     "eval_freq": ("eval.every",),
     "n_eval_episodes": ("eval.layouts",),
 }
+# Arguments of other libraries' evaluations, and those of `Agent.evaluate`.
+OF_EVALUATION = {
+    "n_eval_episodes": "episodes",
+    "num_episodes": "episodes",
+    "n_episodes": "episodes",
+    "eval.layouts": "episodes",
+    "return_episode_rewards": "per_episode",
+    "deterministic": "act, as evaluate is always greedy",
+}
 # Methods of other libraries' agents, and what to use here.
 _MEMBERS_ELSEWHERE = {
     "predict": "act(observation)",

@@ -50,6 +50,15 @@ class Reach(gymnasium.Env):
         return self.target, reward, False, False, {}
 
 
+class Several:
+    """Several agents, as PettingZoo has them."""
+
+    possible_agents = ("a", "b")
+
+    def step(self, actions):
+        return {}, {}, {}, {}, {}
+
+
 @pytest.fixture(scope="module")
 def platform_agent() -> hpamdp.Agent:
     return hpamdp.train("platform", low="hppo", **TINY)
@@ -426,6 +435,11 @@ WITHOUT_FOLDER = {"folder": None}
         ({"mode": "eval"}, r"use hpamdp.load\(...\).evaluate"),
         ({"env": 3}, "must be a name such as"),
         ({"env": lambda: 3}, "is no environment"),
+        ({"env": Several}, "Several is no environment, .* one of several agents needs a gymnasium.Env around it"),
+        ({"env": Several()}, "Several is no environment, .* one of several agents needs a gymnasium.Env around it"),
+        ({"env": {"env": Reach}}, "env: .*Reach.* is given as 'env'; write {'name': ..., ...}"),
+        ({"low": {"low": "hppo"}}, "low: 'hppo' is given as 'low'; write {'name': ..., ...}"),
+        ({"low": {"cls": hpamdp.HPPO}}, "HPPO.* is given as 'cls'; write {'name': ..., ...}"),
         ({"env": lambda: Reach}, "returned the class Reach, not an environment; call it"),
         ({"env": gymnasium.Env}, "has no action_space"),
         ({"env": Reach}, "no time limit of its own; set env.max_steps"),
@@ -824,6 +838,10 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.report(3), "folders=3: must be a path"),
         (lambda: hpamdp.report(".", metric=3), "metric=3: must be the name of a column"),
         (lambda: hpamdp.HPPO("platform"), r"specs='platform': must be PAMDPSpecs.from_env\(env\)"),
+        (lambda: hpamdp.HPPO("MlpPolicy", hpamdp.make_gymnasium("platform")), r"specs='MlpPolicy': must be PAMDPSpecs"),
+        (lambda: hpamdp.UCB(policy="MlpPolicy", env=3), r"specs='MlpPolicy': .* hpamdp.train\(env, low=...\) trains"),
+        (lambda: hpamdp.load("hppo_platform").evaluate(n_eval_episodes=3), "no such argument; use episodes"),
+        (lambda: hpamdp.load("hppo_platform").evaluate(deterministic=True), "no such argument; use act, as evaluate"),
         (lambda: hpamdp.PAMDPSpecs.from_env("platform"), "'platform' is no PAMDPEnv; hpamdp.make makes one"),
         (lambda: hpamdp.Patience(evaluations=0), "evaluations=0: must be greater than 0"),
         (lambda: hpamdp.Patience(foo=1), "foo: no such setting of PatienceOptions; it has evaluations"),

@@ -136,7 +136,8 @@ def test_an_environment_that_ends_the_program_while_it_is_built_is_reported_in_o
 def test_a_reward_of_an_evaluation_that_is_not_finite_is_reported_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(Toy, "step", lambda self, action: (self._observation(), float("nan"), False, False, {}))
     words = [word for word in WORDS if "entry_point" not in word]
-    with pytest.raises(ConfigError, match=r"^env: GymnasiumEnv: .*: the return of evaluation episode 0 is nan$"):
+    line = "^env: GymnasiumEnv: .*: environment 0: step returned the reward nan, which is not finite in float32$"
+    with pytest.raises(ConfigError, match=line):
         run(compose_config([*words, "env.entry_point=toy_environments:Toy"]), tmp_path)
 
 

@@ -30,7 +30,7 @@ from hpamdp.env.decisions import DecisionTracker, decision_tracker
 from hpamdp.env.facts import SOURCE_SETTINGS
 from hpamdp.messages import as_code
 from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.renamed import no_member
+from hpamdp.renamed import OF_EVALUATION, no_member
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env, make_evaluation, option_length
 from hpamdp.settings import NumAtOnce, Settings
@@ -230,6 +230,9 @@ class Agent:
             ConfigError: the problem has other sizes, or a number is wrong.
         """
         flag("per_episode", per_episode)
+        for name in settings:
+            if name in OF_EVALUATION:
+                raise ConfigError(f"evaluate: {name}: no such argument; use {OF_EVALUATION[name]}")
         of_problem = without_env_prefix(settings)
         for name in EnvConfig.model_fields:
             if name in of_problem:

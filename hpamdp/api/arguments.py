@@ -109,6 +109,9 @@ def without_env_prefix(settings: Mapping[str, Any]) -> dict[str, Any]:
 def _choice(group: str, value: Any) -> tuple[list[str], list[tuple[str, Any]]]:
     """Return the word that chooses a yaml file or a class for a group, if one is chosen, and the group's settings."""
     if isinstance(value, Mapping):
+        for name, each in value.items():
+            if name == group or (name != "name" and isinstance(each, type)):
+                raise ConfigError(f"{group}: {as_code(each)} is given as {name!r}; write {{'name': ..., ...}}")
         chosen = _choice(group, value["name"])[0] if "name" in value else []
         return chosen, [(f"{group}.{name}", each) for name, each in value.items() if name != "name"]
     if isinstance(value, type):
@@ -142,10 +145,11 @@ def problem_of(env: Any) -> Problem:
 
 
 def _of_gymnasium(env: Any) -> Problem:
-    if isinstance(env, gymnasium.Env):
-        return Problem(["env=gymnasium"], objects={"make": _copier(env)})
-    if callable(env) and not isinstance(env, EnvBase | VectorEnv):
-        return _of_callable(env)
+    if not isinstance(env, EnvBase | VectorEnv):
+        if hasattr(env, "step") and not isinstance(env, type):  # of another kind is refused where it is copied
+            return Problem(["env=gymnasium"], objects={"make": _copier(env)})
+        if callable(env):
+            return _of_callable(env)
     raise ConfigError(f"env={as_code(env)}: must be {_ACCEPTED}")
 
 

@@ -181,6 +181,14 @@ class Level:
     export_refusal: str | None = None
     specs: PAMDPSpecs
 
+    def __new__(cls, *given: Any, **settings: Any) -> Any:
+        """Refuse the first argument of other libraries, such as `MlpPolicy`, whatever follows it."""
+        first = given[0] if given else settings.get("policy")
+        if isinstance(first, str):
+            cure = "must be PAMDPSpecs.from_env(env); hpamdp.train(env, low=...) trains an agent"
+            raise SettingError(f"{cls.__name__}: specs={as_code(first)}: {cure}")
+        return super().__new__(cls)
+
     def check_specs(self, specs: PAMDPSpecs) -> None:
         """Refuse anything but specs, and pictures unless the card says `takes_pictures`.
 

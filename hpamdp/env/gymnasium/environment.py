@@ -378,11 +378,11 @@ class GymnasiumEnv(PAMDPEnv):
     def _in_float32(self, rewards: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):
             rounded = rewards.astype(np.float32)
-        is_wrong = np.isinf(rounded) & np.isfinite(rewards)
+        is_wrong = ~np.isfinite(rounded)
         if is_wrong.any():
             row = int(is_wrong.argmax())
             where = f"{self._name}: environment {self.first_env + row}"
-            raise ProblemError(f"{where}: step returned the reward {rewards[row]:g}, which is too large for float32")
+            raise ProblemError(f"{where}: step returned the reward {rewards[row]:g}, which is not finite in float32")
         return rounded
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:

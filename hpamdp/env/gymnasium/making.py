@@ -16,6 +16,9 @@ from hpamdp.env.gymnasium.contract import checked
 from hpamdp.messages import one_line
 from hpamdp.settings import SettingError
 
+# What environments of PettingZoo and RLlib have.
+_OF_SEVERAL_AGENTS = ("possible_agents", "agents", "agent_iter", "get_agent_ids")
+
 
 class Maker:
     """Makes copies of a Gymnasium environment.
@@ -81,9 +84,12 @@ class Maker:
         if isinstance(env, type):
             raise SettingError(f"{self.name}: returned the class {env.__name__}, not an environment; call it")
         if not isinstance(env, gymnasium.Env):
+            cure = "wrap an environment of gym with shimmy's GymV21CompatibilityV0"
+            if any(hasattr(env, name) for name in _OF_SEVERAL_AGENTS):
+                cure = "one of several agents needs a gymnasium.Env around it that acts for the others"
             raise SettingError(
                 f"{self.name}: {type(env).__name__} is no environment, because it does not inherit from gymnasium.Env; "
-                "wrap an environment of gym with shimmy's GymV21CompatibilityV0"
+                f"{cure}"
             )
         for space in ("action_space", "observation_space"):
             if not hasattr(env, space):
