@@ -11,7 +11,7 @@ import pytest
 import hpamdp
 from hpamdp.run import checkpoint
 
-TINY = {"total_frames": 1024, "num_envs": 8, "steps_per_batch": 64, "eval.layouts": 4}
+TINY = {"total_frames": 1024, "num_envs": 32, "steps_per_batch": 16, "eval.layouts": 4}
 MODULE = "tossing"  # its import leaves a mark
 CODE = """
 from pathlib import Path
