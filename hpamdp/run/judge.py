@@ -65,7 +65,8 @@ def judged(
     """Return what recorded transitions say of agents, the one with the highest return first; see `hpamdp.judge`."""
     if not paths:
         raise ConfigError("judge: nobody to judge; give the folders of runs")
-    agents = [load_agent(path, []) for path in paths]
+    of_problem = [word for word in words if setting_of(word).startswith("env.")]
+    agents = [load_agent(path, of_problem) for path in paths]
     first = agents[0]
     for path, other in zip(paths, agents, strict=True):
         if other.config.env != first.config.env:
