@@ -1,6 +1,7 @@
 """Gather the offline learners' runs and the runs that continued from them, then draw and tabulate them.
 
 python experiments/offline/study.py multirun/offline multirun/finetune   reads the runs, writes csv files, then draws
+python experiments/offline/study.py planner multirun/planner             reads the runs of the planner, likewise
 python experiments/offline/study.py                                      draws and tabulates the stored csv files
 """
 
@@ -24,6 +25,7 @@ from hpamdp.analysis.study import (
     first_at,
     gathered,
     groups,
+    interval_text,
     markdown_table,
     mean_of,
     read_csv,
@@ -51,6 +53,55 @@ COMPARISONS = (
     ("iql: pretrained less scratch", ("iql", PRETRAINED, "none", "all"), ("iql", SCRATCH, "none", "all")),
     ("pretrained: iql less td3_bc", ("iql", PRETRAINED, "none", "all"), ("td3_bc", PRETRAINED, "none", "all")),
 )
+
+
+# Runs of the planner, told apart by whose presses it learned from, the reward and the boats in the data.
+PLANNER = "planner"
+PLANNER_CELL = ("people", "reward", "boats")
+PEOPLE = {"all": "all 40", "worst_20": "the worse half", "one": "one, another one for each seed"}
+REWARDS = {"paper": "progress and score", "sparse": "recorded score alone"}
+
+
+def gather_planner(runs: Sequence[Run]) -> Rows:
+    """Return a row for each run of the planner: its score on the whole task and with one boat.
+
+    An agent that chooses between the boats is also scored with one of them held.
+    """
+    rows: Rows = []
+    for run in runs:
+        summary, data, env = run.summary, run.config["data"], run.config["env"]
+        people = "one" if data["people"] else f"worst_{data['worst_people']}" if data["worst_people"] else "all"
+        is_one = env["controller"] == "congruent"
+        rows.append(
+            {
+                "people": people,
+                "reward": env["reward"],
+                "boats": "congruent" if is_one else "both",
+                "seed": summary["seed"],
+                "person": ",".join(map(str, data["people"] or ())),
+                "updates": summary["frames"],
+                "whole_task": "" if is_one else round(summary["score"], 4),
+                "one_boat": round(summary["score" if is_one else "score_congruent"], 4),
+                "success": round(summary["success"], 4),
+                "presses": round(summary["steps"], 4),
+                "cpu_s": round(summary["cpu_s"], 1),
+            }
+        )
+    return rows
+
+
+def planner_table(rows: Rows) -> str:
+    """Return the planner's scores by cell, with the median over seeds beside the mean."""
+    lines = []
+    for (people, reward, boats), runs in groups(rows, *PLANNER_CELL).items():
+        cells = []
+        for column in ("whole_task", "one_boat"):
+            scores = [run[column] for run in runs if run[column] != ""]
+            cells += [spread(scores), interval_text(scores, ".2f")] if scores else ["", ""]
+        costs = f"{mean_of(runs, 'success'):.1%}", f"{mean_of(runs, 'presses'):.2f}", f"{mean_of(runs, 'cpu_s'):.0f} s"
+        lines.append([PEOPLE.get(people, people), REWARDS[reward], boats, len(runs), *cells, *costs])
+    head = "people | reward | boats | seeds | whole task | 95 % | one boat | 95 % | success | presses | CPU"
+    return markdown_table(head, lines)
 
 
 def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
@@ -169,15 +220,26 @@ def _draw_curve(axes: Axes, rows: Rows, label: str, colour: str, style: str) -> 
 
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
-    if folders:
+    if folders[:1] == [PLANNER]:
+        rows = gathered(
+            folders[1:],
+            gather_planner,
+            settings={"boatdock.controller": ("choose", "congruent"), "boatdock.reward": ("paper", "sparse")},
+            modes=("offline",),
+            env=("boatdock",),
+            low=("pets",),
+        )
+        add_to_tables(HERE, {PLANNER: rows}, (*PLANNER_CELL, "seed"), steps="updates")
+    elif folders:
         results, curves = gathered(
             folders, gather, modes=("train", "offline"), env=("boatdock",), low=COLOURS, high=("human",)
         )
         names = ("low", "start", "data", "episodes", "seed")
         add_to_tables(HERE, {"results": results, "curves": curves}, names, sorts=False)
-    results, curves = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves"))
+    results, curves, planner = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves", PLANNER))
     draw(curves, HERE / "curves.png")
     print(table(results, curves))
+    print(f"\n{planner_table(planner)}")
 
 
 if __name__ == "__main__":
