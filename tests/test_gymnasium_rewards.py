@@ -10,6 +10,7 @@ import torch
 from gymnasium_players import make, step
 from toy_environments import Toy
 
+import hpamdp
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv, _seeds
 from hpamdp.env.gymnasium.scaling import RewardScaling
@@ -35,6 +36,22 @@ def test_rewards_are_divided_by_the_deviation_of_the_discounted_returns_so_far()
         deviation = np.std(so_far)
         expected = rewards / (deviation if deviation > 1e-6 else 1.0)
         assert np.allclose(scaled[number], expected.clip(-10.0, 10.0), atol=1e-5)
+
+
+def test_returns_in_training_have_the_unit_of_those_in_evaluations():
+    sizes = {
+        "total_frames": 64,
+        "num_envs": 2,
+        "steps_per_batch": 8,
+        "eval.layouts": 2,
+        "max_steps": 3,
+        "low.minibatch_size": 16,
+    }
+    for more in ({}, {"observation_scaling": "running"}):
+        history = hpamdp.train(
+            lambda: Toy(), low="hppo", high="none", reward_scaling=0.9, progress=False, **sizes, **more
+        ).history
+        assert history[-1]["train/return"] == history[-1]["train/score"] == history[-1]["eval/return"] == 2.0 * 3
 
 
 def test_an_evaluation_reports_rewards_as_they_are():

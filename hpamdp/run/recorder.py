@@ -279,11 +279,10 @@ class Recorder:
         if not sum(len(ended) for ended in self._ended):
             return {}
         ended: TensorDictBase = TensorDict.cat(self._ended)
-        results = {"score": ended[keys.EPISODE_RETURN], **self.parts.env.results(ended)}
-        scores = {
-            f"train/{name}": results[name].float().mean().item() for name in ("score", "success") if name in results
-        }
-        scores["train/return"] = ended[keys.EPISODE_RETURN].mean().item()
+        results = {"return": ended[keys.EPISODE_RETURN], **self.parts.env.results(ended)}
+        results = {"score": results["return"], **results}
+        names = [name for name in ("score", "success", "return") if name in results]
+        scores = {f"train/{name}": results[name].float().mean().item() for name in names}
         scores["train/steps"] = ended[keys.EPISODE_STEPS].float().mean().item()
         for i, name in enumerate(self.parts.agent.specs.option_names):
             scores[f"train/option_{name}"] = (ended[keys.OPTION] == i).float().mean().item()

@@ -39,6 +39,7 @@ from hpamdp.settings import SettingError, Settings
 
 _CPU = torch.device("cpu")
 _SUCCESS = "success"
+_RETURN = "unscaled_return"  # with `reward_scaling`
 _SEED = "seed"
 _PICTURE = "picture"
 _LARGEST_PICTURE = 320  # px from edge to edge of a picture that is kept for a film
@@ -56,7 +57,8 @@ class GymnasiumEnv(PAMDPEnv):
     Bounds of the current state are also observed. The observation ends with all lower, then all upper bounds, scaled so
     that the space's bounds are -1 and 1. If the action space contains an option, the agent chooses it. The environment
     may name its options in an attribute `option_names`. The leaf `success` bool `[N]` is `is_success` or `success` in
-    the info of a step, False if it has neither.
+    the info of a step, False if it has neither. With `reward_scaling`, the leaf `unscaled_return` `[N]` is the sum of
+    the episode's rewards as the environment gave them.
 
     A copy's first reset is seeded from `seed` and the copy's number, later resets are not seeded. `reset` also takes
     the seeds to use: a tensordict with `seed` int `[N]`.
@@ -79,7 +81,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     Options: ClassVar[type[Settings]] = GymnasiumOptions
     card = CARDS["GymnasiumEnv"]
-    result_keys = (_SUCCESS,)
+    result_keys: tuple[str, ...] = (_SUCCESS,)
 
     def __init__(
         self,
@@ -131,9 +133,11 @@ class GymnasiumEnv(PAMDPEnv):
         self.option_names = self._names_of_options()
         self.observation_entries = self._copies.observations.entries(2 * self._copies.layout.num_bounded)
         self.bounds_place = self._copies.layout.dim if self._copies.layout.num_bounded else None
-        self._make_specs()
         gamma = options.reward_scaling
         self._reward_scaling = None if gamma is None else RewardScaling(num_envs, gamma)
+        if gamma is not None:
+            self.result_keys = (_SUCCESS, _RETURN)
+        self._make_specs()
         num_parameters = sum(self.parameter_dims)
         self._action_shapes = (
             torch.Size((num_envs, *self.components.shape)),
@@ -202,11 +206,12 @@ class GymnasiumEnv(PAMDPEnv):
         return NativeForm(self._copies, self.scaling, self._reading)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
-        """Return `success` bool `[M]` if any info so far had it."""
+        """Return `success` bool `[M]` if any info so far had it, and with `reward_scaling` the unscaled `return`."""
         success = last.get(_SUCCESS)
         # A success in `last` may have been reported to a copy in another process.
         self._reports_success |= bool(success.any())
-        return {_SUCCESS: success} if self._reports_success else {}
+        results = {_SUCCESS: success} if self._reports_success else {}
+        return results if self._reward_scaling is None else {"return": last.get(_RETURN), **results}
 
     def set_scaling_from(self, other: PAMDPEnv) -> None:
         """Scale observations by the running statistics of `other`, now and later, without updating them.
@@ -225,7 +230,8 @@ class GymnasiumEnv(PAMDPEnv):
     def seed_evaluation(self, seed: int) -> None:
         """Seed the episodes of an evaluation, which reports rewards as they are."""
         super().seed_evaluation(seed)
-        self._reward_scaling = None
+        if self._reward_scaling is not None:
+            self._reward_scaling.is_off = True
 
     @property
     def keeps_episodes(self) -> bool:
@@ -317,6 +323,8 @@ class GymnasiumEnv(PAMDPEnv):
             },
             shape=(n,),
         )
+        if self._reward_scaling is not None:
+            self.observation_spec[_RETURN] = Unbounded(shape=(n,), device=device, dtype=torch.float32)
         for name, size in layout.mask_sizes.items():
             shape = (num_discrete, num_discrete) if name == keys.PAIR_MASK else (size,)
             self.observation_spec[name] = Binary(shape[-1], shape=(n, *shape), dtype=torch.bool, device=device)
@@ -455,6 +463,8 @@ class GymnasiumEnv(PAMDPEnv):
             keys.TRUNCATED: torch.from_numpy(truncated[:, None]),
             keys.DONE: torch.from_numpy(done[:, None]),
         }
+        if self._reward_scaling is not None:
+            leaves[_RETURN] = torch.from_numpy(self._reward_scaling.totals.astype(np.float32))
         for name, mask in results.masks.items():
             leaves[name] = as_leaf(name, torch.from_numpy(mask != 0.0), len(self.parameter_dims))
         leaves |= bounds

@@ -141,16 +141,20 @@ class RewardScaling:
 
     Attributes:
         statistics: of all discounted returns so far.
+        totals: sums of the episodes' rewards before they were scaled, `[N]`.
+        is_off: whether rewards stay as they are, as in evaluations.
     """
 
     def __init__(self, num: int, gamma: float) -> None:
         self.statistics = RunningStatistics(1, "return")
+        self.totals = np.zeros(num)
+        self.is_off = False
         self._gamma = gamma
         self._returns = np.zeros(num)
 
     def begin(self, is_reset: np.ndarray) -> None:
         """Begin the returns of these environments, bool `[N]`."""
-        self._returns[is_reset] = 0.0
+        self._returns[is_reset] = self.totals[is_reset] = 0.0
 
     def scaled(self, rewards: np.ndarray, is_stepped: np.ndarray) -> np.ndarray:
         """Return the rewards `[N]` of a step scaled, after an update of the statistics.
@@ -162,6 +166,9 @@ class RewardScaling:
         Raises:
             ProblemError: a reward is not finite, or so large that its square is not.
         """
+        self.totals = self.totals + rewards
+        if self.is_off:
+            return rewards
         if not (np.abs(rewards) < _LARGEST_REWARD).all():
             worst = rewards[~(np.abs(rewards) < _LARGEST_REWARD)][0]
             raise ProblemError(f"step returned the reward {worst:g}, which reward_scaling cannot scale")
