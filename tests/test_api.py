@@ -488,6 +488,32 @@ def test_a_folder_with_another_run_is_refused_and_stays(tmp_path):
     assert before == {path.name: path.read_bytes() for path in Path(tmp_path, "run").iterdir()}
 
 
+@pytest.mark.parametrize("space", ["action_space", "observation_space"])
+def test_bounds_of_an_environment_that_were_edited_are_told_of_wherever_an_agent_comes_back(
+    space, tmp_path, monkeypatch, capsys
+):
+    trained = hpamdp.train(lambda: Reach(), folder=tmp_path / "run", **OWN)
+    assert "has learned with" not in capsys.readouterr().err
+    other = {
+        "observation_space": spaces.Box(-3.0, 3.0, (3,), np.float32),
+        "action_space": spaces.Tuple(
+            (spaces.Discrete(2), spaces.Tuple((spaces.Box(-3, 3, (1,)), spaces.Box(0, 2, (2,)))))
+        ),
+    }
+    monkeypatch.setattr(Reach, space, other[space])
+    more = {**TINY, "total_frames": 2048}
+    uses = [
+        lambda: hpamdp.load(tmp_path / "run", lambda: Reach()),
+        lambda: hpamdp.train(lambda: Reach(), resume=tmp_path / "run", folder=tmp_path / "more", **more),
+    ]
+    if space == "observation_space":  # bounds of parameters are refused there
+        uses.append(lambda: trained.evaluate(lambda: Reach(), episodes=2))
+    for use in uses:
+        use()
+        err = capsys.readouterr().err
+        assert err.count("has learned with") == 1 and re.search(r"(_low\[0\]=-1|_width\[0\]=1), but GymnasiumEnv", err)
+
+
 def test_an_agent_is_refused_at_a_problem_of_other_sizes(platform_agent):
     with pytest.raises(hpamdp.ConfigError, match="env=goal has observation_dim=17, but the agent's problem 9"):
         platform_agent.evaluate("goal", episodes=2)

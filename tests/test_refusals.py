@@ -201,10 +201,11 @@ def test_an_agent_is_told_when_its_options_are_others(tmp_path, capsys):
 
     def check(words, setting="low.checkpoint"):
         config = read(config_of(f"{words} high=uniform low=random {setting}={tmp_path / 'saved'}"))
-        check_saved_options(config, config.env.build(num_envs=1))
+        source = None if setting == "low.checkpoint" else tmp_path / "saved/checkpoint.safetensors"
+        check_saved_options(config, config.env.build(num_envs=1), source)
 
     for setting in ("mode=eval checkpoint", "resume", "low.checkpoint"):
-        with pytest.raises(ConfigError, match=r"=.*saved: its agent .* incongruent1, congruent; keep the order$"):
+        with pytest.raises(ConfigError, match=r"saved/.*: its agent .* incongruent1, congruent; keep the order$"):
             check("env.boats=[incongruent1,congruent]", setting)
     with pytest.raises(ConfigError, match=r"congruent, incongruent1, but env=boatdock has .*2, congruent$"):
         check("env.boats=[incongruent1,incongruent2,congruent]")

@@ -33,6 +33,7 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.renamed import OF_EVALUATION, no_member
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env, make_evaluation, option_length
+from hpamdp.run.resume import warn_of_other_ranges
 from hpamdp.settings import NumAtOnce, Settings
 from hpamdp.specs import PAMDPSpecs
 
@@ -294,6 +295,7 @@ class Agent:
             name, theirs, ours = next(each for each in both if each[1] != each[2])
             has = f"has {name}={as_code(theirs)}, but the agent's problem {as_code(ours)}"
             raise ConfigError(f"evaluate: {env} {has}")
+        warn_of_other_ranges("evaluate: the agent", self._env.ranges(), built)
         return config
 
     def save(self, path: str | Path) -> None:

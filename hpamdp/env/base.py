@@ -432,6 +432,14 @@ class PAMDPEnv(EnvBase):
         """
         return {}
 
+    def ranges(self) -> dict[str, list[float]]:
+        """Return the numbers that give actions and observations their meaning, by name: the parameters' bounds.
+
+        Saved agents hold them, so that an edited environment is noticed.
+        """
+        space = self.full_action_spec_unbatched[keys.PARAMETERS].space
+        return {"parameter_low": space.low.flatten().tolist(), "parameter_high": space.high.flatten().tolist()}
+
     def set_scaling_from(self, other: PAMDPEnv) -> None:
         """Scale observations as the other environment does, now and later, if their scale is learned.
 

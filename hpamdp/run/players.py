@@ -137,7 +137,7 @@ def load_agent(
             agent = make_agent(config, PAMDPSpecs.from_env(env), device)
             if source is None:
                 return LoadedAgent(config, agent, env, {})
-            check_saved_options(config, env)
+            check_saved_options(config, env, source)
             saved = checkpoint.load(source, agent, device, with_training=False)
             saved.set_statistics(env)
             return LoadedAgent(config, agent, env, saved.progress)

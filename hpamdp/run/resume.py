@@ -190,36 +190,53 @@ def _not_there(error: MissingChoiceError, file: Path) -> ConfigError:
     return ConfigError(f"{error}. The run had {named}; give the folder again, or add trust=true if you trust {file}")
 
 
-def check_saved_options(config: Config, env: PAMDPEnv) -> None:
-    """Refuse a saved agent if number or order of its options differs, and warn if their names differ.
+def check_saved_options(config: Config, env: PAMDPEnv, source: Path | None) -> None:
+    """Refuse a saved agent if number or order of its options differs, and warn if their names or its bounds differ.
 
-    An agent knows its options only by their numbers.
+    An agent knows its options only by their numbers, and its parameters and observations only within their bounds.
 
     Args:
-        config: config of the run, whose `resume`, `checkpoint` or `low.checkpoint` names the agent.
+        config: config of the run.
         env: the environment of the run.
+        source: the checkpoint of the agent. If None, `low.checkpoint` may name one.
 
     Raises:
         ConfigError: the options differ; the message names the options of both.
     """
-    run = config.run
-    sources = {"resume": run.resume, "checkpoint": run.checkpoint, "low.checkpoint": run.low.checkpoint}
-    where, source = next(((name, path) for name, path in sources.items() if path is not None), ("", None))
+    if source is None and config.run.low.checkpoint is not None:
+        source = checkpoint.find(config.run.low.checkpoint, "low.checkpoint")
     if source is None:
         return
-    progress = checkpoint.progress_of(checkpoint.find(source, where))
+    progress = checkpoint.progress_of(source)
+    warn_of_other_ranges(f"{source}: its agent", progress.get("ranges", {}), env)
     saved, now_env = upgraded(progress["config"]), config.to_dict()
     if (saved["choices"]["env"], saved["env"]) == (now_env["choices"]["env"], now_env["env"]):
         return
     before, now = tuple(progress["option_names"]), env.option_names if env.has_choice else ()
     if not before or not now or before == now:
         return
-    both = f"{where}={source}: its agent chooses among {', '.join(before)}, but {config.env} has {', '.join(now)}"
+    both = f"{source}: its agent chooses among {', '.join(before)}, but {config.env} has {', '.join(now)}"
     if len(before) != len(now):
         raise ConfigError(both)
     if set(before) == set(now):
         raise ConfigError(f"{both}; keep the order")
     warn(f"{both}, which take their places")
+
+
+def warn_of_other_ranges(agent: str, before: Mapping[str, Sequence[float]], env: PAMDPEnv) -> None:
+    """Warn if the numbers of an environment mean something else than those that an agent has learned with.
+
+    Args:
+        agent: what the line calls the agent.
+        before: the `ranges` of the environment that it has learned in; empty if they are unknown.
+        env: the environment that it acts in.
+    """
+    for name, numbers in env.ranges().items():
+        for place, (was, now) in enumerate(zip(before.get(name, ()), numbers, strict=False)):
+            if was != now:
+                both = f"{name}[{place}]={was:g}, but {env.title} has {now:g}"
+                warn(f"{agent} has learned with {both}: its actions do not fit; restore the number, or train anew")
+                return
 
 
 def _changes(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:

@@ -43,6 +43,7 @@ class Progress(SavedPart):
 
     config: dict[str, Any]
     option_names: list[str]
+    ranges: dict[str, list[float]] = Field(default_factory=dict)
     config_dirs: list[str] | None = None
     frames: Count
     wall_s: Amount

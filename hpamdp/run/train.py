@@ -122,7 +122,7 @@ def begin(
         warn(warning)
     parts = assemble(config)
     try:
-        check_saved_options(config, parts.env.base_env)
+        check_saved_options(config, parts.problem, source)
         if is_training:
             check_effects_on(facts_about(parts.env.base_env, config), config, overrides)
         trainer = Trainer(config, parts, output_dir, _all_callbacks(config, callbacks) if is_training else ())

@@ -402,6 +402,7 @@ class Trainer:
         return {
             "config": self.config.to_dict(),
             "option_names": list(self.parts.agent.specs.option_names),
+            "ranges": self.parts.problem.ranges(),
             "config_dirs": list(self.config.config_dirs),
             "frames": self.frames,
             "wall_s": self.wall_s,

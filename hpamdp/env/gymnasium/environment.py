@@ -213,6 +213,18 @@ class GymnasiumEnv(PAMDPEnv):
         results = {_SUCCESS: success} if self._reports_success else {}
         return results if self._reward_scaling is None else {"return": last.get(_RETURN), **results}
 
+    def ranges(self) -> dict[str, list[float]]:
+        """Return the bounds and the first discrete actions of the spaces, and the fixed scale of observations."""
+        actions = self._copies.actions
+        ranges = {
+            "parameter_low": actions.own_low,
+            "parameter_high": actions.own_high,
+            "first_action": [*actions.starts, self._copies.options.start],
+        }
+        if self.scaling.statistics is None:
+            ranges["observation_centre"], ranges["observation_half_width"], _ = self.scaling.linear_map()
+        return {name: [float(number) for number in numbers] for name, numbers in ranges.items()}
+
     def set_scaling_from(self, other: PAMDPEnv) -> None:
         """Scale observations by the running statistics of `other`, now and later, without updating them.
 
