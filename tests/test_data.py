@@ -15,6 +15,7 @@ import pytest
 import torch
 from conftest import make_config
 from gymnasium import spaces
+from gymnasium_players import make
 from tensordict import TensorDict
 from torchrl.data import Binary, Unbounded
 
@@ -179,6 +180,11 @@ def timed(row=slice(None), value=2.5):
             spoilt(keys.PARAMETERS, (2, 0), 1e6, spoilt(keys.DISCRETE, 2, 0)),
             SPECS,
             "row 2: action.parameters[0] is 1e+06, but must be 0 to 1",
+        ),
+        (
+            spoilt(keys.PARAMETERS, slice(None), 0.5, spoilt(keys.DISCRETE, slice(None), 0)),
+            replace(SPECS, integer_parameters=(True, False, False, False)),
+            "row 0: action.parameters[0] is 0.5, but must be a whole number",
         ),
         (
             spoilt(keys.PARAMETERS, (2, 3), -0.5, spoilt(keys.DISCRETE, 2, 0)),
@@ -402,6 +408,21 @@ def test_right_rows_pass_the_check():
     Demonstrations(masked([])).check(MASKED)
     Demonstrations(timed()).check(SPECS)
     Demonstrations(timed(1, 0.0)).check(SPECS)  # two signals of a corridor may be due at once
+
+
+def test_rows_in_the_numbers_of_the_space_are_refused_until_they_are_scaled():
+    env = make(1, form="flat", observation_scaling="bounds")
+    rows = episodes(2, 3)
+    rows[keys.DISCRETE] = 4 + rows[keys.DISCRETE]
+    rows[keys.PARAMETERS] = torch.tensor([0.5, 20.0, 0.2]).expand(5, -1).clone()
+    rows[keys.OBSERVATION] = rows["next", keys.OBSERVATION] = torch.tensor([4.0, 7.0]).expand(5, -1).clone()
+    scaled = env.scaled_rows(rows)
+    assert scaled[keys.OBSERVATION][0].tolist() == [0.75, 7.0] and scaled[keys.DISCRETE].max() < 3
+    Demonstrations(scaled).check(PAMDPSpecs.from_env(env), env.observation_bounds)
+    scaled[keys.OBSERVATION] = rows[keys.OBSERVATION]
+    line = r"row 0: observation\[0\] is 4, but must be -1 to 1, as the agent sees it; .* env\.scaled_rows\(rows\)"
+    with pytest.raises(DataError, match=line):
+        Demonstrations(scaled).check(PAMDPSpecs.from_env(env), env.observation_bounds)
 
 
 def test_wrong_decisions_are_refused_with_their_row():

@@ -14,6 +14,7 @@ from hpamdp.data.row_checks import (
     TRAJECTORY,
     check_actions,
     check_decisions,
+    check_observations,
     check_options,
     check_returns,
     check_transitions,
@@ -84,8 +85,10 @@ class Demonstrations:
             decisions = _split("the decisions", decisions, held_out)[0] if held_out else decisions
             self.decisions = _batch(decisions, device)
 
-    def check(self, specs: PAMDPSpecs) -> None:
-        """Check that every row is possible in an environment with these specs.
+    def check(
+        self, specs: PAMDPSpecs, observation_bounds: tuple[Sequence[float], Sequence[float]] | None = None
+    ) -> None:
+        """Check that every row is possible in an environment with these specs and bounds, `[observation_dim]` each.
 
         If a mask allows nothing after the end of an episode, it is opened, as in environments.
 
@@ -93,6 +96,8 @@ class Demonstrations:
             DataError: a row is impossible; the message names the first one.
         """
         check_actions(self.batch.squeeze(0), specs)
+        if observation_bounds is not None:
+            check_observations("the transitions", self.batch.squeeze(0), *observation_bounds)
         self.batch = _with_open_masks(self.batch, specs)
         if self.held_out is not None:
             check_actions(self.held_out.squeeze(0), specs)

@@ -144,6 +144,27 @@ def check_options(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
     _check_rules(what, rows, _option_rules(rows, specs))
 
 
+def check_observations(what: str, rows: TensorDictBase, low: Sequence[float], high: Sequence[float]) -> None:
+    """Check that rows `[N]`, whose form is already checked, hold observations as the agent sees them.
+
+    Args:
+        what: name of the rows in the error.
+        rows: the rows.
+        low, high: bounds of these observations, `[observation_dim]`.
+
+    Raises:
+        DataError: a number is outside its bounds.
+    """
+    slack = 1e-4  # for rounding
+    cure = "as the agent sees it; with env=gymnasium, env.scaled_rows(rows) scales the space's numbers"
+    allowed = [f"{least:.6g} to {most:.6g}, {cure}" for least, most in zip(low, high, strict=True)]
+    present = set(rows.keys(True, True))
+    for name in [name for name in _OBSERVATIONS if name in present]:
+        value = rows.get(name)
+        is_inside = (value >= value.new_tensor(low) - slack) & (value <= value.new_tensor(high) + slack)
+        _check_rules(what, rows, iter([_Rule(name, is_inside, allowed)]))
+
+
 def missing_masks(rows: TensorDictBase, specs: PAMDPSpecs) -> list[str]:
     """Return the names of masks that the environment gives and the transitions `[N]` lack."""
     given = {keys.ACTION_MASK: specs.has_action_mask, keys.OPTION_MASK: specs.has_option_mask}
@@ -281,6 +302,10 @@ def _action_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
     # Other actions' parameters do not count, so recordings fill them with zeros.
     is_filled = is_inside | is_own | (parameters == 0.0)
     yield _Rule(keys.PARAMETERS, is_filled, [f"{each}, or 0 as it is another action's" for each in bounds])
+    if specs.has_integers:
+        is_whole = (parameters - parameters.round()).abs() <= 1e-5
+        is_float = ~torch.tensor(specs.integer_parameters, device=parameters.device)
+        yield _Rule(keys.PARAMETERS, is_whole | is_float | ~is_own, "a whole number")
     if specs.has_parameter_bounds:
         state_low, state_high = rows.get(keys.PARAMETER_LOW), rows.get(keys.PARAMETER_HIGH)
         is_inside = (parameters >= state_low - slack) & (parameters <= state_high + slack)

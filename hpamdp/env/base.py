@@ -432,6 +432,11 @@ class PAMDPEnv(EnvBase):
         """
         return {}
 
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]] | None:
+        """The lowest and the highest observation that the agent sees, `[observation_dim]` each; None if unknown."""
+        return None
+
     def ranges(self) -> dict[str, list[float]]:
         """Return the numbers that give actions and observations their meaning, by name: the parameters' bounds.
 

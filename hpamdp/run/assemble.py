@@ -345,7 +345,7 @@ def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | N
         demonstrations: Demonstrations | None = config.data.build(env=env)
         if demonstrations is None:
             return None
-        demonstrations.check(PAMDPSpecs.from_env(env))
+        demonstrations.check(PAMDPSpecs.from_env(env), env.observation_bounds)
     except DataError as error:
         raise ConfigError(f"{config.data}: {first_line(error)}") from error
     except RuntimeError as error:  # raised by tensordict in the constructor of a user's own data set

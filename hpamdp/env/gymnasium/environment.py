@@ -213,6 +213,37 @@ class GymnasiumEnv(PAMDPEnv):
         results = {_SUCCESS: success} if self._reports_success else {}
         return results if self._reward_scaling is None else {"return": last.get(_RETURN), **results}
 
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]] | None:
+        """The lowest and the highest scaled observation; None with running statistics or `out_of_bounds=allow`."""
+        if self.scaling.statistics is not None or self._reading.out_of_bounds == "allow":
+            return None
+        layout = self._copies.layout
+        with np.errstate(over="ignore"):
+            both = self.scaling.rescaled(np.stack(self._copies.observations.bounds()))
+        ends = [(-1.0, 0.0), (1.0, 255.0)]  # of the bounds of the current state, and of pixels
+        low, high = (
+            [*own.tolist(), *np.repeat(end, (2 * layout.num_bounded, layout.num_pixels))]
+            for own, end in zip(both, ends, strict=True)
+        )
+        return low, high
+
+    def scaled_rows(self, rows: TensorDict) -> TensorDict:
+        """Return recorded transitions as the agent sees them, given in the numbers of the environment's own spaces.
+
+        Only `observation`, `next.observation` and the action are changed. The agent counts discrete actions from 0.
+
+        Args:
+            rows: `[N]`, with flattened observations without pictures and bounds, `[N, dim]`; see `Demonstrations`.
+        """
+        rows, actions = rows.clone(), self._copies.actions
+        for name in (keys.OBSERVATION, ("next", keys.OBSERVATION)):
+            rows[name] = torch.from_numpy(self.scaling.rescaled(rows[name].double().numpy()))
+        rows[keys.PARAMETERS] = torch.from_numpy(actions.to_agent(rows[keys.PARAMETERS].double().numpy())).float()
+        starts = torch.tensor(actions.starts)
+        rows[keys.DISCRETE] = rows[keys.DISCRETE] - (starts if self.component_sizes else starts[0])
+        return rows
+
     def ranges(self) -> dict[str, list[float]]:
         """Return the bounds and the first discrete actions of the spaces, and the fixed scale of observations."""
         actions = self._copies.actions
