@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -181,6 +182,21 @@ def test_an_interrupted_training_in_a_folder_goes_on_with_resume_auto(tmp_path):
     assert hpamdp.train("platform", resume="auto", **arguments).history[-1]["frames"] == 1024
     again = hpamdp.train("platform", resume="auto", **arguments)  # nothing is left to do
     assert again.history[-1]["frames"] == 1024
+
+
+def test_an_environment_that_changes_the_working_directory_takes_no_file_of_the_run_along(tmp_path, monkeypatch):
+    class Moves(Toy):
+        def reset(self, **given):
+            (tmp_path / "elsewhere").mkdir(exist_ok=True)
+            os.chdir(tmp_path / "elsewhere")
+            return super().reset(**given)
+
+    monkeypatch.chdir(tmp_path)
+    hpamdp.train(Moves, folder="run", save_best=True, **OWN)
+    os.chdir(tmp_path)
+    hpamdp.train(Moves, resume="run", folder="more", **{**TINY, "total_frames": 2048})
+    assert not [*(tmp_path / "elsewhere").iterdir()]
+    assert {"best.safetensors", "summary.json"} <= {path.name for path in (tmp_path / "more").iterdir()}
 
 
 def test_a_resumed_run_in_a_new_folder_keeps_its_rows_even_if_it_ends_before_its_first_own_one(tmp_path):

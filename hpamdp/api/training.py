@@ -95,7 +95,7 @@ def train(
     if settings.get("mode") == "eval":
         raise ConfigError("mode=eval: use hpamdp.load(...).evaluate()")
     flag("progress", progress)
-    output_dir = None if folder is None else path_argument("folder", folder)
+    output_dir = None if folder is None else path_argument("folder", folder).absolute()
     callbacks = _checked_callbacks(callbacks)
     problem = problem_of(env)
     goes_on = settings.get("resume") == RESUME_AUTO

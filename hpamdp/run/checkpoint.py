@@ -90,7 +90,7 @@ def find(path: str | Path, where: str) -> Path:
         raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}{ours}") from None
     except OSError as error:
         raise ConfigError(f"{where}={file}: {reason_of(error)}") from error
-    return file
+    return file.absolute()  # since an environment may change the working directory
 
 
 def agents_dir() -> Path:
