@@ -73,6 +73,10 @@ class OwnSteps:
     """
 
 
+class Schedule:
+    """Says, as a part of a setting's type, that the setting is the length of a schedule, in steps or decisions."""
+
+
 class OnlyWith:
     """Says, as a part of a setting's type, with which values of another setting it counts.
 

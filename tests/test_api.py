@@ -238,6 +238,10 @@ def test_a_resumed_run_tells_that_schedules_have_ended(tmp_path, capsys):
     hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **{**TINY, "low.anneal_steps": 1024})
     hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 2048})
     assert "but low.anneal_steps stay at 1,024" in capsys.readouterr().err
+    sizes = {"low.buffer_size": 1024, "low.warmup_steps": 1024, "low.lr_steps": 2048}
+    hpamdp.train("platform", low="pdqn", folder=tmp_path / "pdqn", **TINY, **sizes)
+    hpamdp.train(resume=tmp_path / "pdqn", folder=tmp_path / "longer", **{**TINY, "total_frames": 2048})
+    assert "total_frames is raised" not in capsys.readouterr().err
 
 
 def test_another_preset_of_a_problem_keeps_none_of_the_agents_settings():

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import importlib.util
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from hpamdp.cards import CallbackCard, SelectorCard
 from hpamdp.complaints import as_json
@@ -177,19 +178,23 @@ def _component_and_setting(config: Config, name: str) -> tuple[Component | None,
     return (getattr(config, group) if group in GROUPS else None), setting
 
 
+def marks_of(config: Config, name: str) -> tuple[list[Any], Mapping[str, Any]]:
+    """Return the marks in the type of a setting, such as `OwnSteps`, and all settings of its class."""
+    component, setting = _component_and_setting(config, name)
+    if component is None or component.model is None or setting not in component.model.model_fields:
+        return [], {}
+    return component.model.model_fields[setting].metadata, component.settings
+
+
 def _conditions(config: Config, name: str) -> list[str]:
     """Return what a setting needs to count but does not have, such as `low.memory_size` without `low.memory`.
 
     With `mode=offline`, a setting marked `OwnSteps` needs another mode, and nothing else is named.
     """
-    component, setting = _component_and_setting(config, name)
-    if component is None or component.model is None:
-        return []
-    field = component.model.model_fields.get(setting)
-    marks = [] if field is None else field.metadata
+    marks, settings = marks_of(config, name)
     if config.run.mode == "offline" and any(isinstance(mark, OwnSteps) for mark in marks):
         return ["with mode=train"]
-    return [str(mark) for mark in marks if isinstance(mark, OnlyWith) and not mark.holds(component.settings)]
+    return [str(mark) for mark in marks if isinstance(mark, OnlyWith) and not mark.holds(settings)]
 
 
 def check_problem(config: Config, facts: ProblemFacts) -> None:

@@ -24,6 +24,7 @@ from hpamdp.messages import warn
 from hpamdp.run import checkpoint, compatibility
 from hpamdp.run.assemble import choose_selector
 from hpamdp.run_files import ENV_WITHOUT_INFLUENCE, are_same, flat_settings
+from hpamdp.settings import Schedule
 from hpamdp.shell import setting
 
 # Settings that a run does not take over from the saved run.
@@ -121,7 +122,11 @@ def _warn_of_ended_schedules(saved: Mapping[str, Any], resolved: Config, source:
     if not isinstance(before, int) or now <= before:
         return
     levels = {group: saved.get(group) for group in ("high", "low", "exploration")}
-    ended = [name for name, value in flat_settings(levels).items() if value == before and ".budget." not in name]
+    ended = [
+        name
+        for name, value in flat_settings(levels).items()
+        if value == before and Schedule in map(type, compatibility.marks_of(resolved, name)[0])
+    ]
     if ended:
         warn(
             f"resume={source}: total_frames is raised to {now:,}, but {', '.join(ended)} stay at {before:,}: what "

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveFloat, Pos
 from typing_extensions import Self
 
 from hpamdp.cards import ExplorationCard
-from hpamdp.settings import Fraction, FromList, LearningRate, OnlyWith, Settings, Widths
+from hpamdp.settings import Fraction, FromList, LearningRate, OnlyWith, Schedule, Settings, Widths
 
 _COARSEST, _FINEST = 1e-12, 1e6  # resolutions in float32; finer cells of observations above 1e6 overflow int64
 
@@ -53,7 +53,7 @@ class HeldOptions(Settings):
     """
     epsilon_final: Fraction | None = None
     """Probability after `epsilon_steps`; it falls linearly from `epsilon` to this value. If null, it stays."""
-    epsilon_steps: Annotated[PositiveInt, OnlyWith("epsilon_final")] = 100_000
+    epsilon_steps: Annotated[PositiveInt, OnlyWith("epsilon_final"), Schedule()] = 100_000
     """With `epsilon_final`: the learner's own steps, its warm-up included, within which the probability falls."""
     mu: Annotated[float, Field(gt=1.0, le=10.0)] = 2.0
     """Exponent of the lengths: the probability of n steps is proportional to n^-mu. Less gives longer holds."""

@@ -22,7 +22,7 @@ from hpamdp.policies.shared.options import (
     ReplayMemoryOptions,
     StackOptions,
 )
-from hpamdp.settings import Fraction, LearningRate, OnlyWith, OwnSteps, PositiveFraction, Settings, Widths
+from hpamdp.settings import Fraction, LearningRate, OnlyWith, OwnSteps, PositiveFraction, Schedule, Settings, Widths
 
 
 class EpsilonGreedyOptions(BanditOptions):
@@ -87,7 +87,7 @@ class MetaCriticOptions(ReplayMemoryOptions, OptionValueOptions):
     """Number of critics in the ensemble."""
     exploration: Literal["epsilon", "ucb"] = "epsilon"
     """`epsilon`: a random option with a decaying probability. `ucb`: the option with the highest upper bound."""
-    epsilon_decisions: Annotated[NonNegativeInt, OnlyWith("exploration", "epsilon"), OwnSteps()] = 1000
+    epsilon_decisions: Annotated[NonNegativeInt, OnlyWith("exploration", "epsilon"), OwnSteps(), Schedule()] = 1000
     """Finished decisions of all environments, after the warm-up, over which the probability of a random option falls.
 
     It falls linearly from 1 to `epsilon_final`. Decisions of a data set do not count.
@@ -111,7 +111,7 @@ class OptionCriticOptions(StackOptions, OptionValueOptions):
     """How much better another option's return must be for the held option to end. With 0, most options end at once."""
     initial_termination: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.3
     """Probability that an untrained option ends at a step; it stays part of exploration."""
-    epsilon_steps: NonNegativeInt = 20_000
+    epsilon_steps: Annotated[NonNegativeInt, Schedule()] = 20_000
     """Steps of all environments, after the warm-up, over which the probability of a random option falls.
 
     It falls linearly from 1 to `epsilon_final`.

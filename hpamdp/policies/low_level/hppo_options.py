@@ -9,7 +9,7 @@ from typing_extensions import Self
 
 from hpamdp.cards import ActionFeature, LearnerCard
 from hpamdp.policies.shared.options import Credit, HeadOptions, InitialParameters, MemoryOptions, OnPolicyOptions
-from hpamdp.settings import Fraction, LearningRate, Widths
+from hpamdp.settings import Fraction, LearningRate, Schedule, Widths
 
 
 class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
@@ -70,7 +70,7 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     """Weight of the entropy bonus of the parameters."""
     entropy_final: Fraction = 0.1
     """Fraction of both entropy bonuses that is left after `anneal_steps`; they fall linearly."""
-    anneal_steps: PositiveInt = 200_000
+    anneal_steps: Annotated[PositiveInt, Schedule()] = 200_000
     """Steps of the whole run over which learning rate, `min_scale`, `max_scale` and entropy bonuses are annealed.
 
     Steps of other options' learners count, too. So a learner whose option is seldom chosen ends its exploration with

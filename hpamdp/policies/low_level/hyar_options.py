@@ -10,7 +10,7 @@ from typing_extensions import Self
 
 from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import REPLAY_CARD, SearchingActorOptions, TargetRateOptions
-from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction
+from hpamdp.settings import LearningRate, OnlyWith, PositiveFraction, Schedule
 
 
 class HyAROptions(TargetRateOptions, SearchingActorOptions):
@@ -61,7 +61,7 @@ class HyAROptions(TargetRateOptions, SearchingActorOptions):
     """
     lr_final_fraction: PositiveFraction = 0.1
     """Fraction of the three learning rates that is left after `lr_steps`; 1 keeps them constant."""
-    epsilon_steps: NonNegativeInt = 15_000
+    epsilon_steps: Annotated[NonNegativeInt, Schedule()] = 15_000
     """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
     embedding_dim: PositiveInt = 6
     """Dimension of a discrete action's embedding e."""

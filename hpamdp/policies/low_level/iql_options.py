@@ -9,7 +9,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import REPLAY_CARD, ActorCriticOptions, HeadOptions, ScaleOptions
-from hpamdp.settings import Expectile, LearningRate, OwnSteps, PositiveFraction, Widths
+from hpamdp.settings import Expectile, LearningRate, OwnSteps, PositiveFraction, Schedule, Widths
 
 
 class IQLOptions(HeadOptions, ActorCriticOptions, ScaleOptions):
@@ -17,7 +17,7 @@ class IQLOptions(HeadOptions, ActorCriticOptions, ScaleOptions):
 
     hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
     """Hidden layers of the actor, the state value and the critics."""
-    actor_lr_updates: NonNegativeInt = 0
+    actor_lr_updates: Annotated[NonNegativeInt, Schedule()] = 0
     """Updates within which the actor's learning rate falls to 0 along a cosine; with 0 it is constant."""
     critic_lr: LearningRate = 1e-3
     """Learning rate of the critics and of the state value."""

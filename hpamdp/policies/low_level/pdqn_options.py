@@ -10,7 +10,7 @@ from typing_extensions import Self
 
 from hpamdp.cards import ActionFeature
 from hpamdp.policies.shared.options import REPLAY_CARD, InitialParameters, ReplayMemoryOptions, SearchingActorOptions
-from hpamdp.settings import OnlyWith, OwnSteps, PositiveFraction
+from hpamdp.settings import OnlyWith, OwnSteps, PositiveFraction, Schedule
 
 
 class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
@@ -40,7 +40,7 @@ class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
     With `ornstein_uhlenbeck`, `parameter_noise` is the standard deviation of what is added in a step. The process goes
     on from episode to episode.
     """
-    epsilon_steps: Annotated[NonNegativeInt, OnlyWith("epsilon_episodes", None), OwnSteps()] = 40_000
+    epsilon_steps: Annotated[NonNegativeInt, OnlyWith("epsilon_episodes", None), OwnSteps(), Schedule()] = 40_000
     """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
     epsilon_episodes: Annotated[PositiveInt | None, OwnSteps()] = None
     """Episodes that end with the learner's own steps, within which the probability of a random action falls.

@@ -10,7 +10,17 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from typing_extensions import Self
 
 from hpamdp.cards import LearnerCard
-from hpamdp.settings import Expectile, Fraction, LearningRate, OnlyWith, OwnSteps, PositiveFraction, Settings, Widths
+from hpamdp.settings import (
+    Expectile,
+    Fraction,
+    LearningRate,
+    OnlyWith,
+    OwnSteps,
+    PositiveFraction,
+    Schedule,
+    Settings,
+    Widths,
+)
 
 
 class StackOptions(Settings):
@@ -150,7 +160,7 @@ class EpsilonOptions(Settings):
     """Standard deviation of the exploring noise on the parameters, in units where their bounds are [-1, 1]."""
     epsilon_final: Annotated[Fraction, OwnSteps()] = 0.05
     """Probability of a random action after `epsilon_steps`; it falls linearly from 1 to this value."""
-    epsilon_steps: Annotated[NonNegativeInt, OwnSteps()] = 40_000
+    epsilon_steps: Annotated[NonNegativeInt, OwnSteps(), Schedule()] = 40_000
     """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
 
 
@@ -224,7 +234,7 @@ class SearchingActorOptions(EpsilonOptions, ActorCriticOptions):
     """Critic updates for each update of the actor."""
     lr_final_fraction: Annotated[PositiveFraction, OwnSteps()] = 1.0
     """Fraction of the learning rates that is left after `lr_steps`; 1 keeps them constant."""
-    lr_steps: Annotated[NonNegativeInt, OwnSteps()] = 100_000
+    lr_steps: Annotated[NonNegativeInt, OwnSteps(), Schedule()] = 100_000
     """The learner's own steps, after its warm-up, within which the learning rates fall.
 
     With `mode=offline` the learner makes no steps of its own, so the rates stay constant.
