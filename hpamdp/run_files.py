@@ -20,7 +20,8 @@ CONFIG_NAME = "config.yaml"
 METRICS_NAME = "metrics.csv"
 # Folders that a run's logger writes to.
 TENSORBOARD_NAME, WANDB_NAME = "tensorboard", "wandb"
-# Lists the names of the pictures in the folder, which the environment chooses.
+CURVES_NAME = "learning_curves.png"
+# Lists the names of the pictures in the folder, some of which the environment chooses.
 FIGURES_NAME = ".figures"
 # The files of saved agents of version 0.3, which are no longer read.
 OLD_NAMES = ("checkpoint.zip", "policy.pt", "best.pt")
@@ -89,6 +90,15 @@ def saved_summary(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError):  # missing, or cut off in the middle
         return {}
     return summary if isinstance(summary, dict) else {}
+
+
+def listed_figures(folder: Path) -> list[str]:
+    """Return the names of the pictures that a run has drawn into its folder."""
+    try:
+        names = read_regular(folder / FIGURES_NAME, MAX_TEXT_BYTES).decode().splitlines()
+    except (OSError, UnicodeDecodeError):
+        return []
+    return [name for name in names if Path(name).name == name and not (folder / name).is_dir()]
 
 
 def flat_settings(config: Mapping[str, Any]) -> dict[str, Any]:

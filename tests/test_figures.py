@@ -64,6 +64,16 @@ def test_all_figures_come_from_complete_files(tmp_path):
     assert names(tmp_path) == ALL
 
 
+def test_a_picture_of_a_users_own_with_a_name_that_the_problem_chooses_stays(tmp_path, capsys):
+    write_evaluation(tmp_path)
+    write_metrics(tmp_path)
+    (tmp_path / "trajectories.png").write_text("mine")
+    for _ in range(2):  # the second time the others are known to be the run's own
+        assert names(tmp_path) == ["learning_curves.png", "choices.png"]
+        assert "trajectories.png: no run has written it, so it stays" in capsys.readouterr().err
+    assert (tmp_path / "trajectories.png").read_text() == "mine"
+
+
 def test_learning_curves_show_the_logged_values_between_the_references(tmp_path):
     rows = [{"frames": 10.0 * i, "eval/score": 0.5 * i, "train/score": 0.1 * i} for i in range(4)]
     summary = {"references": {"random": {"score": -0.9}, "human": {"success": 0.9}, "ceiling": {"score": 3.6}}}

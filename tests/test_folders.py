@@ -145,6 +145,7 @@ def test_a_resumed_run_of_wandb_removes_its_own_earlier_folder_alone(tmp_path):
     "own",
     [
         {"best.safetensors": "my networks", "trajectories.png": "", "learning_curves.png": ""},
+        {"learning_curves.png": "my drawing"},
         {"checkpoint.safetensors": "my backup"},
         {CONFIG_NAME: "title: my site\n"},
         {"summary.json": '{"of": "my thesis"}'},
@@ -154,7 +155,7 @@ def test_a_file_of_a_users_own_with_the_name_of_a_result_is_never_deleted(own, t
     for name, text in own.items():
         (tmp_path / name).write_text(text)
     before = contents(tmp_path)
-    (first, *_) = (name for name in own if not name.endswith(".png"))
+    first = next(iter(own))
     for word in ("overwrite=false", "overwrite=true"):
         with pytest.raises(ConfigError, match=rf"holds {first}.*, which no run has written and a run would replace"):
             start(tmp_path, word)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,15 @@ from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.figure_style import AGENT, REFERENCES, STYLE, label_ends
 from hpamdp.files import replacing
-from hpamdp.messages import duration
+from hpamdp.messages import duration, warn
 from hpamdp.metrics_file import EVALUATION, FRAMES, WALL_SECONDS, read_rows
-from hpamdp.run_files import FIGURES_NAME, METRICS_NAME
+from hpamdp.run_files import CURVES_NAME, FIGURES_NAME, METRICS_NAME, listed_figures
 
 
 def draw_all(
     output_dir: Path, env: type[PAMDPEnv], summary: Mapping[str, Any], evaluation: Mapping[str, np.ndarray]
 ) -> list[Path]:
-    """Draw the figures of a run into its folder, and return their paths.
+    """Draw the figures of a run into its folder, and return their paths. Pictures that no run has written stay.
 
     Args:
         output_dir: the run's folder, whose `metrics.csv` has the rows of `learning_curves.png`.
@@ -33,8 +34,12 @@ def draw_all(
     """
     with mpl.rc_context(STYLE):
         curves = learning_curves(read_rows(output_dir / METRICS_NAME), summary, env.curves(summary))
-        figures = {} if curves is None else {"learning_curves.png": curves}
+        figures = {} if curves is None else {CURVES_NAME: curves}
         figures |= env.draw_figures(evaluation, summary)
+        for name in figures.keys() - {*listed_figures(output_dir)}:
+            if os.path.lexists(output_dir / name):
+                warn(f"{output_dir / name}: no run has written it, so it stays, and the run's own figure is left out")
+                del figures[name]
         with replacing(output_dir / FIGURES_NAME) as partial:
             partial.write_text("".join(f"{name}\n" for name in figures))
         for name, figure in figures.items():

@@ -19,6 +19,7 @@ from hpamdp.run_files import (
     BEST_NAME,
     CHECKPOINT_NAME,
     CONFIG_NAME,
+    CURVES_NAME,
     DIVERGED_NAME,
     ERROR_NAME,
     EVALUATION_NAME,
@@ -32,6 +33,7 @@ from hpamdp.run_files import (
     TENSORBOARD_NAME,
     WANDB_NAME,
     is_saved_agent,
+    listed_figures,
     saved_config,
     saved_summary,
 )
@@ -44,6 +46,7 @@ _OTHERS = (
     f"{METRICS_NAME}.previous",
     DIVERGED_NAME,
     EVALUATION_NAME,
+    CURVES_NAME,
     FILM_NAME,
     ERROR_NAME,
 )
@@ -225,11 +228,8 @@ def written_by_a_run(folder: Path) -> list[Path]:
     choices = saved_config(folder).get("choices")
     logger = choices.get("logger") if isinstance(choices, dict) else None
     of_logger = [name for name in _OF_LOGGERS if logger in (None, name)]
-    names = [*_MARKS, *_OTHERS, *of_logger]
-    with suppress(OSError, UnicodeDecodeError):
-        listed = read_regular(folder / FIGURES_NAME, MAX_TEXT_BYTES).decode().splitlines()
-        names += [name for name in listed if Path(name).name == name and not (folder / name).is_dir()]
-    paths = [folder / name for name in (*names, FIGURES_NAME, CONFIG_NAME)]
+    names = [*_MARKS, *_OTHERS, *of_logger, *listed_figures(folder), FIGURES_NAME, CONFIG_NAME]
+    paths = [folder / name for name in names]
     found = [path for path in dict.fromkeys(paths) if path.exists() or path.is_symlink()]
     return [path for path in found if path.name != ERROR_NAME or not has_foreign_error(folder)]
 
