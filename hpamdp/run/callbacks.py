@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import torch
 from torch import Tensor
 
 from hpamdp.cards import CallbackCard
@@ -18,6 +19,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.files import replacing
 from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run.callbacks_options import CARDS, PatienceOptions, TimeLimitOptions
+from hpamdp.run.state_checks import check_numbers
 from hpamdp.run_files import BEST_NAME
 from hpamdp.settings import SettingError
 
@@ -68,7 +70,10 @@ class Callback:
         return {}
 
     def state(self) -> dict[str, Any]:
-        """Return what a checkpoint has to hold: numbers, tensors and mappings of them, always with the same names."""
+        """Return what a checkpoint has to hold: real numbers, dense tensors of them and mappings of these.
+
+        Names and types must always be the same. NaN may stand for a value that is not known yet.
+        """
         return {}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -112,7 +117,7 @@ class BestAgent(Callback):
     def on_evaluation(self, trainer: Trainer, row: Mapping[str, float]) -> None:
         """Keep the agent if its score is the highest so far."""
         score = row[SCORE]
-        if not score > (-math.inf if self.best_score is None else self.best_score):
+        if self.best_score is not None and score <= self.best_score:
             return
         trainer.check_weights()
         if trainer.output_dir is None:
@@ -168,10 +173,10 @@ class Patience(Callback):
     def on_evaluation(self, trainer: Trainer, row: Mapping[str, float]) -> None:
         """Count the evaluation unless its score is an improvement."""
         score = row[SCORE]
-        if score > self._best and score - self._best >= self.options.min_improvement:
-            self._best, self._evaluations = score, 0
-        else:
+        if score <= self._best or score - self._best < self.options.min_improvement:
             self._evaluations += 1
+        else:
+            self._best, self._evaluations = score, 0
         self._stop_if_over(trainer)
 
     def _stop_if_over(self, trainer: Trainer) -> None:
@@ -291,17 +296,27 @@ def _finite_number(where: str, value: Any) -> float:
     return number
 
 
-def states_of(callbacks: Mapping[str, Callback]) -> dict[str, dict[str, Any]]:
+def states_of(
+    callbacks: Mapping[str, Callback], before: Mapping[str, dict[str, Any]] | None = None
+) -> dict[str, dict[str, Any]]:
     """Return copies of the states of all callbacks, with Python's own numbers.
 
+    Args:
+        callbacks: by name.
+        before: their states when the run began; None if it begins now.
+
     Raises:
-        CallbackError: a checkpoint cannot hold a state.
+        CallbackError: a checkpoint cannot hold a state, or a resumed run would refuse it beside the one from before.
     """
     states = {}
     for name, callback in callbacks.items():
         with mistakes_explained(name):
             state = callback.state()
         states[name] = _savable(f"{name}.state", state)
+        try:
+            check_numbers(f"{name}.state", states[name], (before or states)[name])
+        except ValueError as error:
+            raise CallbackError(f"{error}, as when the run began") from error
     return states
 
 
@@ -311,12 +326,12 @@ def _savable(where: str, value: Any) -> Any:
         if wrong:
             raise CallbackError(f"{where}: {wrong[0]!r:.60} must be a text, as the name of a value")
         return {name: _savable(f"{where}.{name}", inner) for name, inner in value.items()}
-    if isinstance(value, Tensor):
+    if isinstance(value, Tensor) and value.layout == torch.strided and not value.is_complex():
         return value.detach().clone()
     if isinstance(value, bool):
         return value
     if isinstance(value, numbers.Real):
         return int(value) if isinstance(value, numbers.Integral) else float(value)
     raise CallbackError(
-        f"{where} is of type {type(value).__name__}, but must be a number, a tensor or a mapping of them"
+        f"{where} is of type {type(value).__name__}, but must be a real number, a dense tensor or a mapping of them"
     )

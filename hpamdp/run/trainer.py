@@ -339,7 +339,7 @@ class Trainer:
         if self.output_dir is None:
             return
         try:
-            self._states_of_callbacks = states_of(self.callbacks)
+            self._states_of_callbacks = states_of(self.callbacks, self._states_of_callbacks)
         finally:  # an error in a callback's code costs no training
             self._write_checkpoint(self.output_dir, collection)
 
