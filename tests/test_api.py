@@ -257,6 +257,19 @@ def test_the_environment_of_a_run_that_was_an_object_is_not_taken_for_the_same_i
     assert "whether it was the same one is not known" in capsys.readouterr().err
 
 
+def test_a_run_that_a_callback_ended_is_not_finished_without_the_callback(tmp_path):
+    class Enough(hpamdp.Callback):
+        def on_batch(self, trainer):
+            trainer.stop()
+
+    arguments = {**TINY, "low": "hppo", "folder": tmp_path / "run"}
+    hpamdp.train("platform", callbacks=[Enough(), hpamdp.BestAgent()], **arguments)
+    assert hpamdp.train("platform", resume="auto", callbacks=Enough(), **arguments).history[-1]["frames"] == 512
+    line = r'results of another config, with callbacks=\["Enough"\] for \["BestAgent"\]; they stay as they are'
+    with pytest.raises(hpamdp.ConfigError, match=line):
+        hpamdp.train("platform", resume="auto", callbacks=hpamdp.BestAgent(), **arguments)
+
+
 @pytest.mark.parametrize("env", ["hpamdp/Platform-v0", {"name": "moving", "max_steps": 20}])
 def test_a_problem_may_be_an_id_or_a_dict(env):
     assert hpamdp.train(env, low="hppo", high=None, **TINY).history[-1]["frames"] == 1024

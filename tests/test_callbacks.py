@@ -461,6 +461,8 @@ def test_a_run_that_a_callback_ended_is_finished(tmp_path, capsys):
     assert summary["frames"] < 6400 and summary["finished"]
     assert f"Training ended at {summary['frames']} steps: 1 evaluations without an improvement" in printed
     assert rest_of(make_config(words), tmp_path).score == summary["score"]
+    with pytest.raises(ConfigError, match=r"another config, with callbacks="):
+        rest_of(make_config([*SMALL, "total_frames=6400"]), tmp_path)
     assert rest_of(make_config([*words, "save_best=true"]), tmp_path).score == summary["score"]
 
 

@@ -114,7 +114,7 @@ def train(
             if output_dir is not None:
                 stack.enter_context(_own_folder(output_dir))
             if goes_on and output_dir is not None:
-                score, source = _rest_of(config, output_dir)
+                score, source = _rest_of(config, output_dir, [type(each).__name__ for each in callbacks])
                 if score is not None:
                     return _finished_agent(config, output_dir, problem, config_dirs)
             trainer = begin(config, source, output_dir, words, may_overwrite=goes_on, callbacks=callbacks)
@@ -238,9 +238,9 @@ def _own_folder(folder: Path) -> Iterator[None]:
                 each.rmdir()
 
 
-def _rest_of(config: Config, folder: Path) -> Rest:
+def _rest_of(config: Config, folder: Path, callbacks: Sequence[str]) -> Rest:
     """Return the rest of a run in a folder. Warn if its environment is an object, which no config tells apart."""
-    rest = rest_of(config, folder)
+    rest = rest_of(config, folder, callbacks=callbacks)
     if config.env.objects and rest != Rest():
         warn(
             f"resume='auto': {folder} holds a run of an environment given as an object, too; whether it was the same "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,13 +29,14 @@ class Rest(NamedTuple):
     checkpoint: Path | None = None
 
 
-def rest_of(wanted: Config, folder: Path, name: str = "its folder") -> Rest:
+def rest_of(wanted: Config, folder: Path, name: str = "its folder", callbacks: Sequence[str] = ()) -> Rest:
     """Return the rest of a run in its folder, which may be new.
 
     Args:
         wanted: the config of the run.
         folder: the run's folder.
         name: name of the folder in the error.
+        callbacks: names of the classes of callbacks that Python code gives.
 
     Raises:
         ConfigError: the folder holds the results of another run, and `overwrite` is false.
@@ -43,13 +44,17 @@ def rest_of(wanted: Config, folder: Path, name: str = "its folder") -> Rest:
     file = folder / checkpoint.FILE_NAME
     if not file.exists() and not (folder / SUMMARY_NAME).exists():
         return Rest()
-    saved = saved_config(folder)
+    saved, summary = saved_config(folder), saved_summary(folder)
     if not saved and file.exists():
         saved = checkpoint.progress_of(file)["config"]
-    if wanted.run.overwrite and _difference(wanted, saved):
-        return Rest()
-    refuse_another(wanted, saved, name)
-    summary = saved_summary(folder)
+    difference, stopped_by = _difference(wanted, saved), summary.get("stopped_by")
+    names = [*(each.class_name for each in wanted.callbacks), *callbacks]
+    if not difference and summary.get("finished") and stopped_by not in (None, *names):
+        difference = f"callbacks={json.dumps([stopped_by])} for {json.dumps(names)}"
+    if difference:
+        if wanted.run.overwrite:
+            return Rest()
+        raise _refusal(name, difference)
     score = summary.get("score") if summary.get("finished") else None
     return Rest(score if isinstance(score, int | float) else None, file if file.exists() else None)
 
@@ -67,10 +72,14 @@ def refuse_another(wanted: Config, saved: Mapping[str, Any], name: str) -> None:
     """
     difference = _difference(wanted, saved)
     if difference:
-        raise ConfigError(
-            f"{name} has the results of another config, with {difference}; they stay as they are: set another "
-            "folder, or move this one away"
-        )
+        raise _refusal(name, difference)
+
+
+def _refusal(name: str, difference: str) -> ConfigError:
+    return ConfigError(
+        f"{name} has the results of another config, with {difference}; they stay as they are: set another folder, or "
+        "move this one away"
+    )
 
 
 def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:

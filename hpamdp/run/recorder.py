@@ -185,7 +185,9 @@ class Recorder:
         self._scalars = {}
         return row
 
-    def finish(self, frames: int, wall_s: float, cpu_s: float, *, is_finished: bool) -> str:
+    def finish(
+        self, frames: int, wall_s: float, cpu_s: float, *, is_finished: bool, stopped_by: str | None = None
+    ) -> str:
         """Evaluate, write the summary and the figures, close the logger, and return the closing table as text.
 
         Args:
@@ -193,6 +195,7 @@ class Recorder:
             wall_s: wall time of training; with `mode=eval`, the time of the evaluation replaces it.
             cpu_s: CPU time of training; likewise.
             is_finished: whether training reached its end. Otherwise the evaluation is the last row of the metrics.
+            stopped_by: class of the callback that ended training, if one did.
         """
         if self.config.run.mode == "eval":
             wall_before, cpu_before = time.perf_counter(), time.process_time()
@@ -205,7 +208,7 @@ class Recorder:
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
         env = self.parts.evaluation.problem
         summary = summarise(self.config, env, measured, self._random_scores, effort, is_finished=is_finished)
-        summary |= self._callback_metrics
+        summary |= self._callback_metrics | ({} if stopped_by is None else {"stopped_by": stopped_by})
         if self.config.run.mode != "eval":
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
             summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])

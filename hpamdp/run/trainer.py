@@ -53,6 +53,7 @@ class Trainer:
         frames: frames so far.
         wall_s, cpu_s: wall time and CPU time of training so far.
         last_score: score of the last evaluation; None before the first one.
+        stopped_by: class of the callback that has ended training; None if none has.
         stop_reason: why a callback has ended training; empty if none has, or if it gave no reason.
         is_evaluation_due: whether an evaluation began and did not end. A resumed run repeats it.
         resumed_from: folder of the run that is continued, if any.
@@ -77,6 +78,7 @@ class Trainer:
         self.recorder = Recorder(config, parts, output_dir)
         self._is_stopped = False
         self.stop_reason = ""
+        self.stopped_by: str | None = None
         self.resumed_from: Path | None = None
         self.frames = 0
         self.wall_s = 0.0
@@ -175,7 +177,8 @@ class Trainer:
         Args:
             is_finished: whether training reached its end.
         """
-        return self.recorder.finish(self.frames, self.wall_s, self.cpu_s, is_finished=is_finished)
+        effort = self.frames, self.wall_s, self.cpu_s
+        return self.recorder.finish(*effort, is_finished=is_finished, stopped_by=self.stopped_by)
 
     def train(self) -> bool:
         """Train until `num_frames`, `eval.stop_score` or a callback ends it, and save the agent.
@@ -215,8 +218,11 @@ class Trainer:
 
     def _call(self, act: Callable[[Callback], None]) -> None:
         for name, callback in self.callbacks.items():
+            was_stopped = self._is_stopped
             with mistakes_explained(name):
                 act(callback)
+            if self._is_stopped and not was_stopped:
+                self.stopped_by = type(callback).__name__
 
     def _save_and_close(self, collection: Collection) -> None:
         """Save first, uninterrupted and without any output, then close the collection."""
