@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
+import gymnasium
+import numpy as np
 import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward, TransformReward
 from gymnasium_players import step
 from toy_environments import Toy
 
@@ -72,6 +77,43 @@ class Unseeded(Toy):
 
     def reset(self, *, seed=None, options=None):
         return super().reset()
+
+
+@pytest.mark.parametrize("name", ["action_space", "observation_space"])
+@pytest.mark.parametrize("changes", [1, 2, 3])
+def test_a_space_that_depends_on_the_state_is_told_of_with_where_masks_and_bounds_go(name, changes):
+    """The space changes with the first step, with the last one, or in the second episode."""
+
+    class Changing(Toy):
+        def step(self, action):
+            values = super().step(action)
+            if len(self.actions) == changes:
+                setattr(self, name, spaces.Box(0.0, 1.0, (9,)))
+            return values
+
+    line = (
+        rf"environment \d: its {name} was .* and is now .*Box.*, but must stay the same; .*action_mask.*parameter_low"
+    )
+    with pytest.raises(hpamdp.ConfigError, match=line):
+        hpamdp.train(Changing, low="hppo", high="none", max_steps=2, total_frames=64, num_envs=2, progress=False)
+
+
+class Normalised(gymnasium.Wrapper):
+    """Normalises rewards with statistics of its own, as wrappers of other libraries do."""
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        self.ret_rms = SimpleNamespace(mean=np.zeros(1), var=np.ones(1), count=1e-4)
+
+
+@pytest.mark.parametrize("wrapper", [NormalizeReward, NormalizeObservation, Normalised])
+def test_a_wrapper_with_running_statistics_is_refused_with_our_settings(wrapper):
+    line = rf"{wrapper.__name__}: its running statistics .* env.observation_scaling=running .*, env.reward_scaling=0.99"
+    with pytest.raises(hpamdp.ConfigError, match=line):
+        hpamdp.make(lambda: TransformReward(wrapper(Toy()), float), max_steps=3)
+    frozen = wrapper(Toy())
+    frozen.update_running_mean = False
+    hpamdp.make(lambda: frozen, max_steps=3).close()
 
 
 def test_an_environment_that_ignores_its_seed_is_named_once(capsys):

@@ -10,6 +10,9 @@ import gymnasium
 from hpamdp.env.errors import ProblemError, fault_of
 from hpamdp.env.gymnasium.values import flag, number, shown
 from hpamdp.messages import one_line, warn
+from hpamdp.settings import SettingError
+
+_STATISTICS = ("mean", "var", "count")
 
 
 class ContractCheck(gymnasium.Wrapper):
@@ -91,6 +94,26 @@ def _is_about_the_call(error: TypeError) -> bool:
     """Return whether a method does not take its arguments: the error was raised before its first line."""
     assert error.__traceback__ is not None
     return error.__traceback__.tb_next is None
+
+
+def refuse_running_statistics(env: gymnasium.Env) -> None:
+    """Refuse a wrapper that normalises by running statistics, which differ between copies and move in evaluations.
+
+    Raises:
+        SettingError: there is one whose statistics are not frozen by `update_running_mean`.
+    """
+    layer = env
+    while isinstance(layer, gymnasium.Wrapper):
+        parts = [layer, *(part for part in vars(layer).values() if not isinstance(part, gymnasium.Env))]
+        # As in the statistics of Gymnasium, Stable-Baselines3 and others; arrays have methods of these names.
+        has_some = any(all(not callable(getattr(part, name, print)) for name in _STATISTICS) for part in parts)
+        if has_some and getattr(layer, "update_running_mean", True):
+            raise SettingError(
+                f"{type(layer).__name__}: its running statistics would differ between copies and move in evaluations, "
+                "whose scores would be wrong; leave it out, and set env.observation_scaling=running for observations, "
+                "env.reward_scaling=0.99 for rewards"
+            )
+        layer = layer.env
 
 
 def checked(env: gymnasium.Env) -> gymnasium.Env:

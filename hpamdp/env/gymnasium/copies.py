@@ -12,7 +12,7 @@ import numpy as np
 
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError, closed_on_error, fault_of
 from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
-from hpamdp.env.gymnasium.contract import ContractCheck, checked_step, refuse_step
+from hpamdp.env.gymnasium.contract import ContractCheck, checked_step, refuse_running_statistics, refuse_step
 from hpamdp.env.gymnasium.masks import Masks
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 from hpamdp.env.gymnasium.options import ActionForm, MaskSource, OutOfBounds
@@ -26,6 +26,7 @@ _SUCCESS_ENTRIES = ("is_success", "success")
 # Columns of a table of results after the observation, before the masks.
 _NUM_AFTER = len(("reward", "terminated", "truncated", "success", "has_success"))
 _ALL = slice(None)  # rows
+_SPACES = ("action_space", "observation_space")
 _PICTURES_PER_SECOND = 4.0
 
 
@@ -153,6 +154,7 @@ class Copies:
                     "its training begins elsewhere than its evaluation, or in another world, and a Gymnasium "
                     "environment does not know which of the two it is in; use the problem itself, such as env=pinball"
                 )
+            refuse_running_statistics(self.example)
             self._limits = [limit_of(env, reading.max_steps) for env in self.envs]
             self.max_steps = max(self._limits)
             space = self.envs[0].observation_space
@@ -185,6 +187,7 @@ class Copies:
         # Without the outer check, whose work `step` does in its loop.
         self._inner = [env.env if isinstance(env, ContractCheck) else env for env in self.envs]
         self._num_steps = [0] * num
+        self._spaces = [(env.action_space, env.observation_space) for env in self.envs]
         self._after = self.table[:, self.layout.dim : self.layout.dim + _NUM_AFTER]
         self._has_masks = bool(mask_sizes)
         self._has_bounds = num_bounded > 0
@@ -194,11 +197,25 @@ class Copies:
             raise SettingError(f"{self._name}: made the same environment twice; each call must make a new one")
         first = self.envs[0]
         for row, env in enumerate(self.envs):
-            for name in ("action_space", "observation_space"):
+            for name in _SPACES:
                 if getattr(env, name) != getattr(first, name):
                     given, wanted = written(getattr(env, name)), written(getattr(first, name))
                     different = f"the {name} of copy {row} is {given}, but that of copy 0 {wanted}"
                     raise SettingError(f"{self._name}: {different}")
+
+    def _check_unchanged(self, row: int) -> None:
+        """Check that a copy has the spaces that were read, now and then, since no step can afford it.
+
+        Raises:
+            ProblemError: a space depends on the state.
+        """
+        env = self.envs[row]
+        for name, now, read in zip(_SPACES, (env.action_space, env.observation_space), self._spaces[row], strict=True):
+            if now is not read and now != read:
+                raise ProblemError(
+                    f"its {name} was {written(read)} and is now {written(now)}, but must stay the same; give what a "
+                    "state forbids as action_mask, its bounds as parameter_low and parameter_high; see env.action_mask"
+                )
 
     def reset(self, seeds: Mapping[int, int | None]) -> None:
         """Begin episodes.
@@ -216,6 +233,7 @@ class Copies:
             for self._row, seed in seeds.items():
                 env = self.envs[self._row]
                 observation, info = env.reset(seed=seed)
+                self._check_unchanged(self._row)
                 if self._write[self._row](observation):
                     unchecked[self._row] = observation
                 self._masks.keep(self._row, observation, info)
@@ -264,6 +282,8 @@ class Copies:
                     self._masks.keep(row, observation, info)
                     self._bounds.keep(row, observation, info)
                     success = _success_in(info)
+                if terminated or truncated or num_steps[row] == 1:
+                    self._check_unchanged(row)
                 if terminated or truncated or success is not None:
                     flags[row] = (terminated, truncated, bool(success), success is not None)
             if rows:
