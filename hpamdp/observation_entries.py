@@ -20,7 +20,7 @@ class ObservationEntry:
     Attributes:
         name: name in errors and in encoders, such as `camera`.
         start: place of its first number in the observation.
-        shape: shape before it was flattened. A picture has 2 or 3 dimensions.
+        shape: shape before it was flattened. A picture has 2 or 3 dimensions, a stack of colour pictures 4.
         is_picture: whether the numbers are pixels, whole numbers from 0 to 255.
     """
 
@@ -41,22 +41,24 @@ class ObservationEntry:
 
     @property
     def has_channels_last(self) -> bool:
-        """Whether a picture has the shape `[H, W, C]`."""
-        return channels_axis(self.shape) == 2
+        """Whether a picture has the shape `[H, W, C]`, or `[K, H, W, C]`."""
+        return channels_axis(self.shape[-3:]) == 2
 
     @property
     def picture_shape(self) -> tuple[int, int, int]:
-        """Channels, height and width of a picture."""
+        """Channels, height and width of a picture. A stack of K pictures has K times the channels of one."""
         if len(self.shape) == 2:
             return 1, self.shape[0], self.shape[1]
-        first, second, third = self.shape
-        return (third, first, second) if self.has_channels_last else (first, second, third)
+        first, second, third = self.shape[-3:]
+        channels, height, width = (third, first, second) if self.has_channels_last else (first, second, third)
+        return math.prod(self.shape[:-3]) * channels, height, width
 
     def picture(self, observation: Tensor) -> Tensor:
         """Return the pictures `[*B, C, H, W]` of observations `[*B, observation_dim]`, in the observations' dtype."""
         flat = observation[..., self.place]
         if self.has_channels_last:
-            return flat.unflatten(-1, self.shape).movedim(-1, -3)
+            picture = flat.unflatten(-1, self.shape).movedim(-1, -3)
+            return picture.flatten(-4, -3) if len(self.shape) == 4 else picture
         return flat.unflatten(-1, self.picture_shape)
 
 
@@ -72,7 +74,11 @@ def channels_axis(shape: Sequence[int]) -> int | None:
 
 
 def is_picture_shape(shape: Sequence[int]) -> bool:
-    """Return whether a uint8 array of this shape counts as a picture: `[H, W]`, `[H, W, C]` or `[C, H, W]`."""
+    """Return whether a uint8 array of this shape counts as a picture: `[H, W]`, `[H, W, C]` or `[C, H, W]`.
+
+    A stack of colour pictures, whose first axis is that of the stack, does, too.
+    """
+    shape = shape[1:] if len(shape) == 4 else shape
     if len(shape) not in (2, 3):
         return False
     axis = channels_axis(shape)

@@ -60,13 +60,15 @@ LEARNERS = {"hppo": HPPO, "pdqn": PDQN, "hsac": HSAC}
         ((4, 84, 84), (4, 84, 84)),
         ((84, 84, 16), (16, 84, 84)),
         ((16, 16, 16), (16, 16, 16)),
+        ((4, 64, 48, 3), (12, 64, 48)),
+        ((4, 3, 64, 48), (12, 64, 48)),
     ],
 )
 def test_channels_are_found_by_the_shorter_of_the_outer_axes(shape, picture_shape):
     entry = ObservationEntry("x", 0, shape, is_picture=True)
     assert is_picture_shape(shape) and entry.picture_shape == picture_shape
     values = torch.arange(entry.size, dtype=torch.int32).reshape(1, *shape)
-    expected = values.movedim(-1, 1) if entry.has_channels_last else values.reshape(1, *picture_shape)
+    expected = (values.movedim(-1, -3) if entry.has_channels_last else values).reshape(1, *picture_shape)
     assert torch.equal(entry.picture(values.flatten(1)), expected)
 
 
@@ -88,10 +90,14 @@ def test_a_picture_is_a_uint8_box_of_0_to_255_with_16_px_a_side(space, counts):
 
 
 @pytest.mark.parametrize("highest", [1.0, 255.0])
-@pytest.mark.parametrize("shape", [(40, 36, 3), (3, 40, 36), (40, 36, 1)])
+@pytest.mark.parametrize(
+    "shape", [(40, 36, 3), (3, 40, 36), (8, 40, 36), (4, 40, 36, 3), (40, 36, 3, 4), (2, 4, 40, 36, 3)]
+)
 def test_a_colour_picture_of_floats_is_refused_unless_it_is_flattened(shape, highest):
     space = spaces.Box(0.0, highest, shape)
-    with pytest.raises(SettingError, match=r"observation camera: .* must be uint8 from 0 to 255; encoder=mlp reads it"):
+    with pytest.raises(
+        SettingError, match=r"observation camera: .* must be uint8 from 0 to 255, .*; encoder=mlp reads"
+    ):
         ObservationSpace(spaces.Dict(camera=space))
     assert ObservationSpace(space, flattens_pictures=True).dim == np.prod(shape)
 

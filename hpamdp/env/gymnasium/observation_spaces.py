@@ -4,9 +4,10 @@ Accepted are `Box`, `Discrete`, `MultiDiscrete`, `MultiBinary` and `Tuple` and `
 `gymnasium.spaces.utils.flatten`, which makes discrete values one-hot. Entries of a `Tuple` or `Dict` can be left out.
 
 A `Box` of uint8 from 0 to 255 is a picture if it has 2 or 3 dimensions and at least 16 px a side. Channels may come
-first or last, see `hpamdp.observation_entries.channels_axis`. Pictures stay uint8 and are never scaled. They follow the
-vector of all other numbers. A `Box` with the shape of a colour picture and other numbers, such as floats from 0 to 1,
-is refused unless pictures are flattened: it would become a long vector without a word.
+first or last, see `hpamdp.observation_entries.channels_axis`. A stack of K of them, `[K, ...]`, is a picture with K
+times the channels. Pictures stay uint8 and are never scaled. They follow the vector of all other numbers. A `Box` of
+pixels in another form, such as floats from 0 to 1, is refused unless pictures are flattened: it would become a long
+vector without a word.
 """
 
 from __future__ import annotations
@@ -21,10 +22,9 @@ from gymnasium.spaces.utils import flatdim, flatten_space
 from hpamdp.env.gymnasium.action_spaces import written
 from hpamdp.env.gymnasium.leaves import Leaf, children, leaves
 from hpamdp.env.gymnasium.options import OutOfBounds
-from hpamdp.observation_entries import ObservationEntry, channels_axis, is_picture_shape
+from hpamdp.observation_entries import SMALLEST_PICTURE, ObservationEntry, is_picture_shape
 from hpamdp.settings import SettingError
 
-_CHANNELS = (1, 3, 4)  # of grey, RGB and RGBA
 _FLOAT32_BYTES = 4
 _MOST_EXACT = 1 << 24  # float32 holds all integers up to this one
 
@@ -232,20 +232,19 @@ def _is_picture(space: spaces.Space) -> bool:
 
 
 def _refuse_other_pixels(leaf: Leaf) -> None:
-    """Refuse a box with the shape of a colour picture whose numbers are pixels in another form.
+    """Refuse a box as large as a colour picture whose numbers are pixels in another form.
 
     Raises:
-        SettingError: they lie between 0 and 1 or between 0 and 255, but are not uint8 from 0 to 255.
+        SettingError: they lie between 0 and 1 or between 0 and 255, but make no picture of uint8 from 0 to 255.
     """
     space = leaf.space
-    if not isinstance(space, spaces.Box) or _is_picture(space) or not is_picture_shape(space.shape):
+    if not isinstance(space, spaces.Box) or _is_picture(space) or len(space.shape) < 3:
         return
-    axis = channels_axis(space.shape)
-    is_colour = axis is not None and space.shape[axis] in _CHANNELS
-    if is_colour and (space.low == 0).all() and any((space.high == highest).all() for highest in (1, 255)):
+    is_large = sum(size >= SMALLEST_PICTURE for size in space.shape) >= 2
+    if is_large and (space.low == 0).all() and any((space.high == highest).all() for highest in (1, 255)):
         raise SettingError(
             f"observation {_name(leaf)}: {written(space)} has the shape of a picture, whose pixels must be uint8 from "
-            "0 to 255; encoder=mlp reads it as a vector"
+            "0 to 255, in [H, W], [H, W, C], [C, H, W] or a stack [K, ...] of these; encoder=mlp reads it as a vector"
         )
 
 
