@@ -340,7 +340,7 @@ def test_a_selector_gets_what_it_needs_on_a_problem():
 
 def test_gymnasium_environments_are_evaluated_on_fewer_episodes():
     words = ["env=gymnasium", "env.id=hpamdp/Goal-v0", "high=none"]
-    assert make_config(words).run.eval.layouts == 100 < make_config(["env=goal", "high=none"]).run.eval.layouts
+    assert make_config(words).run.eval.layouts == 20 < make_config(["env=goal", "high=none"]).run.eval.layouts
     assert make_config([*words, "eval.layouts=7"]).run.eval.layouts == 7
 
 

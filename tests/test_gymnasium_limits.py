@@ -144,3 +144,11 @@ def test_a_reward_of_an_evaluation_that_is_not_finite_is_reported_in_one_line(tm
 def test_a_command_tells_in_one_line_that_an_environment_ended_the_program(command):
     code, _, err = command("watch", "low=random", *WORDS[:3])
     assert code == 1 and err.count("\n") == 1 and "called sys.exit(0), which stopped the run" in err
+
+
+def test_staggered_copies_end_their_first_episodes_apart_and_later_ones_at_the_limit():
+    env = GymnasiumEnv(4, make=Limited, max_steps=8, staggered=True)
+    ended = env.rollout(24, break_when_any_done=False)["next", "truncated"].squeeze(-1)
+    assert [row.nonzero().squeeze(-1).tolist() for row in ended] == [[7, 15, 23], [4, 12, 20], [1, 9, 17], [6, 14, 22]]
+    evaluated = env.rollout(8, auto_reset=False, tensordict=env.reset(env.fixed_episodes(0)))
+    assert evaluated["next", "done"].squeeze(-1).sum(-1).tolist() == [1, 1, 1, 1] and evaluated.shape == (4, 8)

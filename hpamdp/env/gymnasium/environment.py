@@ -45,6 +45,8 @@ _PICTURE = "picture"
 _LARGEST_PICTURE = 320  # px from edge to edge of a picture that is kept for a film
 # Separate streams of seeds for training and for the fixed episodes of evaluation.
 _TRAINING, _FIXED = 0, 1
+# Its multiples without their whole parts fill the range from 0 to 1 evenly, however many there are.
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 class GymnasiumEnv(PAMDPEnv):
@@ -147,6 +149,7 @@ class GymnasiumEnv(PAMDPEnv):
         self._observation = np.zeros((num_envs, self._copies.layout.dim), np.float32)
         self._is_over = np.zeros(num_envs, bool)
         self._rows = [*range(num_envs)]
+        self._first_ends = np.zeros(num_envs, np.int64)  # steps to the end of a staggered first episode; else 0
         self._reports_success = False
         self._set_seed(seed)
 
@@ -406,6 +409,10 @@ class GymnasiumEnv(PAMDPEnv):
         for row in rows:
             self._next_seeds[row] = None
         self._copies.reset(chosen)
+        self._first_ends[is_reset] = 0
+        if self.options.staggered and mask is None and given is None:
+            numbers = np.arange(self.first_env, self.first_env + self.num_envs)
+            self._first_ends[:] = np.ceil(numbers * _GOLDEN % 1.0 * self.max_steps)
         self._scale(is_reset, is_all=len(rows) == self.num_envs)
         if self._reward_scaling is not None:
             self._reward_scaling.begin(is_reset)
@@ -420,6 +427,9 @@ class GymnasiumEnv(PAMDPEnv):
             is_stepped &= tensordict.get("_step").reshape(-1).numpy(force=True)
         is_all = bool(is_stepped.all())
         self._copies.step(self._rows if is_all else np.flatnonzero(is_stepped).tolist(), option, chosen, values)
+        if self._first_ends.any():
+            results.truncated[is_stepped & (self._first_ends == 1) & (results.terminated == 0.0)] = 1.0
+            self._first_ends -= is_stepped & (self._first_ends > 0)
         self._scale(is_stepped, is_all=is_all)
         rewards = results.reward if is_all else np.where(is_stepped, results.reward, 0.0)
         if self._reward_scaling is not None:

@@ -70,6 +70,12 @@ class GymnasiumOptions(Settings):
     """
     out_of_bounds: OutOfBounds = "refuse"
     """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""
+    staggered: bool = False
+    """Truncate the first episode of each copy in training after another number of steps.
+
+    Otherwise copies whose episodes all have the same length stay at the same step. Batches that are shorter than an
+    episode then hold only a part of it: the day, or the night.
+    """
     num_workers: NonNegativeInt = 0
     """Processes that step the copies at the same time, for slow environments. If 0, this process steps them."""
 
