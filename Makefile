@@ -1,7 +1,7 @@
-# `make play`, `make run` and `make test` need Python 3.10, 3.11 or 3.12 and nothing else; all that they install goes into .venv.
+# `make play`, `make run` and `make test` need Python 3.10 to 3.14 and nothing else; all that they install goes into .venv.
 VENV := .venv
 PYTHON := $(VENV)/bin/python
-IS_ALLOWED := import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))
+IS_ALLOWED := import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))
 
 # Environments of their own for `make slow`, `make lowest` and `make docs`.
 SLOW := .venv-slow
@@ -85,11 +85,11 @@ docs: $(DOCS)/.installed
 # A python on the PATH may be a stub that does not run (pyenv) or lack venv's pip (Debian), so each is tried.
 define venv
 @$(@D)/bin/python -c 'import pip; $(IS_ALLOWED)' 2>/dev/null || { \
-    for python in python3.11 python3.12 python3.10 python3; do \
+    for python in python3.11 python3.12 python3.13 python3.10 python3.14 python3; do \
         $$python -c 'import ensurepip; $(IS_ALLOWED)' 2>/dev/null && break; \
         python=; \
     done; \
-    test -n "$$python" || { echo "hpamdp needs Python 3.10, 3.11 or 3.12; there is none on the PATH" >&2; exit 1; }; \
+    test -n "$$python" || { echo "hpamdp needs Python 3.10 to 3.14; there is none on the PATH" >&2; exit 1; }; \
     echo "Making $(@D) with $$($$python --version)"; \
     $$python -m venv --clear $(@D) || exit 1; \
 }
