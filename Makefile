@@ -93,7 +93,7 @@ define venv
     echo "Making $(@D) with $$($$python --version)"; \
     $$python -m venv --clear $(@D) || exit 1; \
 }
-@echo "Installing into $(@D); the first time takes some minutes"
+@echo "Installing torch and what else hpamdp needs into $(@D): 2 GB, or 7 GB with CUDA; the first time takes some minutes"
 endef
 INSTALL = @$(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
