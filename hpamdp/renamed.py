@@ -39,6 +39,8 @@ _ELSEWHERE: dict[str, tuple[str, ...]] = {
     "n_envs": ("num_envs",),
     "eval_freq": ("eval.every",),
     "n_eval_episodes": ("eval.layouts",),
+    "policy_kwargs": ("hidden_dims",),
+    "tensorboard_log": ("logger",),
 }
 # Arguments of other libraries' evaluations, and those of `Agent.evaluate`.
 OF_EVALUATION = {
@@ -58,7 +60,7 @@ _MEMBERS_ELSEWHERE = {
     "load": "hpamdp.load",
 }
 # Names that stand for values of the run, which a group does not have.
-_OF_RUN = ("steps_per_batch", "total_frames", "num_envs", "eval.every", "eval.layouts")
+_OF_RUN = ("steps_per_batch", "total_frames", "num_envs", "eval.every", "eval.layouts", "logger")
 
 
 def renamed(setting: str, known: Iterable[str]) -> str | None:

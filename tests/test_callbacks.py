@@ -11,6 +11,7 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from conftest import compose_config, make_config, parts_of
@@ -77,7 +78,7 @@ def scores(monkeypatch) -> list[float]:
 
 def test_patience_ends_a_run_after_evaluations_without_an_improvement_that_is_large_enough(scores):
     scores += [0.0, 1.0, 1.4, 1.5, 1.9, 1.9, 1.9, 9.0]
-    trainer = train(Patience(evaluations=3, min_improvement=0.5))
+    trainer = train(Patience(3, min_improvement=0.5))
     assert (trainer.frames, trainer.last_score) == (192, 1.9)
     assert trainer.stop_reason == "3 evaluations without an improvement"
 
@@ -99,19 +100,30 @@ def test_a_time_limit_counts_the_time_before_a_resumption_and_is_followed_by_an_
     assert wall_s + 0.2 <= float(last["wall_s"]) < wall_s + 30.0  # even on a busy machine
 
 
-def test_the_best_agent_is_kept_and_can_be_scored_and_watched(scores, tmp_path):
+def test_a_run_ends_with_its_best_agent_which_can_be_scored_and_watched(scores, tmp_path, capsys):
     scores += [0.0, 3.0, 7.0, 2.0, 7.0, 1.0]
     words = [*PLATFORM, "total_frames=160", "save_best=true"]
     assert run(compose_config(words), tmp_path / "run", words) == 0
     best = checkpoint.progress_of(tmp_path / "run/best.safetensors")
     assert (best["frames"], best["last_score"]) == (64, 7.0)
-    kept, last = (tensors_in(tmp_path / f"run/{name}.safetensors") for name in ("best", "policy"))
-    assert not all(torch.equal(value, last[name]) for name, value in kept.items())
-    player = load_agent(str(tmp_path / "run/best.safetensors"), [])
+    kept, at_end = (tensors_in(tmp_path / f"run/{name}.safetensors") for name in ("policy", "checkpoint"))
+    assert not all(torch.equal(value, at_end[name]) for name, value in kept.items())
+    summary = json.loads((tmp_path / "run/summary.json").read_text())
+    assert (summary["frames"], summary["kept_frames"]) == (160, 64) and summary["score_at_end"] < 7.0
+    assert "this agent is that of frame 64; at the end, the score was" in capsys.readouterr().out
+    player = load_agent(str(tmp_path / "run"), [])
+    assert player.progress["frames"] == 64
     assert all(torch.equal(value, player.agent.state_dict()[name]) for name, value in kept.items())
     words = ["mode=eval", f"checkpoint={tmp_path / 'run/best.safetensors'}"]
     assert run(compose_config(words), tmp_path / "eval", words) == 0
     assert json.loads((tmp_path / "eval/summary.json").read_text())["frames"] == 64
+
+
+@pytest.mark.parametrize(("best_score", "is_better"), [(0.5, False), (0.51, False), (0.53, True), (None, False)])
+def test_a_best_agent_is_clearly_better_beyond_two_standard_errors(best_score, is_better):
+    best = BestAgent()
+    best.best_score = best_score
+    assert best.is_clearly_better(np.array([0.4, 0.6] * 100)) is is_better
 
 
 def test_the_best_agent_stays_in_memory_if_the_run_has_no_folder(scores):
@@ -512,5 +524,5 @@ def test_a_new_run_does_not_overwrite_a_best_agent_that_a_killed_run_left(tmp_pa
         (tmp_path / name).unlink()
     with pytest.raises(ConfigError, match="holds the results of a run"):
         start(tmp_path)
-    assert start(tmp_path, "overwrite=true") == 0
+    assert start(tmp_path, "overwrite=true", "save_best=false") == 0
     assert not (tmp_path / "best.safetensors").exists()

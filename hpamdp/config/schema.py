@@ -189,8 +189,9 @@ class RunConfig(Settings):
     """Delete another run in the output folder, right before this one writes its first file."""
     callbacks: Annotated[tuple[str | dict[str, Any], ...], FromList] = ()
     """Callbacks of training, in their order: `[NAME, {name: NAME, SETTING: VALUE, ...}, ...]`."""
-    save_best: bool = False
-    """Keep the agent of the best evaluation in best.safetensors."""
+    save_best: bool = True
+    """Keep the agent of the best evaluation in best.safetensors. With `mode=train`, the run ends with it if the last
+    evaluation is clearly worse: by more than two standard errors."""
     film: bool = True
     """Write episodes.gif, which shows three episodes of the agent's last evaluation."""
 

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +20,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.files import replacing
 from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run.callbacks_options import CARDS, PatienceOptions, TimeLimitOptions
+from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.state_checks import check_numbers
 from hpamdp.run_files import BEST_NAME
 from hpamdp.settings import SettingError
@@ -87,27 +89,30 @@ class BestAgent(Callback):
 
     Attributes:
         best_score: score of the kept agent; None before the first evaluation.
+        best_frames: frames of training that it has had; None if that is not known.
     """
 
     card = CARDS["BestAgent"]
 
     def __init__(self) -> None:
         self.best_score: float | None = None
+        self.best_frames: int | None = None
         self._file: Path | None = None
         self._kept: tuple[dict[str, Any], dict[str, Tensor]] | None = None  # the networks, the observations' scale
 
     def on_start(self, trainer: Trainer) -> None:
         """Take over the best agent of the resumed run, which a killed run may have saved after its checkpoint."""
         if trainer.resumed_from is None:
-            self.best_score = None
+            self.best_score = self.best_frames = None
             return
         file = trainer.resumed_from / BEST_NAME
         if not file.is_file():
             if self.best_score is not None:
                 warn(f"{file}: not there, so the best agent is only kept from here on")
-            self.best_score = None
+            self.best_score = self.best_frames = None
             return
-        self.best_score = trainer.score_in(file)
+        progress = progress_of(file)
+        self.best_score, self.best_frames = progress["last_score"], progress["frames"]
         self._file = file
         if trainer.output_dir is not None and trainer.output_dir.resolve() != trainer.resumed_from.resolve():
             self._file = trainer.output_dir / BEST_NAME
@@ -126,7 +131,15 @@ class BestAgent(Callback):
         else:
             self._file = trainer.output_dir / BEST_NAME
             trainer.save_policy(self._file)
-        self.best_score = score
+        self.best_score, self.best_frames = score, trainer.frames
+
+    def is_clearly_better(self, scores: np.ndarray) -> bool:
+        """Return whether the kept agent has clearly more than the mean of an evaluation's scores `[episodes]`.
+
+        That is more than two standard errors of a difference of two such evaluations.
+        """
+        error = math.sqrt(2.0 / len(scores)) * float(scores.std())
+        return self.best_score is not None and self.best_score > float(scores.mean()) + 2.0 * error
 
     def restore(self, trainer: Trainer) -> None:
         """Give the trainer's agent the networks of the best agent. Optimizers and replay buffers stay.
@@ -154,12 +167,19 @@ class BestAgent(Callback):
 
 
 class Patience(Callback):
-    """End training after some evaluations without an improvement of the score."""
+    """End training after some evaluations without an improvement of the score.
+
+    Args:
+        options: the settings, or the number of evaluations, as in `Patience(3)`.
+        settings: single settings.
+    """
 
     Options = PatienceOptions
     card = CARDS["Patience"]
 
-    def __init__(self, options: PatienceOptions | None = None, **settings: Any) -> None:
+    def __init__(self, options: PatienceOptions | int | None = None, **settings: Any) -> None:
+        if isinstance(options, int):
+            options, settings = None, {"evaluations": options, **settings}
         self.options: PatienceOptions = PatienceOptions.of(options, settings)
         self._best = -math.inf
         self._evaluations = 0  # since the last improvement
@@ -193,12 +213,19 @@ class Patience(Callback):
 
 
 class TimeLimit(Callback):
-    """End training after some minutes of wall time."""
+    """End training after some minutes of wall time.
+
+    Args:
+        options: the settings, or the minutes, as in `TimeLimit(60)`.
+        settings: single settings.
+    """
 
     Options = TimeLimitOptions
     card = CARDS["TimeLimit"]
 
-    def __init__(self, options: TimeLimitOptions | None = None, **settings: Any) -> None:
+    def __init__(self, options: TimeLimitOptions | float | None = None, **settings: Any) -> None:
+        if isinstance(options, int | float):
+            options, settings = None, {"minutes": options, **settings}
         self.options: TimeLimitOptions = TimeLimitOptions.of(options, settings)
 
     def on_start(self, trainer: Trainer) -> None:

@@ -63,7 +63,7 @@ _NOT_RESUMED = "networks alone, which cannot be resumed"
 def find(path: str | Path, where: str) -> Path:
     """Return the file of a checkpoint.
 
-    A folder without a checkpoint may hold only the networks, which suffice for everything except resuming the run.
+    A folder holds the networks alone, too. They suffice for acting, and may be those of the run's best agent.
 
     Args:
         path: the file itself, the output folder of its run, or the name of an agent that comes with the package.
@@ -76,7 +76,8 @@ def find(path: str | Path, where: str) -> Path:
     if not os.path.exists(path) and str(path) in agent_names():
         path = agents_dir() / path
     if os.path.isdir(path):  # `Path.is_dir` would fail for some texts
-        names = (FILE_NAME, *(() if where == "resume" else (POLICY_NAME,)), *OLD_NAMES)
+        own = {"resume": (FILE_NAME,), "low.checkpoint": (FILE_NAME, POLICY_NAME)}
+        names = (*own.get(where, (POLICY_NAME, FILE_NAME)), *OLD_NAMES)
         file = next((path / name for name in names if os.path.isfile(path / name)), path / FILE_NAME)
     else:
         file = path

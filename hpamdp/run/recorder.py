@@ -31,7 +31,15 @@ from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.loggers import EarlierRun, LenientLogger, Logger
 from hpamdp.run.state_checks import SavedPart, check_like, check_values, checked
-from hpamdp.run.summary import ONE_OPTION, SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight, summarise
+from hpamdp.run.summary import (
+    KEPT_FRAMES,
+    ONE_OPTION,
+    SHORT_SIGHT,
+    WITHOUT_UPDATE,
+    closing_table,
+    short_sight,
+    summarise,
+)
 from hpamdp.run_files import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
 
 # Small enough to film in a second or two.
@@ -57,6 +65,7 @@ class Recorder:
     Attributes:
         metrics: the rows so far.
         summary: see `summarise`; empty before `finish`.
+        training_return: mean return of the exploring episodes in the last batch in which some ended; None before.
     """
 
     def __init__(self, config: Config, parts: AssembledRun, output_dir: Path | None) -> None:
@@ -65,6 +74,7 @@ class Recorder:
         self.output_dir = output_dir
         self.metrics = Metrics(None if output_dir is None else output_dir / METRICS_NAME)
         self.summary: dict[str, Any] = {}
+        self.training_return: float | None = None
         self._logger: LenientLogger | None = None
         self._resumed_from: Path | None = None  # the folder of the run that is continued
         self._ended: list[TensorDictBase] = []
@@ -143,7 +153,10 @@ class Recorder:
         if batch is None:
             return
         is_end = batch.get(("next", keys.DONE)).squeeze(-1)
-        self._ended.append(self._results(batch)[is_end])
+        ended = self._results(batch)[is_end]
+        self._ended.append(ended)
+        if len(ended):
+            self.training_return = ended[keys.EPISODE_RETURN].mean().item()
 
     def _results(self, steps: TensorDictBase) -> TensorDictBase:
         """Return the entries of steps `[*B]` to record at the end of an episode."""
@@ -185,30 +198,37 @@ class Recorder:
         self._scalars = {}
         return row
 
-    def finish(
-        self, frames: int, wall_s: float, cpu_s: float, *, is_finished: bool, stopped_by: str | None = None
-    ) -> str:
+    def scores_at_end(self, frames: int, wall_s: float, *, is_finished: bool) -> np.ndarray:
+        """Evaluate the agent as training left it, and return the scores `[episodes]`.
+
+        If training did not reach its end, the evaluation is the last row of the metrics.
+        """
+        if not is_finished and self._played is None:
+            self.log(frames, wall_s, is_evaluated=True, is_stopped=True)
+        return self._play()["score"]
+
+    def finish(self, frames: int, wall_s: float, cpu_s: float, ending: Mapping[str, Any], *, is_finished: bool) -> str:
         """Evaluate, write the summary and the figures, close the logger, and return the closing table as text.
 
         Args:
             frames: frames of training.
             wall_s: wall time of training; with `mode=eval`, the time of the evaluation replaces it.
             cpu_s: CPU time of training; likewise.
-            is_finished: whether training reached its end. Otherwise the evaluation is the last row of the metrics.
-            stopped_by: class of the callback that ended training, if one did.
+            ending: entries of the summary about the end of training: `stopped_by`, `kept_frames`, `score_at_end`.
+            is_finished: whether training reached its end.
         """
         if self.config.run.mode == "eval":
             wall_before, cpu_before = time.perf_counter(), time.process_time()
             self._play()
             wall_s, cpu_s = time.perf_counter() - wall_before, time.process_time() - cpu_before
-        if not is_finished and self._played is None:
-            self.log(frames, wall_s, is_evaluated=True, is_stopped=True)
+        if KEPT_FRAMES not in ending:
+            self.scores_at_end(frames, wall_s, is_finished=is_finished)
         played = self._play()
         measured = self.parts.evaluation.measure(played)
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
         env = self.parts.evaluation.problem
         summary = summarise(self.config, env, measured, self._random_scores, effort, is_finished=is_finished)
-        summary |= self._callback_metrics | ({} if stopped_by is None else {"stopped_by": stopped_by})
+        summary |= {**self._callback_metrics, **ending}
         if self.config.run.mode != "eval":
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
             summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])

@@ -23,12 +23,13 @@ from hpamdp.messages import LenientStream, first_line, warn
 from hpamdp.policies.base import Learner
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.callbacks import Callback, CallbackError, metrics_of, mistakes_explained, named, states_of
+from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, metrics_of, mistakes_explained, named, states_of
 from hpamdp.run.collection.base import Collection
 from hpamdp.run.folder import mark_unfinished, moved_aside
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.state_checks import check_numbers, example_steps
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
+from hpamdp.run.summary import KEPT_FRAMES, SCORE_AT_END
 from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
@@ -85,6 +86,8 @@ class Trainer:
         self.cpu_s = 0.0
         self.last_score: float | None = None
         self.is_evaluation_due = False
+        self._last_evaluation = "no evaluation yet"  # in the words of the bar
+        self._kept: dict[str, Any] = {}  # progress of the best agent, if the run ended with it
         self._saved: checkpoint.Saved | None = None  # what a resumed run continues from
         self.unit = " steps"
         if config.run.mode == "offline":
@@ -103,6 +106,8 @@ class Trainer:
         self.wall_s = progress["wall_s"]
         self.cpu_s = progress["cpu_s"]
         self.last_score = progress["last_score"]
+        if self.last_score is not None:
+            self._last_evaluation = f"score {self.last_score:.2f}"
         self.is_evaluation_due = progress.get("evaluation_due", False)
         if not is_training:
             saved.set_statistics(env)
@@ -174,11 +179,23 @@ class Trainer:
     def finish(self, *, is_finished: bool = True) -> str:
         """Evaluate the agent, write what the run has found, and return the closing table as text.
 
+        With `mode=train` and `save_best=true`, the agent first becomes that of the best evaluation, if it is clearly
+        worse now. `checkpoint.safetensors`, from which the run can be continued, stays.
+
         Args:
             is_finished: whether training reached its end.
         """
-        effort = self.frames, self.wall_s, self.cpu_s
-        return self.recorder.finish(*effort, is_finished=is_finished, stopped_by=self.stopped_by)
+        ending: dict[str, Any] = {} if self.stopped_by is None else {"stopped_by": self.stopped_by}
+        best = next((each for each in self.callbacks.values() if isinstance(each, BestAgent)), None)
+        if best is not None and self.config.run.mode == "train" and self.config.run.save_best:
+            scores = self.recorder.scores_at_end(self.frames, self.wall_s, is_finished=is_finished)
+            if best.is_clearly_better(scores):
+                best.restore(self)
+                ending |= {KEPT_FRAMES: best.best_frames, SCORE_AT_END: float(scores.mean())}
+                self._kept = {"frames": best.best_frames, "last_score": best.best_score}
+                if self.output_dir is not None:
+                    self.save_policy(self.output_dir / POLICY_NAME)
+        return self.recorder.finish(self.frames, self.wall_s, self.cpu_s, ending, is_finished=is_finished)
 
     def train(self) -> bool:
         """Train until `num_frames`, `eval.stop_score` or a callback ends it, and save the agent.
@@ -283,6 +300,7 @@ class Trainer:
                 self.frames += num
                 take_time()
                 bar.update(num)
+                self._show(bar)
                 self._call(lambda callback: callback.on_batch(self))
                 if self._is_over() or _is_due(last, self.frames, run.eval_every):
                     self._evaluate(bar)
@@ -294,6 +312,12 @@ class Trainer:
                     self.save(collection)
                     saved_at = time.monotonic()
             take_time()
+
+    def _show(self, bar: tqdm) -> None:
+        """Show the last batch's return and the last evaluation behind the bar, from its next refresh on."""
+        seen = self.recorder.training_return
+        texts = [f"return {seen:.2f}"] if seen is not None else []
+        bar.set_postfix_str(", ".join([*texts, self._last_evaluation]), refresh=False)
 
     def _learn(self, collection: Collection) -> int:
         """Let the agent learn from a batch of steps or from the data set, and return the number of frames.
@@ -330,7 +354,8 @@ class Trainer:
         row = self.recorder.log(self.frames, self.wall_s, is_evaluated=True, own=own)
         success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
         self.last_score = row["eval/score"]
-        bar.set_postfix_str(f"score {self.last_score:.2f}{success}")
+        self._last_evaluation = f"score {self.last_score:.2f}{success} at {tqdm.format_sizeof(self.frames)}"
+        self._show(bar)
         self._call(lambda callback: callback.on_evaluation(self, row))
         self.is_evaluation_due = False
 
@@ -383,15 +408,6 @@ class Trainer:
         saved.set_statistics(self.parts.env.base_env)
         self.recorder.forget_evaluation()
 
-    def score_in(self, file: Path) -> float | None:
-        """Return the score of the last evaluation before such a file was written; None if there was none.
-
-        Raises:
-            ConfigError: the file is damaged or not a checkpoint of this program.
-        """
-        score: float | None = checkpoint.progress_of(file)["last_score"]
-        return score
-
     def keep_for_inspection(self) -> str:
         """Save the current agent beside the last good checkpoint, and return a message about both files."""
         if self.output_dir is None:
@@ -415,6 +431,7 @@ class Trainer:
             "cpu_s": self.cpu_s,
             "last_score": self.last_score,
             "evaluation_due": self.is_evaluation_due,
+            **self._kept,
         }
 
 
