@@ -492,6 +492,9 @@ WITHOUT_FOLDER = {"folder": None}
         ({"save_best": True, **WITHOUT_FOLDER}, "save_best=true: writes files, so give the run a folder"),
         ({"overwrite": True, **WITHOUT_FOLDER}, "overwrite=True: has no effect without a folder; give folder, or"),
         ({"trust": True}, "trust=True: has no effect without a saved run; give resume, or leave it out"),
+        ({"low": {"name": "hppo", "gamma": 0.9}, "low.gamma": 0.9}, "low.gamma: given twice, as 0.9 and as 0.9"),
+        ({"low.per_option": {"a": "pets"}, "low.per_option.a.name": "hppo"}, "low.per_option.a: given twice"),
+        ({"env.grouping": None, "env.grouping.a": [0]}, "env.grouping: given twice, as None and as"),
     ],
 )
 def test_a_wrong_argument_of_train_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, arguments, message):
@@ -859,6 +862,7 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.make("office", human=True), "human=True: env=office has no human data"),
         (lambda: hpamdp.make("platform", device="cuda:9"), "device"),
         (lambda: hpamdp.make("hpamdp/Platform-v1"), r"no such problem .*; did you mean hpamdp/Platform-v0"),
+        (lambda: hpamdp.make("CartPole-v1", id="Acrobot-v1"), r"env\.id: given twice, as 'CartPole-v1' and as 'Acrob"),
         (lambda: hpamdp.make("platform", grouping={"up": ["hop", "hop"]}), "option up has an action twice: hop, hop"),
         (lambda: hpamdp.make("platform", grouping={"a b": [0]}), "the name 'a b' of an entry must be a text"),
         (lambda: hpamdp.make("platform", grouping={"up": "hop"}), 'env.grouping.up="hop": must be a list'),
@@ -930,10 +934,21 @@ def test_an_id_with_its_module_is_made_as_a_vector_and_its_arguments_are_named(t
         hpamdp.make_gymnasium("own_pole:OwnPole-v0", 2, render_mod="rgb_array")
 
 
-def test_of_a_setting_that_is_given_twice_the_last_value_counts_as_on_a_command_line():
-    assert hpamdp.make({"name": "platform", "max_steps": 5}, max_steps=7).max_steps == 7
-    agent = hpamdp.train("platform", low={"name": "hppo", "gamma": 0.9}, **{**TINY, "low.gamma": 0.8})
-    assert agent._config.low.settings["gamma"] == 0.8
+FIVE_STEPS = {"name": "platform", "max_steps": 5}
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: hpamdp.make(FIVE_STEPS, **{"env.max_steps": 7}),
+        lambda: hpamdp.make({"name": FIVE_STEPS, "max_steps": 7}),
+        lambda: hpamdp.train(FIVE_STEPS, max_steps=7),
+        lambda: hpamdp.load("hppo_platform").evaluate("platform", 2, max_steps=5, **{"env.max_steps": 7}),
+    ],
+)
+def test_a_setting_of_the_problem_that_is_given_twice_is_refused(call):
+    with pytest.raises(hpamdp.ConfigError, match=r"^(env\.)?max_steps: given twice, as [57] and as [57]; leave"):
+        call()
 
 
 def test_settings_change_those_that_a_built_problem_brings_along():

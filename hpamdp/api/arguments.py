@@ -21,7 +21,7 @@ from hpamdp.complaints import no_such
 from hpamdp.config.components import GROUPS, takes_settings_model
 from hpamdp.config.compose import choosing, conf_dir
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.outside_jobs import choosing_class
+from hpamdp.config.outside_jobs import choosing_class, given_twice
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import as_code, first_line
 
@@ -39,7 +39,7 @@ class Problem:
         words: the word of the command line that chooses it, if it is chosen.
         settings: its settings by their names on the command line.
         objects: arguments for its constructor, which no file can hold.
-        copied: the settings of a built problem, in whose place others may be given.
+        copied: the settings of a built problem. Unlike `settings`, they may be given once more with other values.
         num_envs: number of environments of a built problem; else None.
     """
 
@@ -102,8 +102,18 @@ def choices_and_settings(given: Mapping[str, Any]) -> tuple[list[str], list[tupl
 
 
 def without_env_prefix(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings of the problem without the `env.` that `train` writes before them."""
-    return {name.removeprefix("env."): value for name, value in settings.items()}
+    """Return settings of the problem without the `env.` that `train` writes before them.
+
+    Raises:
+        ConfigError: a setting is given twice.
+    """
+    plain: dict[str, Any] = {}
+    for name, value in settings.items():
+        own = name.removeprefix("env.")
+        if own in plain:
+            raise ConfigError(given_twice(own, plain[own], value))
+        plain[own] = value
+    return plain
 
 
 def _choice(group: str, value: Any) -> tuple[list[str], list[tuple[str, Any]]]:

@@ -65,7 +65,7 @@ def make(name: Any, num_envs: int | None = None, *, device: Any = "cpu", seed: i
             `oracle=True` and `human=True` add entries for players that need them.
 
     Raises:
-        ConfigError: there is no such problem, or a setting is wrong.
+        ConfigError: there is no such problem, or a setting is wrong or given twice.
 
     Example:
         >>> import hpamdp
@@ -107,7 +107,7 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         Gymnasium's default.
 
     Raises:
-        ConfigError: there is no such id or device, a package is missing, or a setting is wrong.
+        ConfigError: there is no such id or device, a package is missing, or a setting is wrong or given twice.
 
     Example:
         >>> import hpamdp

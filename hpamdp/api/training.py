@@ -80,8 +80,8 @@ def train(
             Settings of the problem may do without `env.`, as for `make`: `max_steps=50`.
 
     Raises:
-        ConfigError: a value is wrong, values do not go together, or the folder holds another run. Then nothing is
-            written.
+        ConfigError: a value is wrong or given twice, values do not go together, or the folder holds another run. Then
+            nothing is written.
         DivergedError: a reward, a loss or a weight is not finite.
         EnvironmentFaultError: the environment's own code raised an error, which is the cause.
         SystemExit: a worker process imports a script that calls this function outside `if __name__ == "__main__":`.

@@ -59,8 +59,8 @@ def composed(words: Sequence[str], settings: Iterable[tuple[str, Any]] = ()) -> 
         The config with its `hydra` part.
 
     Raises:
-        ConfigError: the words cannot be composed, or a setting does not exist or has no value that a yaml file can
-            hold.
+        ConfigError: the words cannot be composed, or a setting does not exist, has no value that a yaml file can hold,
+            or is given twice.
     """
     with own_hydra():
         cfg = _compose(words, conf_dir())
@@ -115,11 +115,10 @@ def _parsed(words: Sequence[str], conf: Path) -> CommandLine:
 def _change(cfg: DictConfig, settings: Iterable[tuple[str, Any]], conf: Path) -> None:
     """Change a composed config by settings from Python code, as Hydra changes it by the words of a command line.
 
-    Of a setting that is given twice, the last value counts, as on a command line.
-
     Raises:
-        ConfigError: a setting does not exist, or has no value that a yaml file can hold.
+        ConfigError: a setting does not exist, has no value that a yaml file can hold, or is given twice.
     """
+    given: dict[str, Any] = {}
     words = []
     for written, value in settings:
         name, is_new = written.lstrip("+"), written.startswith("+")
@@ -127,10 +126,12 @@ def _change(cfg: DictConfig, settings: Iterable[tuple[str, Any]], conf: Path) ->
             name = f"env.{name}"
         plain = plain_value(name, value)
         singles = dict(_single_values(name, plain))
-        for single in singles if not is_new else ():
-            wrong = missing_setting(cfg, single, conf)
+        for single, each in singles.items():
+            wrong = None if is_new else missing_setting(cfg, single, conf)
             if wrong is not None:
                 raise ConfigError(wrong)
+            _check_once(single, each, given)
+        given |= singles
         before = OmegaConf.select(cfg, name, throw_on_resolution_failure=False)
         has_entries = isinstance(before, DictConfig)  # of which a mapping changes some
         words += [f"{one}={as_json(each)}" for one, each in (singles if has_entries else {name: plain}).items()]
@@ -139,6 +140,16 @@ def _change(cfg: DictConfig, settings: Iterable[tuple[str, Any]], conf: Path) ->
         except OmegaConfBaseException as error:
             raise ConfigError(f"{name}={as_code(value)}: {first_line(error)}") from error
     cfg.hydra.overrides.task.extend(words)
+
+
+def _check_once(name: str, value: Any, given: Mapping[str, Any]) -> None:
+    """Refuse a setting that was given before, also one inside a mapping, such as `eval={"seed": 7}` and `eval.seed`.
+
+    On a command line the last word counts.
+    """
+    for earlier, first in given.items():
+        if f"{name}.".startswith(f"{earlier}.") or earlier.startswith(f"{name}."):
+            raise ConfigError(given_twice(min(name, earlier, key=len), first, value))
 
 
 def _single_values(name: str, value: Any) -> Iterator[tuple[str, Any]]:
@@ -191,6 +202,11 @@ def check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
             f"{sweep}: a sweep over {', '.join(swept)}, for the command line; to train one agent, give "
             f"{'it a value' if len(swept) == 1 else 'each of them a value'}"
         )
+
+
+def given_twice(name: str, first: Any, second: Any) -> str:
+    """Return the error for a setting that arguments give twice."""
+    return f"{name}: given twice, as {as_code(first)} and as {as_code(second)}; leave one out"
 
 
 def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list[str]:
