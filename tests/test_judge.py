@@ -11,8 +11,8 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.run.assemble import assemble
 from hpamdp.run.judge import judged
-from hpamdp.run.off_policy import RecordedProblem, starts_of
 from hpamdp.run.players import load_agent
+from hpamdp.run.recorded_problem import RecordedProblem, starts_of
 from hpamdp.run.train import run
 
 WORDS = ["data=human", "data.checksum=null", "offline.updates=400", "low.batch_size=32"]

@@ -153,7 +153,7 @@ def check_effects_on(problem: ProblemFacts, config: Config, words: Sequence[str]
 
 
 def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
-    """Return a warning for each word whose setting counts only with another value of another setting, or of the mode.
+    """Return a warning for each word whose setting has an effect only with another value of another setting or mode.
 
     A warning is enough: in a sweep, one command line serves several values of the other setting.
 
@@ -187,9 +187,9 @@ def marks_of(config: Config, name: str) -> tuple[list[Any], Mapping[str, Any]]:
 
 
 def _conditions(config: Config, name: str) -> list[str]:
-    """Return what a setting needs to count but does not have, such as `low.memory_size` without `low.memory`.
+    """Return the unmet conditions of a setting, for example `with memory=gru` for `low.memory_size`.
 
-    With `mode=offline`, a setting marked `OwnSteps` needs another mode, and nothing else is named.
+    With `mode=offline`, the only condition of a setting marked `OwnSteps` is another mode.
     """
     marks, settings = marks_of(config, name)
     if config.run.mode == "offline" and any(isinstance(mark, OwnSteps) for mark in marks):

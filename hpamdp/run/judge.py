@@ -19,8 +19,8 @@ from hpamdp.config.schema import Config
 from hpamdp.env.decisions import decision_tracker
 from hpamdp.messages import say
 from hpamdp.run.assemble import make_data, option_length
-from hpamdp.run.off_policy import RecordedProblem, Rollout, starts_of
 from hpamdp.run.players import LoadedAgent, add_config_dir, load_agent, whole_number, with_config_dirs
+from hpamdp.run.recorded_problem import RecordedProblem, Rollout, starts_of
 from hpamdp.specs import PAMDPSpecs
 
 DEFAULT_EPISODES = 100

@@ -14,9 +14,9 @@ Differs from the source:
   faster than the mean moves. This limit, the learning rate and the entropy bonus are annealed over `anneal_steps`, and
   so is an upper limit, if `max_scale_final` is set.
 - With `vector_products` actors and critic also see products of the vectors that the problem declares.
-- Where an exploration has taken another action than the policy's (`is_overruled`), the step has no part in the
-  surrogates. It counts in the values, and in the advantages of the steps before it. That is the policy gradient of the
-  return under both kinds of actions: the probability of the exploration's actions does not depend on the policy.
+- If an exploration takes another action than the policy's (`is_overruled`), the step has no part in the surrogates. It
+  counts in the values, and in the advantages of the steps before it. This is still an unbiased policy gradient, because
+  the policy does not affect when and how the exploration acts.
 - With `memory` actors and critic share a memory of the history. A recurrent one is trained on whole sequences, each
   from the state that was stored at its first step.
 
@@ -60,7 +60,7 @@ class HPPO(OnPolicy, Learner):
 
     Options = HPPOOptions
     card = CARDS["HPPO"]
-    # Waiting rows are of the run that sampled them, maybe on another problem.
+    # A new run does not take over rows that wait for an update: they may come from another problem.
     progress = Learner.progress | {"log_min_scale", "log_max_scale", WAITING}
 
     frames: Tensor
@@ -133,7 +133,7 @@ class HPPO(OnPolicy, Learner):
         rate = options.lr + progress * (options.lr_final - options.lr)
         for group, first_rate in zip(self.optimizer.param_groups, self.first_rates, strict=True):
             group["lr"] = rate * (first_rate / options.lr)
-        # A tensor, since code would be compiled again for another number.
+        # A tensor, because compiled code would be compiled again for each new number.
         left = 1.0 + progress * (options.entropy_final - 1.0)
         entropy_weight = torch.tensor(left, device=rows.device, dtype=torch.float32)
         steps = [self.gradient_step(self.loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]

@@ -1,7 +1,8 @@
 """Judge an agent without its environment: roll it out in a model of recorded transitions.
 
 The model is the ensemble of `low=pets`, fitted to transitions from which the agent has not learned. Every member rolls
-the agent out from starts of recorded episodes. An episode that ends with some probability counts on with the rest.
+the agent out from starts of recorded episodes. If a step terminates with probability p, what follows counts with weight
+1 - p.
 
 Source: model-based off-policy evaluation as in Fu et al. 2021, *Benchmarks for Deep Off-Policy Evaluation*, arXiv
 2103.16596; the members and TS-infinity of Chua et al. 2018, arXiv 1805.12114.
@@ -33,10 +34,10 @@ _IN_DATA = 0.95  # fraction of the data's own rows that coverage calls covered
 
 @dataclass(frozen=True)
 class Rollout:
-    """What a model predicts of an agent, for each start `[N]` the mean over the members.
+    """What a model predicts of an agent. Single numbers are means over starts and members.
 
     Attributes:
-        returns: undiscounted returns by each member, `[E, N]`.
+        returns: undiscounted returns from each start, by each member, `[E, N]`.
         steps: expected number of steps.
         coverage: fraction of the agent's actions that are like an action in the data, in a state like one there.
         unfinished: probability that an episode has not ended.
