@@ -263,6 +263,18 @@ def test_the_policy_samples_from_its_distribution():
     torch.testing.assert_close(td[RAW].std(0), torch.full((3,), 0.5), atol=0.02, rtol=0)
 
 
+def test_discrete_actions_without_parameters_are_learned_too():
+    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()))
+    for _ in range(15):
+        td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(512, 1, 4)}, [512, 1]))
+        is_end = torch.ones(512, 1, 1, dtype=torch.bool)
+        reward = (td[keys.DISCRETE] == 1).float().unsqueeze(-1)
+        td["next"] = {keys.OBSERVATION: td[keys.OBSERVATION], keys.REWARD: reward}
+        td["next"].update({keys.DONE: is_end, keys.TERMINATED: is_end})
+        learner.learn(td, everything(td))
+    assert td[keys.PARAMETERS].shape == (512, 1, 0) and reward.mean() > 0.95
+
+
 def test_the_critics_own_learning_rate_falls_with_that_of_the_actors():
     learner = make(anneal_steps=200, minibatch_size=2, critic_lr=3e-2)
     td = random_rows(learner, 50, 2)
