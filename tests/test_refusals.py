@@ -46,6 +46,10 @@ REFUSED = [
     ("high=value low=dlpa", "high=value: low=dlpa has no value to compare without low.end_values=true"),
     ("high=value low=random", "high=value: low=random has no value to compare; use another low or another high"),
     ("low.buffer_size=4 low.batch_size=64", "low: batch_size=64: must be at most buffer_size=4"),
+    (
+        "num_envs=1024 steps_per_batch=65536 total_frames=524288",
+        "steps_per_batch=65536: counts the steps of each of num_envs=1024, so a batch has 67,108,864",
+    ),
     ("low=pdqn low.n_step=5", "low.n_step=5: must be at most steps_per_batch=4, as sums of rewards end with a batch"),
     ("low=qpamdp low.sigma_final=5", "low: sigma_final=5.0: must be at most sigma=0.1"),
     ("low=dlpa low.horizon=10000000", "low: horizon=10000000, num_iterations=5, num_samples=256: a plan would try"),

@@ -31,6 +31,8 @@ from hpamdp.settings import OnlyWith, OwnSteps
 # The choice that picks a selector automatically, and the selector that it picks if there are options.
 AUTO_SELECTOR, DEFAULT_SELECTOR = "auto", "ucb"
 
+_LARGE_BATCH = 1_000_000  # steps that fit into memory, so that a run may be shorter than its batch
+
 # The encoder that encodes pictures if there are any.
 AUTO_ENCODER = "auto"
 
@@ -358,6 +360,12 @@ def _about_batches(config: Config) -> Iterator[str]:
         yield (
             f"low.n_step={n_step}: must be at most steps_per_batch={run.steps_per_batch}, as sums of rewards end with "
             "a batch"
+        )
+    batch = run.num_envs * run.steps_per_batch
+    if run.mode == "train" and batch > max(run.total_frames, _LARGE_BATCH):
+        yield (
+            f"steps_per_batch={run.steps_per_batch}: counts the steps of each of num_envs={run.num_envs}, so a batch has "
+            f"{batch:,}, more than total_frames={run.total_frames}"
         )
     if run.mode == "offline" and collector.card.has_workers:
         yield f"{collector}: mode=offline takes no steps; use collector=single"
