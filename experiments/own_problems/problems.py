@@ -1,0 +1,367 @@
+"""Six problems of the kinds that people have at work, as Gymnasium environments in plain Python.
+
+Each action is a choice together with a number: which supplier and how much, which mode and which power. Rewards and
+observations have their natural units. `optimum.py` computes the best return of each by dynamic programming.
+
+The rules of a problem are one function that takes floats or arrays: the environment calls it with floats, the dynamic
+programme with arrays.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete, Space, Tuple
+
+# A number of a state, or the numbers of many states.
+Value = Any
+
+
+class OwnProblem(gymnasium.Env):
+    """Base class: a state of two numbers, a time limit, and a random event at every step.
+
+    Attributes:
+        steps: steps of an episode, after which it is truncated.
+        events: what may happen at a step, each with the same probability.
+        grid: values of both numbers of the state for the dynamic programme.
+        limits: largest number of each choice; 0 if the choice takes no number.
+    """
+
+    steps: ClassVar[int]
+    events: ClassVar[tuple[Any, ...]]
+    grid: ClassVar[tuple[np.ndarray, np.ndarray]]
+    limits: ClassVar[tuple[float, ...]]
+
+    def __init__(self) -> None:
+        self.action_space: Space = Tuple((Discrete(len(self.limits)), Box(0.0, 1.0, (1,))))
+        self.time = 0
+        self.state: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return the state at the beginning of an episode."""
+        raise NotImplementedError
+
+    @classmethod
+    def rules(
+        cls, time: int, state: tuple[Value, Value], choice: int, amount: Value, event: Any
+    ) -> tuple[tuple[Value, Value], Value, Value]:
+        """Return the next state, the reward and whether the episode terminates.
+
+        Args:
+            time: steps so far.
+            state: the two numbers of the state.
+            choice: number of the choice.
+            amount: of the choice, from 0 to its limit.
+            event: one of `events`.
+        """
+        raise NotImplementedError
+
+    def observe(self) -> Any:
+        """Return the observation of the state."""
+        raise NotImplementedError
+
+    def read(self, action: Any) -> tuple[int, float]:
+        """Return the choice and its amount, given an action of the space: a fraction of its limit."""
+        choice = int(action[0])
+        return choice, float(action[1][0]) * self.limits[choice]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        super().reset(seed=seed)
+        self.time = 0
+        self.state = self.start(self.np_random)
+        return self.observe(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take a step."""
+        event = self.events[self.np_random.integers(len(self.events))]
+        self.state, reward, is_over = self.rules(self.time, self.state, *self.read(action), event)
+        self.time += 1
+        return self.observe(), float(reward), bool(is_over), self.time >= self.steps, {}
+
+
+class Battery(OwnProblem):
+    """A battery at the grid for a day of half hours: idle, charge or discharge, with a power in kW.
+
+    State: energy in kWh, deviation of the price in EUR/kWh. The bounds of the power depend on the energy; the
+    environment gives them with the observation. Reward: EUR.
+    """
+
+    steps = 48
+    events = (-0.03, -0.01, 0.01, 0.03)
+    grid = (np.linspace(0.0, 10.0, 41), np.linspace(-0.15, 0.15, 13))
+    limits = (0.0, 5.0, 5.0)
+    prices = tuple(
+        0.2 + 0.06 * math.sin(2 * math.pi * (t - 15) / 24) + 0.04 * math.sin(math.pi * t / 48) for t in range(49)
+    )
+
+    def __init__(self) -> None:
+        super().__init__()
+        power = Box(0.0, 5.0, (1,))
+        self.action_space = Tuple((Discrete(3), Tuple((Box(0.0, 0.0, (0,)), power, power))))
+        bounds = Box(0.0, 5.0, (2,))
+        low, high = np.array([0.0, 0.0, 0.0], np.float32), np.array([10.0, 1.0, 48.0], np.float32)
+        self.observation_space = Dict(state=Box(low, high), parameter_low=bounds, parameter_high=bounds)
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return a battery that is less than half full."""
+        return float(rng.uniform(0.0, 5.0)), 0.0
+
+    @classmethod
+    def rules(cls, time, state, choice, amount, event):
+        """Return what a power brings; energy that is left at the end of the day is worth 0.15 EUR/kWh."""
+        energy, deviation = state
+        price = cls.prices[time] + deviation
+        if choice == 1:
+            power = np.minimum(amount, (10.0 - energy) / 0.475)
+            energy = energy + 0.475 * power
+            reward = -0.5 * power * (price + 0.015) - 0.01
+        elif choice == 2:
+            power = np.minimum(amount, energy * 1.9)
+            energy = energy - power / 1.9
+            reward = 0.5 * power * (price - 0.015) - 0.01
+        else:
+            reward = 0.0 * energy
+        if time == cls.steps - 1:
+            reward = reward + 0.15 * energy
+        return (energy, np.clip(0.8 * deviation + event, -0.15, 0.15)), reward, False
+
+    def read(self, action: Any) -> tuple[int, float]:
+        """Return the choice and its power."""
+        choice = int(action[0])
+        return choice, float(action[1][choice][0]) if choice else 0.0
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """Return energy, price, half hour, and the bounds of the powers."""
+        energy, deviation = self.state
+        highest = [min(5.0, (10.0 - energy) / 0.475), min(5.0, energy * 1.9)]
+        return {
+            "state": np.array([energy, self.prices[self.time] + deviation, self.time], np.float32),
+            "parameter_low": np.zeros(2, np.float32),
+            "parameter_high": np.clip(np.array(highest, np.float32), 0.0, 5.0),
+        }
+
+
+class Inventory(OwnProblem):
+    """A stock for 60 days: wait, or order from a cheap supplier for large orders or a quick one for small ones.
+
+    State: units in stock, level of the demand in units a day. Reward: EUR.
+    """
+
+    steps = 60
+    events = tuple((drift, factor) for drift in (-2.0, 0.0, 2.0) for factor in (0.6, 1.0, 1.4))
+    grid = (np.linspace(0.0, 200.0, 101), np.linspace(8.0, 32.0, 9))
+    limits = (0.0, 100.0, 30.0)
+    fixed, unit = (0.0, 90.0, 10.0), (0.0, 5.0, 7.0)
+    week = (1.0, 0.8, 0.8, 1.0, 1.4, 1.7, 0.3)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = Box(-np.inf, np.inf, (3,))
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return a stock of about two days."""
+        return float(rng.uniform(20.0, 60.0)), 20.0
+
+    @classmethod
+    def rules(cls, time, state, choice, amount, event):
+        """Return sales less purchases, storage and lost sales; a unit is worth 4 EUR at the end."""
+        stock, level = state
+        drift, factor = event
+        demand = level * cls.week[time % 7] * factor
+        stock = stock + amount
+        sold = np.minimum(stock, demand)
+        stock = np.minimum(stock - sold, 200.0)
+        reward = 10.0 * sold - cls.fixed[choice] - cls.unit[choice] * amount - 0.1 * stock - 2.0 * (demand - sold)
+        if time == cls.steps - 1:
+            reward = reward + 4.0 * stock
+        return (stock, np.clip(20.0 + 0.9 * (level - 20.0) + drift, 8.0, 32.0)), reward, False
+
+    def observe(self) -> np.ndarray:
+        """Return stock, level of the demand and day."""
+        return np.array([*self.state, self.time], np.float32)
+
+
+class Heating(OwnProblem):
+    """A house for a day of quarter hours: off, the heat pump or the electric heater, with a power.
+
+    State: temperature inside and deviation of the one outside in °C. Reward: EUR, with 0.02 EUR for each °C² of
+    discomfort in a quarter hour while somebody is at home.
+    """
+
+    steps = 96
+    events = (-0.6, -0.2, 0.2, 0.6)
+    grid = (np.linspace(5.0, 30.0, 76), np.linspace(-5.0, 5.0, 9))
+    limits = (0.0, 3.0, 6.0)
+    outside = tuple(2.0 + 4.0 * math.sin(2 * math.pi * (t - 36) / 96) for t in range(97))
+    tariff = tuple(0.15 if t < 24 or t >= 88 else 0.45 if 68 <= t < 80 else 0.3 for t in range(97))
+    is_home = tuple(24 <= t < 36 or t >= 64 for t in range(97))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.action_space = Dict(mode=Discrete(3), power=Box(0.0, 1.0, (1,)))
+        low, high = (
+            np.array([5.0, -20.0, 0.0, 0.0, 0.0], np.float32),
+            np.array([30.0, 40.0, 1.0, 96.0, 1.0], np.float32),
+        )
+        self.observation_space = Box(low, high)
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return a house that is a little cold."""
+        return float(rng.uniform(15.0, 20.0)), float(rng.uniform(-3.0, 3.0))
+
+    @classmethod
+    def rules(cls, time, state, choice, amount, event):
+        """Return what heat costs, and the discomfort."""
+        inside, deviation = state
+        outside = cls.outside[time] + deviation
+        heat = amount * (2.5 + 0.08 * outside) if choice == 1 else amount
+        inside = np.clip(inside + 0.25 * (heat - 0.25 * (inside - outside)) / 2.0, 5.0, 30.0)
+        reward = -0.25 * cls.tariff[time] * amount - (0.02 if choice == 1 else 0.0)
+        if cls.is_home[time]:
+            reward = reward - 0.02 * (inside - 21.0) ** 2
+        return (inside, np.clip(0.95 * deviation + event, -5.0, 5.0)), reward, False
+
+    def read(self, action: Any) -> tuple[int, float]:
+        """Return the mode and its power."""
+        return super().read((action["mode"], action["power"]))
+
+    def observe(self) -> np.ndarray:
+        """Return both temperatures, tariff, quarter hour, and whether somebody is at home."""
+        inside, deviation = self.state
+        time = self.time
+        seen = [inside, self.outside[time] + deviation, self.tariff[time], time, self.is_home[time]]
+        return np.array(seen, np.float32)
+
+
+class Queue(OwnProblem):
+    """A service for 100 quarter hours: admit all, admit half, or call a second crew, with the speed of the first one.
+
+    State: customers who wait, rate of arrivals. Reward: EUR.
+    """
+
+    steps = 100
+    events = tuple((drift, factor) for drift in (-0.5, 0.5) for factor in (0.5, 1.0, 1.5))
+    grid = (np.concatenate([np.linspace(0.0, 40.0, 41), np.linspace(45.0, 200.0, 32)]), np.linspace(2.0, 14.0, 9))
+    limits = (10.0, 10.0, 10.0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = Box(0.0, 1000.0, (3,))
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return a short queue."""
+        return float(rng.uniform(0.0, 20.0)), float(rng.uniform(4.0, 10.0))
+
+    @classmethod
+    def rules(cls, time, state, choice, amount, event):
+        """Return what customers pay, less the cost of speed, of waiting and of a second crew."""
+        queue, rate = state
+        drift, factor = event
+        admitted = rate * factor * (0.5 if choice == 1 else 1.0)
+        served = np.minimum(queue + admitted, amount + (8.0 if choice == 2 else 0.0))
+        queue = np.minimum(queue + admitted - served, 200.0)
+        reward = 10.0 * served - 0.6 * amount**2 - 0.5 * queue - 0.02 * queue**2 - (50.0 if choice == 2 else 0.0)
+        mean = 7.0 + 3.0 * math.sin(2 * math.pi * time / 50)
+        return (queue, np.clip(rate + 0.2 * (mean - rate) + drift, 2.0, 14.0)), reward, False
+
+    def observe(self) -> np.ndarray:
+        """Return the queue, the rate of arrivals and the quarter hour."""
+        return np.array([*self.state, self.time], np.float32)
+
+
+class Irrigation(OwnProblem):
+    """A field for a season of 120 days: nothing, drip or sprinkler, with mm of water. The harvest is paid at the end.
+
+    State: moisture of the soil in mm, crop in t/ha. Reward: EUR/ha.
+    """
+
+    steps = 120
+    events = (0.0, 0.0, 0.0, 0.0, 4.0, 14.0)
+    grid = (np.linspace(0.0, 100.0, 51), np.linspace(0.0, 12.0, 49))
+    limits = (0.0, 8.0, 25.0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = Box(0.0, np.inf, (3,))
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return a field in spring."""
+        return float(rng.uniform(30.0, 70.0)), 0.3
+
+    @classmethod
+    def rules(cls, time, state, choice, amount, event):
+        """Return the cost of water, and at the end the value of the harvest, 250 EUR/t."""
+        moisture, crop = state
+        need = 3.0 + 2.0 * math.sin(math.pi * time / 120)
+        water = amount * (0.0, 0.95, 0.75)[choice]
+        moisture = np.clip(moisture + water + event - need, 0.0, 100.0)
+        health = np.exp(-(((moisture - 60.0) / 25.0) ** 2))
+        crop = crop + 0.09 * crop * (1.0 - crop / 12.0) * health
+        reward = -1.2 * amount if choice == 1 else -0.7 * amount - (12.0 if choice == 2 else 0.0)
+        if time == cls.steps - 1:
+            reward = reward + 250.0 * crop
+        return (moisture, crop), reward, False
+
+    def observe(self) -> np.ndarray:
+        """Return moisture, crop and day."""
+        return np.array([*self.state, self.time], np.float32)
+
+
+class Vehicle(OwnProblem):
+    """A vehicle on 2 km of hills with a slow zone: coast, accelerate or brake, each second, with a strength.
+
+    State: position in m, speed in m/s. Reward: seconds, energy, fines and the speed at the end, in one unit.
+    """
+
+    steps = 200
+    events = (-0.1, 0.1)
+    grid = (np.linspace(0.0, 2000.0, 161), np.linspace(0.0, 35.0, 51))
+    limits = (0.0, 2.0, 4.0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = Box(0.0, np.array([2000.0, 35.0, 2000.0], np.float32), (3,))
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return a vehicle near the beginning."""
+        return float(rng.uniform(0.0, 200.0)), float(rng.uniform(0.0, 15.0))
+
+    @classmethod
+    def rules(cls, time, state, choice, amount, event):
+        """Return time, energy and fines. Braking hard at the end is necessary: arriving fast costs its square."""
+        position, speed = state
+        push = amount if choice == 1 else -amount
+        slope = 0.4 * np.sin(2 * np.pi * position / 700.0)
+        after = np.clip(speed + push - slope - 0.0008 * speed**2 + event, 0.0, 35.0)
+        is_slow = (position > 800.0) & (position < 1200.0)
+        excess = np.maximum(after - np.where(is_slow, 14.0, 25.0), 0.0)
+        position = np.minimum(position + 0.5 * (speed + after), 2000.0)
+        is_over = position >= 2000.0
+        reward = -1.0 - (0.04 * amount * speed if choice == 1 else 0.0) - 0.5 * excess**2
+        reward = reward - np.where(is_over, 0.2 * after**2, 0.0)
+        if time == cls.steps - 1:
+            reward = reward - 0.1 * (2000.0 - position)
+        return (position, after), reward, is_over
+
+    def observe(self) -> np.ndarray:
+        """Return position, speed, and the distance to the slow zone, 0 in it and after it."""
+        position, speed = self.state
+        return np.array([position, speed, max(800.0 - position, 0.0)], np.float32)
+
+
+TUNED: dict[str, type[OwnProblem]] = {"battery": Battery, "inventory": Inventory, "heating": Heating}
+HELD: dict[str, type[OwnProblem]] = {"queue": Queue, "irrigation": Irrigation, "vehicle": Vehicle}
+PROBLEMS = TUNED | HELD
+EPISODES = 64
+EPISODE_SEEDS = tuple(range(900_000, 900_000 + EPISODES))  # of the fixed episodes on which all players are scored

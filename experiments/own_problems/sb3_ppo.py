@@ -1,0 +1,102 @@
+"""Train Stable-Baselines3's PPO, with its defaults, on the flattened Box.
+
+python experiments/own_problems/sb3_ppo.py PROBLEM raw|normalised SEED FILE CPU_SECONDS
+    writes the curve to a csv file.
+
+The action is one Box: a score for each choice beside all numbers; the largest score chooses. `normalised` wraps the
+environment in VecNormalize, which scales observations and rewards.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, flatten, flatten_space
+from problems import EPISODE_SEEDS, PROBLEMS
+from protocol import Clock
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+
+class Flat(gymnasium.Wrapper):
+    """Flattens observations, and takes scores of the choices beside numbers from -1 to 1, as SB3 advises."""
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        space = env.action_space
+        choice, numbers = (space["mode"], space["power"]) if "mode" in getattr(space, "spaces", ()) else space.spaces
+        self.num_choices = int(choice.n)
+        self.boxes = numbers.spaces if hasattr(numbers, "spaces") else [numbers]
+        self.is_shared = numbers is self.boxes[0]
+        num_numbers = sum(box.shape[0] for box in self.boxes)
+        self.action_space = Box(-1.0, 1.0, (self.num_choices + num_numbers,), np.float32)
+        self.observation_space = flatten_space(env.observation_space)
+
+    def reset(self, **given):
+        observation, info = self.env.reset(**given)
+        return flatten(self.env.observation_space, observation), info
+
+    def step(self, action):
+        choice = int(np.argmax(action[: self.num_choices]))
+        numbers, start = [], self.num_choices
+        for box in self.boxes:
+            end = start + box.shape[0]
+            numbers.append(box.low + 0.5 * (action[start:end] + 1.0) * (box.high - box.low))
+            start = end
+        amount = numbers[0] if self.is_shared else tuple(numbers)
+        is_dict = isinstance(self.env.action_space, gymnasium.spaces.Dict)
+        observation, *others = self.env.step({"mode": choice, "power": amount} if is_dict else (choice, amount))
+        return flatten(self.env.observation_space, observation), *others
+
+
+class Scorer(BaseCallback):
+    """Score the agent while it learns, and end training when its time is over."""
+
+    def __init__(self, name: dict, file: Path, limit: float) -> None:
+        super().__init__()
+        self.envs = [Flat(PROBLEMS[name["problem"]]()) for _ in EPISODE_SEEDS]
+        self.clock = Clock(self.score, name, file, limit)
+
+    def score(self) -> float:
+        """Return the mean return of the greedy agent in the fixed episodes."""
+        seen = np.stack([env.reset(seed=seed)[0] for env, seed in zip(self.envs, EPISODE_SEEDS, strict=True)])
+        total, is_running = np.zeros(len(seen)), np.ones(len(seen), bool)
+        while is_running.any():
+            scaled = self.training_env.normalize_obs(seen) if isinstance(self.training_env, VecNormalize) else seen
+            actions, _ = self.model.predict(scaled, deterministic=True)
+            for row in np.flatnonzero(is_running):
+                seen[row], reward, terminated, truncated, _ = self.envs[row].step(actions[row])
+                total[row] += reward
+                is_running[row] = not (terminated or truncated)
+        return float(total.mean())
+
+    def _on_step(self) -> bool:
+        # Between two updates, as the learners of hpamdp are scored.
+        is_between = self.num_timesteps % self.model.n_steps == 1 and self.num_timesteps > 1
+        return not (is_between and self.clock.after(self.num_timesteps))
+
+    def end(self) -> None:
+        """Score the last agent, and write the file."""
+        self.clock.after(self.num_timesteps, is_over=True)
+        self.clock.write()
+
+
+def main(problem: str, form: str, seed: int, file: Path, limit: float) -> None:
+    """Train and score."""
+    env = DummyVecEnv([lambda: Monitor(Flat(PROBLEMS[problem]()))])
+    if form == "normalised":
+        env = VecNormalize(env)
+    name = {"problem": problem, "library": "sb3", "player": f"ppo {form}", "seed": seed, "limit_s": limit}
+    scorer = Scorer(name, file, limit)
+    PPO("MlpPolicy", env, seed=seed, device="cpu").learn(10**9, callback=scorer)
+    scorer.end()
+
+
+if __name__ == "__main__":
+    problem, form, seed, file, seconds = sys.argv[1:]
+    main(problem, form, int(seed), Path(file), float(seconds))

@@ -1,0 +1,132 @@
+"""Tabulate and draw hpamdp with its defaults beside PPO of Stable-Baselines3, against CPU seconds.
+
+python experiments/own_problems/study.py FOLDER    gathers the curves in the folder into curves.csv, then tabulates
+python experiments/own_problems/study.py           tabulates the stored csv file
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from hpamdp.analysis.study import (
+    Rows,
+    first_at,
+    groups,
+    markdown_table,
+    mean_of,
+    read_csv,
+    refuse_repeats,
+    spread,
+    write_tables,
+)
+from hpamdp.figure_style import FAINT, INK, LEARNER_COLOURS, STYLE
+from hpamdp.messages import exit_code
+
+HERE = Path(__file__).resolve().parent
+NAME = ("problem", "library", "player", "seed")
+LEVEL = 0.8  # of the way from random play to the best policy
+TIMES = (15.0, 30.0, 60.0, 120.0)  # columns of the table, CPU seconds
+COLOURS = {"ppo raw": FAINT, "ppo normalised": INK}
+
+
+def gather(folder: Path, order: Sequence[str]) -> Rows:
+    """Return the rows of all curves in the folder, in the order of problems, players and seeds.
+
+    Raises:
+        SystemExit: two files are of one run.
+    """
+    rows = [row for file in sorted(folder.glob("*.csv")) for row in read_csv(file)]
+    refuse_repeats(rows, (*NAME, "cpu_s"), NAME)
+    return sorted(rows, key=lambda row: (order.index(row["problem"]), row["library"], row["player"], row["seed"]))
+
+
+def way_at(run: Rows, cpu_s: float) -> float:
+    """Return the way at a mark. Before its first mark a run has made none; one that has ended keeps its last agent."""
+    return next((row["way"] for row in reversed(run) if row["mark"] <= cpu_s), 0.0)
+
+
+def seconds_to(run: Rows, level: float) -> float:
+    """Return the CPU seconds of the first score of at least `level`; infinity if there is none."""
+    first = first_at(run, "way", level)
+    return float("inf") if first is None else first["cpu_s"]
+
+
+def median(values: Sequence[float]) -> float:
+    """Return the upper median, which may be infinite."""
+    return sorted(values)[len(values) // 2]
+
+
+def seconds_text(seconds: float) -> str:
+    """Return seconds as text; `none` if they are infinite."""
+    return "none" if seconds == float("inf") else f"{seconds:.0f} s"
+
+
+def table(curves: Rows, optima: Rows) -> str:
+    """Return a line for each problem and player."""
+    longest = max(row["limit_s"] for row in curves)
+    times = [time for time in TIMES if time <= longest]
+    parts = {row["problem"]: row["part"] for row in optima}
+    lines = []
+    for (problem, library, player), rows in groups(curves, *NAME[:3]).items():
+        runs = list(groups(rows, "seed").values())
+        cells = [problem, parts[problem], f"{library} {player}", len(runs)]
+        cells += [spread([way_at(run, time) for run in runs], 2) for time in times]
+        cells.append(seconds_text(median([seconds_to(run, LEVEL) for run in runs])))
+        lines.append([*cells, f"{mean_of([run[-1] for run in runs], 'steps'):,.0f}"])
+    after = " | ".join(f"{time:g} s" for time in times)
+    return markdown_table(
+        f"problem | part | player | seeds | {after} | to {LEVEL:g} of the way | steps at the end", lines
+    )
+
+
+def optima_table(optima: Rows) -> str:
+    """Return a line for each problem with the returns of random play and of the best policy."""
+    lines = [[row["problem"], row["part"], f"{row['random']:,.2f}", f"{row['best']:,.2f}"] for row in optima]
+    return markdown_table("problem | part | return of random play | of the best policy", lines)
+
+
+def draw(curves: Rows, path: Path) -> None:
+    """Draw a panel for each problem, with a line for each seed."""
+    problems = groups(curves, "problem")
+    with rc_context(STYLE):
+        figure = Figure(figsize=(9.2, 5.4), layout="constrained")
+        panels = figure.subplots(2, -(-len(problems) // 2), sharex=True, sharey=True, squeeze=False).flat
+        for axes, ((problem,), rows) in zip(panels, problems.items(), strict=False):
+            for (library, player), of_player in groups(rows, "library", "player").items():
+                colour = COLOURS.get(player) or LEARNER_COLOURS[player.split()[0]]
+                for number, run in enumerate(groups(of_player, "seed").values()):
+                    label = f"{library} {player}" if number == 0 else None
+                    style = "-" if library == "hpamdp" else "--"
+                    at_s, ways = [row["cpu_s"] for row in run], [row["way"] for row in run]
+                    axes.plot(at_s, ways, color=colour, linestyle=style, linewidth=1.1, label=label)
+            axes.set_title(problem)
+            axes.set_xscale("log")
+            axes.set_ylim(-0.1, 1.05)
+            axes.xaxis.set_major_locator(FixedLocator([5, 10, 20, 30, 60, 120]))
+            axes.xaxis.set_minor_locator(NullLocator())
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        figure.axes[0].legend(frameon=False, fontsize=8, loc="lower right")
+        figure.supxlabel("CPU seconds since the start of the program")
+        figure.supylabel("way from random play to the best policy")
+        figure.savefig(path)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Gather, draw, tabulate."""
+    optima = read_csv(HERE / "optima.csv")
+    if arguments:
+        order = [row["problem"] for row in optima]
+        write_tables(HERE, {"curves": gather(Path(arguments[0]), order)})
+    curves = read_csv(HERE / "curves.csv")
+    draw(curves, HERE / "curves.png")
+    print(table(curves, optima), optima_table(optima), sep="\n\n")
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))
