@@ -81,13 +81,14 @@ def of_usual_length(rows: Rows, low: str) -> Rows:
 
 def table(rows: Rows) -> str:
     """Return the map: mean score and number of seeds of each selector over each learner."""
-    lines = ["| learner | presses | " + " | ".join(SELECTORS) + " |", "|---" * (len(SELECTORS) + 2) + "|"]
+    selectors = [high for high in SELECTORS if any(row["high"] == high for row in rows)]
+    lines = ["| learner | presses | " + " | ".join(selectors) + " |", "|---" * (len(selectors) + 2) + "|"]
     for low in LEARNERS:
         runs = of_usual_length(rows, low)
         if not runs:
             continue
         cells = []
-        for high in SELECTORS:
+        for high in selectors:
             scores = [row["score"] for row in runs if row["high"] == high]
             agreement = [row["agreement"] for row in runs if row["high"] == high]
             cells.append(f"{spread(scores, 2)}, {np.mean(agreement):.0%} ({len(scores)})" if scores else "-")
