@@ -126,6 +126,12 @@ def test_a_best_agent_is_clearly_better_beyond_two_standard_errors(best_score, i
     assert best.is_clearly_better(np.array([0.4, 0.6] * 100)) is is_better
 
 
+def test_one_episode_does_not_tell_whether_a_best_agent_is_clearly_better():
+    best = BestAgent()
+    best.best_score = 9.0
+    assert not best.is_clearly_better(np.array([0.4]))
+
+
 def test_the_best_agent_stays_in_memory_if_the_run_has_no_folder(scores):
     scores += [0.0, 3.0, 1.0, 2.0]
     best, weights = BestAgent(), []
@@ -151,6 +157,16 @@ def test_a_callback_may_be_used_for_another_run(scores):
     patience, best = Patience(evaluations=2), BestAgent()
     assert (train(patience, best).frames, best.best_score) == (64, 9.0)
     assert (train(patience, best, words=[*SMALL, "total_frames=32"]).frames, best.best_score) == (32, 1.0)
+
+
+def test_a_best_agent_of_a_second_run_in_a_folder_is_not_that_of_the_first_in_memory(scores, tmp_path):
+    scores += [0.0, *itertools.repeat(9.0, 20)]
+    best, words = BestAgent(), [*PLATFORM, "total_frames=32"]
+    train(best, words=words)
+    trainer = train(best, words=words, folder=tmp_path)
+    best.restore(trainer)
+    kept = tensors_in(tmp_path / "best.safetensors")
+    assert all(torch.equal(value, trainer.parts.agent.state_dict()[name]) for name, value in kept.items())
 
 
 def test_metrics_of_ones_own_are_columns_of_every_row_and_part_of_the_summary(tmp_path):

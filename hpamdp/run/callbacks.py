@@ -102,6 +102,7 @@ class BestAgent(Callback):
 
     def on_start(self, trainer: Trainer) -> None:
         """Take over the best agent of the resumed run, which a killed run may have saved after its checkpoint."""
+        self._file = self._kept = None  # of an earlier run
         if trainer.resumed_from is None:
             self.best_score = self.best_frames = None
             return
@@ -138,6 +139,8 @@ class BestAgent(Callback):
 
         That is more than two standard errors of a difference of two such evaluations.
         """
+        if len(scores) < 2:  # one episode tells no standard error
+            return False
         error = math.sqrt(2.0 / len(scores)) * float(scores.std())
         return self.best_score is not None and self.best_score > float(scores.mean()) + 2.0 * error
 
