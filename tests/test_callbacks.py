@@ -169,6 +169,12 @@ def test_a_best_agent_of_a_second_run_in_a_folder_is_not_that_of_the_first_in_me
     assert all(torch.equal(value, trainer.parts.agent.state_dict()[name]) for name, value in kept.items())
 
 
+@pytest.mark.parametrize(("callback", "name"), [(Patience, "evaluations"), (TimeLimit, "minutes")])
+def test_a_setting_given_by_position_and_by_name_is_refused(callback, name):
+    with pytest.raises(TypeError, match=rf"{callback.__name__}: {name} is given twice, as 3 and as 4"):
+        callback(3, **{name: 4})
+
+
 def test_metrics_of_ones_own_are_columns_of_every_row_and_part_of_the_summary(tmp_path):
     folder = tmp_path / "run"
     own = OwnMetrics(lambda trainer: {"frames": trainer.frames, "tensor": torch.tensor(2), "flag": True})

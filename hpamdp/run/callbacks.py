@@ -182,7 +182,7 @@ class Patience(Callback):
 
     def __init__(self, options: PatienceOptions | int | None = None, **settings: Any) -> None:
         if isinstance(options, int):
-            options, settings = None, {"evaluations": options, **settings}
+            options, settings = None, _with_first(self, "evaluations", options, settings)
         self.options: PatienceOptions = PatienceOptions.of(options, settings)
         self._best = -math.inf
         self._evaluations = 0  # since the last improvement
@@ -228,7 +228,7 @@ class TimeLimit(Callback):
 
     def __init__(self, options: TimeLimitOptions | float | None = None, **settings: Any) -> None:
         if isinstance(options, int | float):
-            options, settings = None, {"minutes": options, **settings}
+            options, settings = None, _with_first(self, "minutes", options, settings)
         self.options: TimeLimitOptions = TimeLimitOptions.of(options, settings)
 
     def on_start(self, trainer: Trainer) -> None:
@@ -239,6 +239,19 @@ class TimeLimit(Callback):
         """End training if its time is over."""
         if trainer.wall_s >= 60.0 * self.options.minutes:
             trainer.stop(f"{self.options.minutes:g} minutes are over")
+
+
+def _with_first(callback: Callback, name: str, value: float, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings by name together with the first one, which was given by position.
+
+    Raises:
+        TypeError: the first one is among the others, too.
+    """
+    if name in settings:
+        raise TypeError(
+            f"{type(callback).__name__}: {name} is given twice, as {as_code(value)} and as {as_code(settings[name])}"
+        )
+    return {name: value, **settings}
 
 
 class OwnMetrics(Callback):
