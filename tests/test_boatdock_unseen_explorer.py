@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 import torch
+from scripts import load_script
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env.boatdock.task import TANK
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
-from hpamdp.env.boatdock_unseen.explorer import Explorer
 from hpamdp.env.boatdock_unseen.planner import best_plan
 
+EXPLORER = Path(__file__).parents[1] / "experiments/generalisation/explorer.py"
 
-def explorer_for(env: UnseenBoatsEnv) -> Explorer:
+
+def explorer_for(env: UnseenBoatsEnv) -> Any:
     options = env.options
-    return Explorer(
+    return load_script(EXPLORER).Explorer(
         env.num_envs,
         options.fleet,
         num_boats=options.boats,
@@ -24,7 +29,7 @@ def explorer_for(env: UnseenBoatsEnv) -> Explorer:
     )
 
 
-def press(env: UnseenBoatsEnv, explorer: Explorer) -> Tensor | None:
+def press(env: UnseenBoatsEnv, explorer: Any) -> Tensor | None:
     """Let the player press once and return the boats that it chose."""
     td = env.read()
     boat, key, duration = explorer.act(td[keys.OBSERVATION])
@@ -86,7 +91,7 @@ def test_with_two_boats_both_are_tried_and_then_the_better_one_is_taken():
     assert (ceilings - scores)[:, 2:].mean().abs() < 0.05
 
 
-def known_after(env: UnseenBoatsEnv, presses: list[tuple[int, float]]) -> Explorer:
+def known_after(env: UnseenBoatsEnv, presses: list[tuple[int, float]]) -> Any:
     """Return a player that has seen these presses of the first boat, (key, seconds)."""
     env.reset()
     explorer = explorer_for(env)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import synthetic_human
 import torch
+from scripts import load_script
 
 from hpamdp.data.human import statistics, validation
 from hpamdp.data.human.episodes import keep, score, scores_by_person
 from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.data.human.validation import Singles
 from hpamdp.env.boatdock import harbour, physics, reference
+
+STUDY = Path(__file__).parents[1] / "experiments/human/study.py"
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +39,7 @@ def test_scores_are_five_times_the_tank_left_or_minus_one(data):
 
 def test_no_synthetic_player_beats_the_best_plan(data):
     data = keep(data, torch.arange(len(data.episodes)) < 40)
-    gaps = statistics.optimality_gaps(data, statistics.best_scores(data))
+    gaps = load_script(STUDY).optimality_gaps(data, statistics.best_scores(data))
     assert (gaps["press_gap"] > -0.05).all()  # the tank is recorded in whole ticks of a score of 0.014
     assert (gaps["choice_gap"] >= 0).all() and (gaps["choice_gap"] > 0).any()
     torch.testing.assert_close(gaps["gap"], gaps["choice_gap"] + gaps["press_gap"])
@@ -99,7 +104,7 @@ def simulated_singles(num: int, glide: float, limit: float) -> Singles:
 
 
 def test_fit_finds_the_constants_that_made_the_presses():
-    fit = validation.fit(simulated_singles(400, glide=1.1, limit=80.0), num_bootstraps=50)
+    fit = load_script(STUDY).fit_constants(simulated_singles(400, glide=1.1, limit=80.0), num_bootstraps=50)
     for glide in (fit.likely_glide, fit.agreeing_glide):
         assert glide[0] == pytest.approx(1.1, abs=0.05) and glide[1] <= 1.1 <= glide[2]
     for speed in (fit.likely_speed, fit.agreeing_speed):
@@ -108,7 +113,7 @@ def test_fit_finds_the_constants_that_made_the_presses():
 
 
 def test_our_constants_lie_in_the_intervals_fitted_to_peoples_presses(people):
-    fit = validation.fit(validation.single_presses(people), num_bootstraps=100)
+    fit = load_script(STUDY).fit_constants(validation.single_presses(people), num_bootstraps=100)
     for name in ("likely_glide", "agreeing_glide"):
         _, low, high = getattr(fit, name)
         assert low <= physics.GLIDE <= high, name

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from explorer import Explorer
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.analysis.study import Rows, write_tables
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
-from hpamdp.env.boatdock_unseen.explorer import Explorer
 from hpamdp.env.boatdock_unseen.options import FAMILIES
 from hpamdp.messages import exit_code
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -49,20 +49,140 @@ def measure() -> None:
     """Write every csv file."""
     data = read(one_frame=True)
     best = statistics.best_scores(data)
-    gaps = statistics.optimality_gaps(data, best)
+    gaps = optimality_gaps(data, best)
     write("persons", persons(data, best, gaps))
     write("blocks", blocks(data, gaps))
     write("choices", choices(data, best))
     singles = validation.single_presses(data)
     write("singles", rows_of(singles._asdict()))
     write("first_presses", rows_of(validation.first_presses(data)._asdict()))
-    fit = validation.fit(singles)
+    fit = fit_constants(singles)
     constants = ("likely_glide", "likely_speed", "agreeing_glide", "agreeing_speed")
     names = ("value", "low", "high", "constant")
     write("fit", [dict(zip(names, (*getattr(fit, constant), constant), strict=True)) for constant in constants])
     glide, speed = torch.meshgrid(fit.glides, fit.speeds, indexing="ij")
     grid = {"glide": glide.flatten(), "docking_speed": speed.flatten(), "agreement": fit.agreement.flatten()}
     write("agreement", rows_of(grid))
+
+
+def optimality_gaps(data: HumanData, best: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Return the gap between each episode's score and the best possible score, in three parts `[E]`.
+
+    `gap` is the difference to the best plan with the better controller. It is the sum of two parts: `choice_gap` is due
+    to the choice of the controller, `press_gap` is due to the presses with that controller.
+
+    Args:
+        data: the recording.
+        best: `best_scores` of this recording.
+    """
+    scores = score(data)
+    chosen = best.gather(1, data.episodes["controller"].unsqueeze(1)).squeeze(1)
+    better = best.max(1).values
+    return {"gap": better - scores, "choice_gap": better - chosen, "press_gap": chosen - scores}
+
+
+class Fit(NamedTuple):
+    """The glide and the docking speed (px/s) fitted to people's single presses, with 95 % bootstrap intervals.
+
+    Attributes:
+        likely_glide, likely_speed: the constants of largest likelihood, as (value, low, high).
+        agreeing_glide, agreeing_speed: the constants that predict the most outcomes correctly, as (value, low, high).
+        glides, speeds: the grid, `[G]` and `[S]`.
+        agreement: fraction of outcomes predicted correctly on the grid, `[G, S]`.
+    """
+
+    likely_glide: tuple[float, float, float]
+    likely_speed: tuple[float, float, float]
+    agreeing_glide: tuple[float, float, float]
+    agreeing_speed: tuple[float, float, float]
+    glides: torch.Tensor
+    speeds: torch.Tensor
+    agreement: torch.Tensor
+
+
+def fit_constants(singles: validation.Singles, num_bootstraps: int = 400, seed: int = 0) -> Fit:
+    """Fit the glide and the docking speed to people's single presses, on a grid, and bootstrap over presses.
+
+    The likelihood has two Gaussian errors: of the speed at the dock, and of the distance covered. Their standard
+    deviations are fitted, too.
+    """
+    glides = torch.arange(0.7, 1.305, 0.02, dtype=torch.float64)
+    speeds = torch.arange(60.0, 100.5, 1.0, dtype=torch.float64)
+    speed_errors = torch.tensor([2.0, 4.0, 8.0, 16.0], dtype=torch.float64)
+    distance_errors = torch.tensor([0.5, 2.0, 8.0], dtype=torch.float64)
+    weights = _bootstrap_weights(len(singles.pressed), num_bootstraps, seed)
+
+    glide, limit, speed_error, distance_error = _grid(glides, speeds, speed_errors, distance_errors)
+    log_likelihood = _log_likelihood(singles, glide, limit, speed_error, distance_error)
+    likely = (log_likelihood @ weights.T).argmax(0)
+    likely_glide = _interval(glide[likely, 0])
+    likely_speed = _interval(limit[likely, 0])
+
+    glide, limit = _grid(glides, speeds)
+    spare, speed = _arrival(singles, glide)
+    at_dock = torch.where(speed > limit, physics.TOO_FAST, physics.SUCCESS)
+    predicted = torch.where(spare < 0.0, physics.SAILING, at_dock)
+    is_right = (predicted == validation.reached(singles.outcome)).double()
+    agreeing = (is_right @ weights.T).argmax(0)
+    return Fit(
+        likely_glide=likely_glide,
+        likely_speed=likely_speed,
+        agreeing_glide=_interval(glide[agreeing, 0]),
+        agreeing_speed=_interval(limit[agreeing, 0]),
+        glides=glides,
+        speeds=speeds,
+        agreement=is_right.mean(1).reshape(len(glides), len(speeds)),
+    )
+
+
+def _bootstrap_weights(num: int, num_bootstraps: int, seed: int) -> torch.Tensor:
+    """Return the weight of each press `[1 + num_bootstraps, num]`: 1 in the first row, then resampled counts."""
+    sampled = torch.randint(num, (num_bootstraps, num), generator=torch.Generator().manual_seed(seed))
+    resampled = torch.zeros(num_bootstraps, num, dtype=torch.float64)
+    resampled.scatter_add_(1, sampled, torch.ones(sampled.shape, dtype=torch.float64))
+    return torch.cat([torch.ones(1, num, dtype=torch.float64), resampled])
+
+
+def _grid(*axes: torch.Tensor) -> list[torch.Tensor]:
+    """Return each axis's values at all points of the grid of the axes, `[points, 1]`."""
+    return [values.flatten().unsqueeze(1) for values in torch.meshgrid(*axes, indexing="ij")]
+
+
+def _arrival(singles: validation.Singles, glide: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the distance that each press would go beyond the dock's circle (px), and the speed there (px/s).
+
+    Both are `[points, M]`.
+    """
+    pressed = singles.pressed.double()
+    to_dock = singles.to_dock.double()
+    spare = (1.0 + glide) * pressed - to_dock
+    # The speed follows from the distance covered while the key is down, and from the distance left in the glide.
+    in_glide = to_dock > pressed
+    distance = torch.where(in_glide, (spare / glide).clamp(min=0.0), to_dock)
+    return spare, physics.speed(physics.duration_for(distance))
+
+
+def _log_likelihood(
+    singles: validation.Singles,
+    glide: torch.Tensor,
+    limit: torch.Tensor,
+    speed_error: torch.Tensor,
+    distance_error: torch.Tensor,
+) -> torch.Tensor:
+    """Return the log-likelihood of each press's outcome at each point of the grid, `[points, M]`."""
+    spare, speed = _arrival(singles, glide)
+    log_reaches = torch.special.log_ndtr(spare / distance_error)
+    log_falls_short = torch.special.log_ndtr(-spare / distance_error)
+    log_too_fast = torch.special.log_ndtr((speed - limit) / speed_error)
+    log_docks = torch.special.log_ndtr(-(speed - limit) / speed_error)
+    at_dock = log_reaches + torch.where(singles.outcome == physics.TOO_FAST, log_too_fast, log_docks)
+    return torch.where(validation.reached(singles.outcome) == physics.SAILING, log_falls_short, at_dock)
+
+
+def _interval(values: torch.Tensor) -> tuple[float, float, float]:
+    """Return the first value and the 95 % interval of the others, as (value, low, high)."""
+    low, high = values[1:].quantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    return values[0].item(), low, high
 
 
 def rows_of(columns: Mapping[str, torch.Tensor]) -> Rows:

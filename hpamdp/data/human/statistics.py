@@ -78,19 +78,3 @@ def best_scores(data: HumanData) -> Tensor:
     A thousand episodes take about a second.
     """
     return planner.best_plans(layouts(data), data.episodes["keymap"]).score
-
-
-def optimality_gaps(data: HumanData, best: Tensor) -> dict[str, Tensor]:
-    """Return the gap between each episode's score and the best possible score, in three parts `[E]`.
-
-    `gap` is the difference to the best plan with the better controller. It is the sum of two parts: `choice_gap` is due
-    to the choice of the controller, `press_gap` is due to the presses with that controller.
-
-    Args:
-        data: the recording.
-        best: `best_scores` of this recording.
-    """
-    scores = score(data)
-    chosen = best.gather(1, data.episodes["controller"].unsqueeze(1)).squeeze(1)
-    better = best.max(1).values
-    return {"gap": better - scores, "choice_gap": better - chosen, "press_gap": chosen - scores}
