@@ -364,8 +364,8 @@ def _about_batches(config: Config) -> Iterator[str]:
     batch = run.num_envs * run.steps_per_batch
     if run.mode == "train" and batch > max(run.total_frames, _LARGE_BATCH):
         yield (
-            f"steps_per_batch={run.steps_per_batch}: counts the steps of each of num_envs={run.num_envs}, so a batch has "
-            f"{batch:,}, more than total_frames={run.total_frames}"
+            f"steps_per_batch={run.steps_per_batch}: counts the steps of each of num_envs={run.num_envs}, so a batch "
+            f"has {batch:,}, more than total_frames={run.total_frames}"
         )
     if run.mode == "offline" and collector.card.has_workers:
         yield f"{collector}: mode=offline takes no steps; use collector=single"
