@@ -134,7 +134,7 @@ def test_an_existing_folder_precedes_the_agent_of_its_name(tmp_path, monkeypatch
     (tmp_path / "pdqn_goal").mkdir()
     shutil.copy(FOLDER / "hppo_platform/policy.safetensors", "pdqn_goal")
     assert hpamdp.load("pdqn_goal").specs.num_discrete == 3
-    assert checkpoint.find("pdqn_goal", "checkpoint") == Path("pdqn_goal/policy.safetensors")
+    assert checkpoint.find("pdqn_goal", "checkpoint") == tmp_path / "pdqn_goal/policy.safetensors"
 
 
 @pytest.mark.parametrize("words", [["watch", "hppo_plat"], ["mode=eval", "checkpoint=hppo_plat"]])

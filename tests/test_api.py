@@ -489,7 +489,6 @@ WITHOUT_FOLDER = {"folder": None}
         ({"folder": "n" * 300}, "folder="),
         ({"resume": "auto", **WITHOUT_FOLDER}, "so give folder"),
         ({"logger": "wandb", **WITHOUT_FOLDER}, "writes files, so give the run a folder"),
-        ({"save_best": True, **WITHOUT_FOLDER}, "save_best=true: writes files, so give the run a folder"),
         ({"overwrite": True, **WITHOUT_FOLDER}, "overwrite=True: has no effect without a folder; give folder, or"),
         ({"trust": True}, "trust=True: has no effect without a saved run; give resume, or leave it out"),
         ({"low": {"name": "hppo", "gamma": 0.9}, "low.gamma": 0.9}, "low.gamma: given twice, as 0.9 and as 0.9"),
@@ -528,7 +527,8 @@ def test_a_folder_with_another_run_is_refused_and_stays(tmp_path):
 def test_bounds_of_an_environment_that_were_edited_are_told_of_wherever_an_agent_comes_back(
     space, tmp_path, monkeypatch, capsys
 ):
-    trained = hpamdp.train(lambda: Reach(), folder=tmp_path / "run", **OWN)
+    by_bounds = {**OWN, "env.observation_scaling": "bounds"}
+    trained = hpamdp.train(lambda: Reach(), folder=tmp_path / "run", **by_bounds)
     assert "has learned with" not in capsys.readouterr().err
     other = {
         "observation_space": spaces.Box(-3.0, 3.0, (3,), np.float32),

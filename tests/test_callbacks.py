@@ -109,8 +109,10 @@ def test_a_run_ends_with_its_best_agent_which_can_be_scored_and_watched(scores, 
     kept, at_end = (tensors_in(tmp_path / f"run/{name}.safetensors") for name in ("policy", "checkpoint"))
     assert not all(torch.equal(value, at_end[name]) for name, value in kept.items())
     summary = json.loads((tmp_path / "run/summary.json").read_text())
-    assert (summary["frames"], summary["kept_frames"]) == (160, 64) and summary["score_at_end"] < 7.0
-    assert "this agent is that of frame 64; at the end, the score was" in capsys.readouterr().out
+    assert (summary["frames"], summary["kept_frames"]) == (160, 64) and summary["kept_score"] == 7.0 > summary["score"]
+    assert (
+        "clearly worse than the agent of 64 frames, whose score was 7.000: that one is kept" in capsys.readouterr().out
+    )
     player = load_agent(str(tmp_path / "run"), [])
     assert player.progress["frames"] == 64
     assert all(torch.equal(value, player.agent.state_dict()[name]) for name, value in kept.items())

@@ -46,6 +46,7 @@ from hpamdp.run.train import run
 SMALL = ["num_envs=8", "steps_per_batch=4", "eval.layouts=4", "low=hppo", "low.minibatch_size=16"]
 SMALL += ["compile_updates=false"]
 GYMNASIUM = ["env.id=hpamdp/BoatDock-v0", "env.kwargs={controller:congruent}", "env.max_steps=9"]
+UNSCALED = ["env.observation_scaling=bounds", "env.reward_scaling=null"]  # since shares have statistics of their own
 NEEDS_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray")
 WORKERS = ["multi", pytest.param("ray", marks=[pytest.mark.slow, NEEDS_RAY])]
 
@@ -172,7 +173,7 @@ def test_a_copy_takes_all_that_a_policy_acts_by(low):
 
 @pytest.mark.parametrize(
     "overrides",
-    [["high=ucb", "env.sensor_noise=1"], ["env=gymnasium", "high=none", *GYMNASIUM]],
+    [["high=ucb", "env.sensor_noise=1"], ["env=gymnasium", "high=none", *GYMNASIUM, *UNSCALED]],
     ids=["boats", "copies"],
 )
 def test_shares_together_are_the_environments_of_a_single_process(overrides, tmp_path):
@@ -426,7 +427,7 @@ def test_an_error_in_workers_that_never_told_their_state_costs_only_the_episodes
 
 def test_an_error_in_workers_keeps_the_present_scale_of_observations(tmp_path):
     words = ["env=gymnasium", "env.id=CartPole-v1", "env.observation_scaling=running", "high=none"]
-    with closing(Mortal(tmp_path, 0, *words)) as collection:
+    with closing(Mortal(tmp_path, 0, *words, "env.reward_scaling=null")) as collection:
         collection.next()
         collection.have_die(1)
         with pytest.raises(WorkerDiedError):

@@ -35,7 +35,7 @@ def outside_copies(folder, outside):
 
 def test_a_run_never_writes_through_a_link_in_its_folder(tmp_path, with_figures):
     folder = tmp_path / "run"
-    words = [*TINY, "total_frames=16", "film=true"]
+    words = [*TINY, "total_frames=16", "film=true", "save_best=false"]
     assert run(compose_config(words), folder, words) == 0
     names = {path.name for path in folder.iterdir()}
     assert {
@@ -50,7 +50,7 @@ def test_a_run_never_writes_through_a_link_in_its_folder(tmp_path, with_figures)
     contents = outside_copies(folder, tmp_path / "outside")
     os.link(tmp_path / "outside/summary.json", folder / ".hpamdp-lock")
     os.symlink(tmp_path / "outside/summary.json", folder / "metrics.csv.previous")
-    words = [f"resume={folder}", "total_frames=32", "film=true"]
+    words = [f"resume={folder}", "total_frames=32", "film=true", "save_best=false"]
     with locked(folder):
         assert run(compose_config(words), folder, words) == 0
     assert all(target.read_bytes() == data for target, data in contents.items())

@@ -167,7 +167,7 @@ def test_an_entry_named_option_without_an_action_beside_it_is_the_action():
 
 
 def test_an_option_key_that_names_no_discrete_entry_is_told_in_one_line():
-    with pytest.raises(ValueError, match="option_key=action: must name a Discrete beside the action, in the action"):
+    with pytest.raises(ValueError, match="option_key=action: must name a Discrete beside the action, of at"):
         make(form="dict", option_key="action")
 
 

@@ -95,7 +95,7 @@ def test_a_space_that_depends_on_the_state_is_told_of_with_where_masks_and_bound
         rf"environment \d: its {name} was .* and is now .*Box.*, but must stay the same; .*action_mask.*parameter_low"
     )
     with pytest.raises(hpamdp.ConfigError, match=line):
-        hpamdp.train(Changing, low="hppo", high="none", max_steps=2, total_frames=64, num_envs=2, progress=False)
+        hpamdp.train(Changing, low="hppo", high="none", max_steps=2, total_frames=512, num_envs=2, progress=False)
 
 
 class Normalised(gymnasium.Wrapper):

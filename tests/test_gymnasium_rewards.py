@@ -45,6 +45,7 @@ def test_returns_in_training_have_the_unit_of_those_in_evaluations():
         "steps_per_batch": 8,
         "eval.layouts": 2,
         "max_steps": 3,
+        "staggered": False,
         "low.minibatch_size": 16,
     }
     for more in ({}, {"observation_scaling": "running"}):

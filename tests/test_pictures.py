@@ -467,7 +467,7 @@ def test_workers_collect_the_pictures_that_one_process_collects(quick_workers, m
             total_frames=32,
             num_envs=4,
             steps_per_batch=8,
-            **{"eval.layouts": 2, "env.max_steps": 5},
+            **{"eval.layouts": 2, "env.max_steps": 5, "env.observation_scaling": "bounds"},
         )
     one, other = pictures
     # What is seen depends on the seed and the step alone.

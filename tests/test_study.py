@@ -29,7 +29,6 @@ from hpamdp.analysis.study import (
     with_enough_seeds,
     write_tables,
 )
-from hpamdp.run.summary import KEPT_FRAMES
 
 EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
 CONFIG = (
@@ -471,14 +470,6 @@ def test_a_study_of_evaluations_takes_them_without_metrics(tmp_path, capsys):
     with pytest.raises(SystemExit, match=r"no finished runs of this study; nothing was written"):
         gathered([tmp_path], list, env=("boatdock",))
     assert "mode=eval, but runs of this study have train; left out" in capsys.readouterr().err
-
-
-def test_runs_whose_agent_was_chosen_by_its_score_are_refused(tmp_path):
-    leave_run(tmp_path / "a")
-    leave_run(tmp_path / "b")
-    change_summary(tmp_path / "b", **{KEPT_FRAMES: 64})
-    with pytest.raises(SystemExit, match=r"/b: its agent was chosen .* with save_best=false; nothing was written"):
-        gathered([tmp_path], list, settings={"boatdock.controller": None}, env=("boatdock",))
 
 
 def test_a_run_on_another_problem_of_gymnasium_does_not_join_those_on_hybrid_shoot(tmp_path, capsys):

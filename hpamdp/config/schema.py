@@ -190,8 +190,10 @@ class RunConfig(Settings):
     callbacks: Annotated[tuple[str | dict[str, Any], ...], FromList] = ()
     """Callbacks of training, in their order: `[NAME, {name: NAME, SETTING: VALUE, ...}, ...]`."""
     save_best: bool = True
-    """Keep the agent of the best evaluation in best.safetensors. With `mode=train`, the run ends with it if the last
-    evaluation is clearly worse: by more than two standard errors."""
+    """Keep the agent of the best evaluation in best.safetensors.
+
+    With `mode=train`, it takes the place of the last one if that is clearly worse: by more than two standard errors.
+    """
     film: bool = True
     """Write episodes.gif, which shows three episodes of the agent's last evaluation."""
 

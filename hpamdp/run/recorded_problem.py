@@ -158,7 +158,7 @@ class RecordedProblem:
         """Let an agent act greedily from starts `[N, observation_dim]`, in every member's model."""
         num = self.num_members * len(starts)
         observation = starts.repeat(self.num_members, 1)
-        goes_on = torch.ones(num, device=starts.device)
+        goes_on = torch.ones(num, dtype=torch.float32, device=starts.device)
         total, steps, covered = (torch.zeros_like(goes_on) for _ in range(3))
         begins = torch.ones(num, dtype=torch.bool, device=starts.device)
         last: TensorDictBase | None = None

@@ -32,7 +32,6 @@ from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.loggers import EarlierRun, LenientLogger, Logger
 from hpamdp.run.state_checks import SavedPart, check_like, check_values, checked
 from hpamdp.run.summary import (
-    KEPT_FRAMES,
     ONE_OPTION,
     SHORT_SIGHT,
     WITHOUT_UPDATE,
@@ -214,15 +213,14 @@ class Recorder:
             frames: frames of training.
             wall_s: wall time of training; with `mode=eval`, the time of the evaluation replaces it.
             cpu_s: CPU time of training; likewise.
-            ending: entries of the summary about the end of training: `stopped_by`, `kept_frames`, `score_at_end`.
+            ending: entries of the summary about the end of training: `stopped_by`, `kept_frames`, `kept_score`.
             is_finished: whether training reached its end.
         """
         if self.config.run.mode == "eval":
             wall_before, cpu_before = time.perf_counter(), time.process_time()
             self._play()
             wall_s, cpu_s = time.perf_counter() - wall_before, time.process_time() - cpu_before
-        if KEPT_FRAMES not in ending:
-            self.scores_at_end(frames, wall_s, is_finished=is_finished)
+        self.scores_at_end(frames, wall_s, is_finished=is_finished)
         played = self._play()
         measured = self.parts.evaluation.measure(played)
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}

@@ -95,8 +95,14 @@ def exits_explained() -> Iterator[None]:
     try:
         yield
     except SystemExit as error:
-        frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
-        if str(frame.f_globals.get("__name__")).partition(".")[0] in ("argparse", "submitit"):
+        # wandb puts a function of its own before `sys.exit`.
+        frames = [each for each in traceback.walk_tb(error.__traceback__) if _module(each[0]) != "wandb"]
+        frame, line = frames[-1]
+        if _module(frame) in ("argparse", "submitit"):
             raise
         where = f"{frame.f_code.co_filename}, line {line}"
         raise ProgramExitError(one_line(f"{where}: called sys.exit({error.code!r}), which stopped the run")) from error
+
+
+def _module(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__")).partition(".")[0]

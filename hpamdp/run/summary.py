@@ -18,8 +18,7 @@ from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 
 WITHOUT_UPDATE = "without_update"  # names of the levels that made no update
 ONE_OPTION = "one_option"  # lines about a selector that holds one option in all episodes
-KEPT_FRAMES = "kept_frames"  # frames that the best agent has had, if the run ended with it
-SCORE_AT_END = "score_at_end"  # in that case, the score of the agent as training left it
+KEPT_FRAMES, KEPT_SCORE = "kept_frames", "kept_score"  # of the best agent, if it is kept in place of the last one
 SHORT_SIGHT = "short_sight"  # lines about learners that look far less ahead than episodes last
 _FAR = 4.0  # times the steps that a learner looks ahead; longer episodes count as far longer
 _PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy")
@@ -77,7 +76,7 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
 
     Args:
         summary: the agent's metrics by their names, `references`, `mode`, `frames`, `wall_s`, `without_update`,
-            `short_sight` and `one_option`; `kept_frames` and `score_at_end`, if the run ended with an earlier agent.
+            `short_sight` and `one_option`; `kept_frames` and `kept_score`, if an earlier agent is kept.
         metrics: the rows. Rows without a value for the agent are left out, and so are columns without any value.
     """
     titles = {name: title for name, (title, _, _) in REFERENCES.items()}
@@ -105,8 +104,8 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     without = summary.get(WITHOUT_UPDATE, [])
     lines += [f"no update was made: {', '.join(without)}"] if without else []
     if KEPT_FRAMES in summary:
-        frames, at_end = summary[KEPT_FRAMES], _number(summary[SCORE_AT_END])
-        lines.append(f"this agent is that of frame {frames:,.0f}; at the end, the score was {at_end}")
+        kept = f"{summary[KEPT_FRAMES]:,.0f} frames, whose score was {_number(summary[KEPT_SCORE])}"
+        lines.append(f"clearly worse than the agent of {kept}: that one is kept")
     return "\n".join([*lines, *_effort(summary)])
 
 

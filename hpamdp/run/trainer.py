@@ -29,7 +29,7 @@ from hpamdp.run.folder import mark_unfinished, moved_aside
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.state_checks import check_numbers, example_steps
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
-from hpamdp.run.summary import KEPT_FRAMES, SCORE_AT_END
+from hpamdp.run.summary import KEPT_FRAMES, KEPT_SCORE
 from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
@@ -179,23 +179,28 @@ class Trainer:
     def finish(self, *, is_finished: bool = True) -> str:
         """Evaluate the agent, write what the run has found, and return the closing table as text.
 
-        With `mode=train` and `save_best=true`, the agent first becomes that of the best evaluation, if it is clearly
-        worse now. `checkpoint.safetensors`, from which the run can be continued, stays.
+        With `mode=train` and `save_best=true`, the agent then becomes that of the best evaluation, if the last one is
+        clearly worse. The figures of the run stay those of the last evaluation, since the best one was chosen by the
+        episodes that score it. `checkpoint.safetensors`, from which the run can be continued, stays, too.
 
         Args:
             is_finished: whether training reached its end.
         """
         ending: dict[str, Any] = {} if self.stopped_by is None else {"stopped_by": self.stopped_by}
         best = next((each for each in self.callbacks.values() if isinstance(each, BestAgent)), None)
+        is_kept = False
         if best is not None and self.config.run.mode == "train" and self.config.run.save_best:
             scores = self.recorder.scores_at_end(self.frames, self.wall_s, is_finished=is_finished)
-            if best.is_clearly_better(scores):
-                best.restore(self)
-                ending |= {KEPT_FRAMES: best.best_frames, SCORE_AT_END: float(scores.mean())}
-                self._kept = {"frames": best.best_frames, "last_score": best.best_score}
-                if self.output_dir is not None:
-                    self.save_policy(self.output_dir / POLICY_NAME)
-        return self.recorder.finish(self.frames, self.wall_s, self.cpu_s, ending, is_finished=is_finished)
+            is_kept = best.is_clearly_better(scores)
+        if best is not None and is_kept:
+            ending |= {KEPT_FRAMES: best.best_frames, KEPT_SCORE: best.best_score}
+        table = self.recorder.finish(self.frames, self.wall_s, self.cpu_s, ending, is_finished=is_finished)
+        if best is not None and is_kept:
+            best.restore(self)
+            self._kept = {"frames": best.best_frames, "last_score": best.best_score}
+            if self.output_dir is not None:
+                self.save_policy(self.output_dir / POLICY_NAME)
+        return table
 
     def train(self) -> bool:
         """Train until `num_frames`, `eval.stop_score` or a callback ends it, and save the agent.

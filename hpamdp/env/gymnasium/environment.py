@@ -149,6 +149,7 @@ class GymnasiumEnv(PAMDPEnv):
         self._observation = np.zeros((num_envs, self._copies.layout.dim), np.float32)
         self._is_over = np.zeros(num_envs, bool)
         self._rows = [*range(num_envs)]
+        self._is_staggered = options.staggered
         self._first_ends = np.zeros(num_envs, np.int64)  # steps to the end of a staggered first episode; else 0
         self._reports_success = False
         self._set_seed(seed)
@@ -410,7 +411,7 @@ class GymnasiumEnv(PAMDPEnv):
             self._next_seeds[row] = None
         self._copies.reset(chosen)
         self._first_ends[is_reset] = 0
-        if self.options.staggered and mask is None and given is None:
+        if self._is_staggered and mask is None and given is None:
             numbers = np.arange(self.first_env, self.first_env + self.num_envs)
             self._first_ends[:] = np.ceil(numbers * _GOLDEN % 1.0 * self.max_steps)
         self._scale(is_reset, is_all=len(rows) == self.num_envs)
