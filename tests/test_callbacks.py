@@ -272,6 +272,7 @@ def test_a_wrong_metric_of_a_callback_from_yaml_ends_the_run_in_one_line_that_sa
             "Stateful.state.of is of type Tensor, but must be a real number",
         ),
         ({"of": torch.zeros(2).to_sparse()}, "Stateful.state.of is of type Tensor, but must be a real number"),
+        ({"of": torch.zeros(2, device="meta")}, "Stateful.state.of is of type Tensor, but must be a real number"),
         ({"of": {3: 1.0}}, "Stateful.state.of: 3 must be a text, as the name of a value"),
     ],
 )

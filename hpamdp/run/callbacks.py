@@ -363,13 +363,18 @@ def states_of(
     return states
 
 
+def _is_plain(value: Tensor) -> bool:
+    has_numbers = value.layout == torch.strided and not value.is_meta
+    return has_numbers and not value.is_complex() and not value.is_quantized
+
+
 def _savable(where: str, value: Any) -> Any:
     if isinstance(value, Mapping):
         wrong = [name for name in value if not isinstance(name, str)]
         if wrong:
             raise CallbackError(f"{where}: {wrong[0]!r:.60} must be a text, as the name of a value")
         return {name: _savable(f"{where}.{name}", inner) for name, inner in value.items()}
-    if isinstance(value, Tensor) and value.layout == torch.strided and not value.is_complex():
+    if isinstance(value, Tensor) and _is_plain(value):
         return value.detach().clone()
     if isinstance(value, bool):
         return value
