@@ -182,7 +182,7 @@ class Patience(Callback):
 
     def __init__(self, options: PatienceOptions | int | None = None, **settings: Any) -> None:
         if isinstance(options, int):
-            options, settings = None, _with_first(self, "evaluations", options, settings)
+            settings, options = _with_first(self, "evaluations", options, settings), None
         self.options: PatienceOptions = PatienceOptions.of(options, settings)
         self._best = -math.inf
         self._evaluations = 0  # since the last improvement
@@ -228,7 +228,7 @@ class TimeLimit(Callback):
 
     def __init__(self, options: TimeLimitOptions | float | None = None, **settings: Any) -> None:
         if isinstance(options, int | float):
-            options, settings = None, _with_first(self, "minutes", options, settings)
+            settings, options = _with_first(self, "minutes", options, settings), None
         self.options: TimeLimitOptions = TimeLimitOptions.of(options, settings)
 
     def on_start(self, trainer: Trainer) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import multiprocessing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial, update_wrapper
 from typing import Any, ClassVar
 
@@ -251,7 +251,7 @@ class GymnasiumEnv(PAMDPEnv):
     def ranges(self) -> dict[str, list[float]]:
         """Return the bounds and the first discrete actions of the spaces, and the fixed scale of observations."""
         actions = self._copies.actions
-        ranges = {
+        ranges: dict[str, Iterable[float]] = {
             "parameter_low": actions.own_low,
             "parameter_high": actions.own_high,
             "first_action": [*actions.starts, self._copies.options.start],
