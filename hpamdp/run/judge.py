@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from hpamdp import keys
 from hpamdp.analysis.study import mean_interval
@@ -16,6 +17,7 @@ from hpamdp.config.compose import choosing, read, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed
 from hpamdp.config.schema import Config
+from hpamdp.data.row_checks import PERSON
 from hpamdp.env.decisions import decision_tracker
 from hpamdp.messages import say
 from hpamdp.run.assemble import make_data, option_length
@@ -93,7 +95,7 @@ def judged(
     for path, each in zip(paths, agents, strict=True):
         tracker = decision_tracker(each.env, option_length=option_length(each.config))
         rollout = problem.roll_out(each.agent, tracker, starts, max_steps)
-        doubts = [*_doubts(rollout, max_steps), *_is_known(each, config, data.held_out is not None)]
+        doubts = [*_doubts(rollout, max_steps), *_is_known(each, config, rows)]
         found.append({"agent": path, **_row(rollout, people), "doubts": doubts})
     return sorted(found, key=lambda row: -row["return"])
 
@@ -149,14 +151,16 @@ def _doubts(rollout: Rollout, max_steps: int) -> list[str]:
     return doubts
 
 
-def _is_known(loaded: LoadedAgent, config: Config, are_held_out: bool) -> list[str]:
-    """Return a doubt if an agent may have learned from the transitions that judge it."""
+def _is_known(loaded: LoadedAgent, config: Config, rows: TensorDict) -> list[str]:
+    """Return a doubt if an agent may have learned from the transitions `[M]` that judge it."""
     learned = _people_of(loaded)
     if not learned or loaded.progress["config"]["choices"]["data"] != config.data.name:
         return []
-    apart = set(getattr(config.data.options, "held_out", ())) if are_held_out else None
-    if apart is not None and apart <= set(learned.get("held_out") or ()):
-        return []
+    if PERSON in rows.keys():
+        judging = set(rows[PERSON].unique().tolist())
+        known = judging & set(learned.get("people") or judging)
+        if known <= set(learned.get("held_out") or ()):
+            return []
     return ["it may have learned from the transitions that judge it; hold people out of its data (data.held_out)"]
 
 
