@@ -469,7 +469,7 @@ WITHOUT_FOLDER = {"folder": None}
         ({"env": 3}, "must be a name such as"),
         ({"env": lambda: 3}, "is no environment"),
         ({"env": Several}, "Several is no environment, .* one of several agents needs a gymnasium.Env around it"),
-        ({"env": Several()}, "Several is no environment, .* one of several agents needs a gymnasium.Env around it"),
+        ({"env": lambda: gymnasium.vector.SyncVectorEnv([Reach])}, "give a single one, of which num_envs makes copies"),
         ({"env": {"env": Reach}}, "env: .*Reach.* is given as 'env'; write {'name': ..., ...}"),
         ({"low": {"low": "hppo"}}, "low: 'hppo' is given as 'low'; write {'name': ..., ...}"),
         ({"low": {"cls": hpamdp.HPPO}}, "HPPO.* is given as 'cls'; write {'name': ..., ...}"),

@@ -87,6 +87,8 @@ class Maker:
             cure = "wrap an environment of gym with shimmy's GymV21CompatibilityV0"
             if any(hasattr(env, name) for name in _OF_SEVERAL_AGENTS):
                 cure = "one of several agents needs a gymnasium.Env around it that acts for the others"
+            elif isinstance(env, gymnasium.vector.VectorEnv):
+                cure = "give a single one, of which num_envs makes copies"
             raise SettingError(
                 f"{self.name}: {type(env).__name__} is no environment, because it does not inherit from gymnasium.Env; "
                 f"{cure}"
