@@ -155,9 +155,9 @@ def test_a_best_agent_before_any_evaluation_cannot_be_restored():
 
 
 def test_a_callback_may_be_used_for_another_run(scores):
-    scores += [9.0, 0.0, 0.0, *itertools.repeat(1.0, 3)]
+    scores += [0.0, 9.0, 0.0, 0.0, *itertools.repeat(1.0, 3)]
     patience, best = Patience(evaluations=2), BestAgent()
-    assert (train(patience, best).frames, best.best_score) == (64, 9.0)
+    assert (train(patience, best).frames, best.best_score) == (96, 9.0)
     assert (train(patience, best, words=[*SMALL, "total_frames=32"]).frames, best.best_score) == (32, 1.0)
 
 

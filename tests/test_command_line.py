@@ -26,7 +26,7 @@ MISTAKES = [
     (["high=ucb", "high.windw=3"], "high.windw: no such setting of UCB; did you mean window? It"),
     (["high=none", "high.window=3"], "high.window: high=none has no settings; choose another high, too"),
     (["exploration.epsilon=0.5"], "exploration.epsilon: exploration=none has no settings; choose another exploration"),
-    (["+low=hppo"], "Multiple values for low."),
+    (["+low=hppo"], "low is always chosen; leave out the +"),
     (["low=pdqn", "low.epsilon=0.1"], "did you mean epsilon_steps or epsilon_final or epsilon_episodes? It has "),
     (["low=hppo", "low.learning_rate=1"], "no such setting of HPPO; did you mean lr or critic_lr? It has "),
     (["low=hppo", "low.batch_size=64"], "did you mean minibatch_size? It has "),

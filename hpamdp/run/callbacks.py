@@ -121,9 +121,9 @@ class BestAgent(Callback):
                 shutil.copyfile(file, partial)
 
     def on_evaluation(self, trainer: Trainer, row: Mapping[str, float]) -> None:
-        """Keep the agent if its score is the highest so far."""
+        """Keep the agent if its score is the highest so far. An untrained agent does not count."""
         score = row[SCORE]
-        if self.best_score is not None and score <= self.best_score:
+        if trainer.frames == 0 or (self.best_score is not None and score <= self.best_score):
             return
         trainer.check_weights()
         if trainer.output_dir is None:
