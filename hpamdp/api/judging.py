@@ -24,8 +24,8 @@ def judge(*agents: str | Path, data: str, episodes: int = DEFAULT_EPISODES, **se
 
     Returns:
         A row for each agent, the highest return first:
-        - `agent`; `return`: the mean undiscounted return; `interval`: its 95 % interval over people (Student's t), or
-          over starts if the data tell of no people;
+        - `agent`; `return`: the mean undiscounted return;
+        - `interval`: its 95 % interval (Student's t) over people, or over starts if the data tell of no people;
         - `between_members`: standard deviation of the mean over the members of the ensemble;
         - `coverage`: fraction of the actions that are like a recorded one in a recorded state;
         - `steps`, and `unfinished`: probability that an episode lasts longer than all recorded ones;
