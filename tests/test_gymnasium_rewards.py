@@ -48,9 +48,15 @@ def test_returns_in_training_have_the_unit_of_those_in_evaluations():
         "staggered": False,
         "low.minibatch_size": 16,
     }
+
+    class Shown(hpamdp.Callback):
+        def on_end(self, trainer):
+            assert trainer.recorder.training_return == 2.0 * 3  # which the bar shows
+
     for more in ({}, {"observation_scaling": "running"}):
+        given = {**sizes, **more, "callbacks": [Shown()]}
         history = hpamdp.train(
-            lambda: Toy(), low="hppo", high="none", reward_scaling=0.9, progress=False, **sizes, **more
+            lambda: Toy(), low="hppo", high="none", reward_scaling=0.9, progress=False, **given
         ).history
         assert history[-1]["train/return"] == history[-1]["train/score"] == history[-1]["eval/return"] == 2.0 * 3
 

@@ -155,7 +155,7 @@ class Recorder:
         ended = self._results(batch)[is_end]
         self._ended.append(ended)
         if len(ended):
-            self.training_return = ended[keys.EPISODE_RETURN].mean().item()
+            self.training_return = self._outcomes(ended)["return"].mean().item()
 
     def _results(self, steps: TensorDictBase) -> TensorDictBase:
         """Return the entries of steps `[*B]` to record at the end of an episode."""
@@ -163,6 +163,10 @@ class Recorder:
         if keys.OPTION in steps.keys():
             results.set(keys.OPTION, steps.get(keys.OPTION))
         return results
+
+    def _outcomes(self, ended: TensorDictBase) -> dict[str, Tensor]:
+        """Return what the environment tells of episodes that ended, and their `return` as the environment gave it."""
+        return {"return": ended[keys.EPISODE_RETURN], **self.parts.env.results(ended)}
 
     def forget_evaluation(self) -> None:
         """Drop the last evaluation, because the agent may have changed."""
@@ -300,7 +304,7 @@ class Recorder:
         if not sum(len(ended) for ended in self._ended):
             return {}
         ended: TensorDictBase = TensorDict.cat(self._ended)
-        results = {"return": ended[keys.EPISODE_RETURN], **self.parts.env.results(ended)}
+        results = self._outcomes(ended)
         results = {"score": results["return"], **results}
         names = [name for name in ("score", "success", "return") if name in results]
         scores = {f"train/{name}": results[name].float().mean().item() for name in names}
