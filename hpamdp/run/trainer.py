@@ -187,20 +187,24 @@ class Trainer:
             is_finished: whether training reached its end.
         """
         ending: dict[str, Any] = {} if self.stopped_by is None else {"stopped_by": self.stopped_by}
-        best = next((each for each in self.callbacks.values() if isinstance(each, BestAgent)), None)
-        is_kept = False
-        if best is not None and self.config.run.mode == "train" and self.config.run.save_best:
-            scores = self.recorder.scores_at_end(self.frames, self.wall_s, is_finished=is_finished)
-            is_kept = best.is_clearly_better(scores)
-        if best is not None and is_kept:
-            ending |= {KEPT_FRAMES: best.best_frames, KEPT_SCORE: best.best_score}
+        better = self._better_agent(is_finished=is_finished)
+        if better is not None:
+            ending |= {KEPT_FRAMES: better.best_frames, KEPT_SCORE: better.best_score}
         table = self.recorder.finish(self.frames, self.wall_s, self.cpu_s, ending, is_finished=is_finished)
-        if best is not None and is_kept:
-            best.restore(self)
-            self._kept = {"frames": best.best_frames, "last_score": best.best_score}
+        if better is not None:
+            better.restore(self)
+            self._kept = {"frames": better.best_frames, "last_score": better.best_score}
             if self.output_dir is not None:
                 self.save_policy(self.output_dir / POLICY_NAME)
         return table
+
+    def _better_agent(self, *, is_finished: bool) -> BestAgent | None:
+        """Return what holds the agent of the best evaluation if it is clearly better than the last one."""
+        best = next((each for each in self.callbacks.values() if isinstance(each, BestAgent)), None)
+        if best is None or self.config.run.mode != "train" or not self.config.run.save_best:
+            return None
+        scores = self.recorder.scores_at_end(self.frames, self.wall_s, is_finished=is_finished)
+        return best if best.is_clearly_better(scores) else None
 
     def train(self) -> bool:
         """Train until `num_frames`, `eval.stop_score` or a callback ends it, and save the agent.
