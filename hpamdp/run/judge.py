@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,7 +20,14 @@ from hpamdp.data.row_checks import PERSON
 from hpamdp.env.decisions import decision_tracker
 from hpamdp.messages import say
 from hpamdp.run.assemble import make_data, option_length
-from hpamdp.run.players import LoadedAgent, add_config_dir, load_agent, whole_number, with_config_dirs
+from hpamdp.run.players import (
+    LoadedAgent,
+    add_config_dir,
+    load_agent,
+    paths_and_settings,
+    whole_number,
+    with_config_dirs,
+)
 from hpamdp.run.recorded_problem import RecordedProblem, Rollout, starts_of
 from hpamdp.specs import PAMDPSpecs
 
@@ -54,9 +60,8 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     )
     add_config_dir(parser)
     options = parser.parse_intermixed_args(words)
-    paths = [word for word in options.words if "=" not in word or os.path.exists(word)]
-    settings = with_config_dirs([word for word in options.words if word not in paths], options.config_dir)
-    rows = judged(paths, settings, episodes=options.episodes)
+    paths, settings = paths_and_settings(options.words)
+    rows = judged(paths, with_config_dirs(settings, options.config_dir), episodes=options.episodes)
     say(_table(rows))
     return 0
 

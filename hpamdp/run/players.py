@@ -51,16 +51,22 @@ class LoadedAgent:
             return make_evaluation(self.config, self.env, num_filmed=num_filmed, filmed_steps=None)
 
 
+def paths_and_settings(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the paths among a command line's words, and the settings."""
+    paths = [word for word in words if "=" not in word or os.path.exists(word)]
+    return paths, [word for word in words if word not in paths]
+
+
 def split_words(words: Sequence[str]) -> tuple[str | None, list[str]]:
     """Return the path among a command line's words, if there is one, and the settings.
 
     Raises:
         ConfigError: there are several paths.
     """
-    paths = [word for word in words if "=" not in word or os.path.exists(word)]
+    paths, settings = paths_and_settings(words)
     if len(paths) > 1:
         raise ConfigError(f"{' '.join(paths)}: several agents; give one, and settings as SETTING=VALUE")
-    return (paths[0] if paths else None), [word for word in words if word not in paths]
+    return (paths[0] if paths else None), settings
 
 
 def add_config_dir(parser: argparse.ArgumentParser) -> None:
