@@ -83,6 +83,11 @@ def saved_config(folder: Path) -> dict[str, Any]:
     return config if isinstance(config, dict) else {}
 
 
+def is_config_of_run(config: Mapping[str, Any]) -> bool:
+    """Return whether a config is one of this program, since other programs write files of the same name."""
+    return {"mode", "seed", "env", "low"} <= config.keys()
+
+
 def saved_summary(folder: Path) -> dict[str, Any]:
     """Return the summary of the run in a folder; empty if it is missing or cannot be read."""
     try:

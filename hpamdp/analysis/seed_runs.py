@@ -26,6 +26,7 @@ from hpamdp.run_files import (
     METRICS_NAME,
     SUMMARY_NAME,
     flat_settings,
+    is_config_of_run,
     saved_config,
     saved_summary,
 )
@@ -153,7 +154,7 @@ def _read(folder: Path, metric: str) -> SeedRun | None:
     if not config:
         warn(f"{one_line(folder)}: {CONFIG_NAME} is missing or damaged, left out")
         return None
-    if not {"mode", _SEED, "env", "low"} <= config.keys():
+    if not is_config_of_run(config):
         if summary:
             warn(f"{one_line(folder)}: is of another program, left out")
         return None

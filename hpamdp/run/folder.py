@@ -32,6 +32,7 @@ from hpamdp.run_files import (
     SUMMARY_NAME,
     TENSORBOARD_NAME,
     WANDB_NAME,
+    is_config_of_run,
     is_saved_agent,
     listed_figures,
     saved_config,
@@ -109,7 +110,7 @@ def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
 
 def _is_of_a_run(folder: Path) -> bool:
     """Return whether a file says by its contents that a run has written it, since others use the same names."""
-    if {"mode", "seed", "env", "low"} <= saved_config(folder).keys() or _aside(folder).exists():
+    if is_config_of_run(saved_config(folder)) or _aside(folder).exists():
         return True
     if {"finished", "frames"} <= saved_summary(folder).keys():
         return True
