@@ -426,7 +426,8 @@ def runs_table(words: str) -> str:
     The columns before `seed` tell settings apart; of those after it the table has the means over the seeds. Runs that
     do not stand in the tables of studies, and settings with too few seeds, are left out.
     """
-    from hpamdp.analysis.study import FEWEST_SEEDS, groups, spread, standing_rows, with_enough_seeds
+    from experiments.study_tables import FEWEST_SEEDS, groups, standing_rows, with_enough_seeds
+    from hpamdp.analysis.statistics import spread
 
     path, _, condition = words.partition(": ")
     column, _, values = condition.partition("=")

@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from hpamdp.analysis.study import Rows, standing_rows
+from experiments.study_tables import Rows, standing_rows
 from hpamdp.messages import exit_code
 
 ROOT = Path(__file__).resolve().parent.parent

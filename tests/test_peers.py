@@ -6,8 +6,8 @@ import pytest
 import torch
 from scripts import load_script
 
+from experiments.study_tables import read_csv, write_tables
 from hpamdp import keys
-from hpamdp.analysis.study import read_csv, write_tables
 
 PEERS = Path(__file__).resolve().parent.parent / "experiments" / "peers"
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import hpamdp
-from hpamdp.analysis.seed_curves import mean_curve
 from hpamdp.analysis.seed_report import report_on
+from hpamdp.analysis.statistics import mean_curve
 from hpamdp.config.errors import ConfigError
 
 CONFIG = """\

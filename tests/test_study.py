@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scripts import load_script
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     FIRST_PROTOCOL_SEED,
     Run,
     add_to_tables,
@@ -20,15 +20,14 @@ from hpamdp.analysis.study import (
     groups,
     interquartile_mean,
     interval_text,
-    mean_interval,
     middle_half,
     planned_seeds,
     read_csv,
-    spread,
     standing_rows,
     with_enough_seeds,
     write_tables,
 )
+from hpamdp.analysis.statistics import mean_interval, spread
 
 EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
 CONFIG = (

@@ -14,7 +14,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from hpamdp.analysis.study import Rows, groups, markdown_table, mean_of, read_csv, spread, write_tables
+from experiments.study_tables import Rows, groups, markdown_table, mean_of, read_csv, write_tables
+from hpamdp.analysis.statistics import spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from hpamdp.analysis.study import PLAN_NAME, planned_seeds, read_csv
+from experiments.study_tables import PLAN_NAME, planned_seeds, read_csv
 from hpamdp.messages import exit_code
 from hpamdp.run_files import saved_summary
 

@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     FIRST_PROTOCOL_SEED,
     Rows,
     Run,
@@ -33,12 +33,12 @@ from hpamdp.analysis.study import (
     mean_of,
     read_csv,
     refuse_repeats,
-    spread,
     standing_rows,
     with_enough_seeds,
     with_repeats_replaced,
     write_tables,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.figure_style import LEARNER_COLOURS
 from hpamdp.messages import exit_code
 

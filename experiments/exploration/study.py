@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     Run,
     add_to_tables,
@@ -20,9 +20,9 @@ from hpamdp.analysis.study import (
     markdown_table,
     mean_of,
     read_csv,
-    spread,
     with_enough_seeds,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent

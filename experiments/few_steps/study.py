@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     Run,
     first_at,
@@ -25,9 +25,9 @@ from hpamdp.analysis.study import (
     mean_of,
     merged_tables,
     read_csv,
-    spread,
     write_tables,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
 from hpamdp.messages import exit_code

@@ -15,8 +15,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
+from experiments.study_tables import write_tables
 from hpamdp import keys
-from hpamdp.analysis.study import write_tables
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.messages import exit_code
 from hpamdp.policies.low_level.pets.learner import PETS

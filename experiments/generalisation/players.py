@@ -15,8 +15,8 @@ import torch
 from explorer import Explorer
 from torch import Tensor
 
+from experiments.study_tables import Rows, write_tables
 from hpamdp import keys
-from hpamdp.analysis.study import Rows, write_tables
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.env.boatdock_unseen.options import FAMILIES
 from hpamdp.messages import exit_code

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     Run,
     add_to_tables,
@@ -26,9 +26,9 @@ from hpamdp.analysis.study import (
     markdown_table,
     mean_of,
     read_csv,
-    spread,
     with_enough_seeds,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
 from hpamdp.messages import exit_code

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import hpamdp
-from hpamdp.analysis.study import Rows, write_tables
+from experiments.study_tables import Rows, write_tables
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.messages import exit_code
 

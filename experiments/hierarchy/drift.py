@@ -16,8 +16,8 @@ import torch
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
+from experiments.study_tables import Rows, groups, markdown_table, read_csv, write_tables
 from hpamdp import keys
-from hpamdp.analysis.study import Rows, groups, markdown_table, read_csv, write_tables
 from hpamdp.config.compose import read
 from hpamdp.config.outside_jobs import composed
 from hpamdp.messages import exit_code

@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     Run,
     add_to_tables,
@@ -29,10 +29,10 @@ from hpamdp.analysis.study import (
     groups,
     markdown_table,
     mean_of,
-    spread,
     standing_rows,
     with_enough_seeds,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.env.boatdock.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 from hpamdp.figure_style import draw_spread
 from hpamdp.messages import exit_code

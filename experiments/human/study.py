@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from hpamdp.analysis.study import Rows, markdown_table, read_csv, write_tables
+from experiments.study_tables import Rows, markdown_table, read_csv, write_tables
 from hpamdp.data.human import statistics, validation
 from hpamdp.data.human.episodes import score
 from hpamdp.data.human.released_file import HumanData, read

@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     Run,
     add_to_tables,
@@ -30,8 +30,8 @@ from hpamdp.analysis.study import (
     markdown_table,
     mean_of,
     read_csv,
-    spread,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.figure_style import STYLE, draw_spread
 from hpamdp.messages import exit_code
 

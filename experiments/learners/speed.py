@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torchrl.collectors import Collector
 
-from hpamdp.analysis.study import Rows, markdown_table, write_tables
+from experiments.study_tables import Rows, markdown_table, write_tables
 from hpamdp.config.compose import read
 from hpamdp.config.outside_jobs import composed
 from hpamdp.messages import exit_code

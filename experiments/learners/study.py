@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     Run,
     add_to_tables,
@@ -28,9 +28,9 @@ from hpamdp.analysis.study import (
     markdown_table,
     mean_of,
     read_csv,
-    spread,
     with_enough_seeds,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.figure_style import LEARNER_COLOURS
 from hpamdp.messages import exit_code

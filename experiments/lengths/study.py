@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     Run,
     add_to_tables,
@@ -23,8 +23,8 @@ from hpamdp.analysis.study import (
     markdown_table,
     mean_of,
     read_csv,
-    spread,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent

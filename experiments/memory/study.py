@@ -17,16 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import hpamdp
-from hpamdp.analysis.study import (
-    Rows,
-    add_to_tables,
-    groups,
-    markdown_table,
-    mean_of,
-    read_csv,
-    spread,
-    with_enough_seeds,
-)
+from experiments.study_tables import Rows, add_to_tables, groups, markdown_table, mean_of, read_csv, with_enough_seeds
+from hpamdp.analysis.statistics import spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent

@@ -24,7 +24,7 @@ from scipy import stats
 from tensordict import TensorDict
 from torch import Tensor
 
-from hpamdp.analysis.study import Rows, groups, markdown_table, mean_of, read_csv, write_tables
+from experiments.study_tables import Rows, groups, markdown_table, mean_of, read_csv, write_tables
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.episodes import score
 from hpamdp.data.human.released_file import read

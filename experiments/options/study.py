@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     FEWEST_SEEDS,
     FIRST_PROTOCOL_SEED,
     Rows,
@@ -28,9 +28,9 @@ from hpamdp.analysis.study import (
     markdown_table,
     mean_of,
     read_csv,
-    spread,
     standing_rows,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent

@@ -21,8 +21,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from experiments.study_tables import add_to_tables
 from hpamdp import keys
-from hpamdp.analysis.study import add_to_tables
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed

@@ -16,7 +16,7 @@ import numpy as np
 from problems import EPISODE_SEEDS, HELD, PROBLEMS, OwnProblem
 from scipy.interpolate import RegularGridInterpolator
 
-from hpamdp.analysis.study import write_tables
+from experiments.study_tables import write_tables
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent

@@ -14,7 +14,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     first_at,
     groups,
@@ -22,9 +22,9 @@ from hpamdp.analysis.study import (
     mean_of,
     read_csv,
     refuse_repeats,
-    spread,
     write_tables,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.figure_style import FAINT, INK, LEARNER_COLOURS, STYLE
 from hpamdp.messages import exit_code
 

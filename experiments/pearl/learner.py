@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import hpamdp
-from hpamdp.analysis.study import write_tables
+from experiments.study_tables import write_tables
 from hpamdp.messages import exit_code
 
 SETTINGS: dict[str, dict[str, Any]] = {

@@ -15,7 +15,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     first_at,
     groups,
@@ -24,10 +24,10 @@ from hpamdp.analysis.study import (
     mean_of,
     read_csv,
     refuse_repeats,
-    spread,
     with_repeats_replaced,
     write_tables,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.figure_style import INK, LEARNER_COLOURS, STYLE
 from hpamdp.messages import exit_code
 

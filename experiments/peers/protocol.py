@@ -10,7 +10,7 @@ from typing import Any
 from tensordict import TensorDictBase
 
 import hpamdp
-from hpamdp.analysis.study import write_tables
+from experiments.study_tables import write_tables
 from hpamdp.env.decisions import with_decisions
 from hpamdp.run.evaluate import Evaluation
 

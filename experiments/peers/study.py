@@ -16,7 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from hpamdp.analysis.study import Rows, groups, markdown_table, mean_of, read_csv, refuse_repeats, spread, write_tables
+from experiments.study_tables import Rows, groups, markdown_table, mean_of, read_csv, refuse_repeats, write_tables
+from hpamdp.analysis.statistics import spread
 from hpamdp.figure_style import FAINT, INK, LEARNER_COLOURS, STYLE
 from hpamdp.messages import exit_code
 

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.analysis.study import Rows, Run, add_to_tables, curve, gathered, groups, markdown_table, read_csv
+from experiments.study_tables import Rows, Run, add_to_tables, curve, gathered, groups, markdown_table, read_csv
 from hpamdp.figure_style import LEARNER_COLOURS
 from hpamdp.messages import exit_code
 

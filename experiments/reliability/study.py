@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hpamdp.analysis.study import markdown_table, read_csv
+from experiments.study_tables import markdown_table, read_csv
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent

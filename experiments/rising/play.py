@@ -14,9 +14,9 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType
 
+from experiments.study_tables import Rows
 from hpamdp import keys
 from hpamdp.acting import acting
-from hpamdp.analysis.study import Rows
 from hpamdp.policies.base import Selector
 from hpamdp.policies.high_level.epsilon_greedy import EpsilonGreedy
 from hpamdp.policies.high_level.lin_thompson import LinThompson

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hpamdp.analysis.study import Rows, groups, markdown_table, read_csv, write_tables
+from experiments.study_tables import Rows, groups, markdown_table, read_csv, write_tables
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent

@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     Run,
     difference,
@@ -29,9 +29,9 @@ from hpamdp.analysis.study import (
     markdown_table,
     read_csv,
     refuse_repeats,
-    spread,
     write_tables,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.config.compose import conf_dir
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.messages import exit_code

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.collectors import Collector
 
-from hpamdp.analysis.study import Rows, markdown_table, read_csv, write_tables
+from experiments.study_tables import Rows, markdown_table, read_csv, write_tables
 from hpamdp.config.compose import read
 from hpamdp.config.outside_jobs import composed
 from hpamdp.messages import exit_code

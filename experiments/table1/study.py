@@ -21,7 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.analysis.study import (
+from experiments.study_tables import (
     Rows,
     Run,
     add_to_tables,
@@ -32,10 +32,10 @@ from hpamdp.analysis.study import (
     markdown_table,
     middle_half,
     read_csv,
-    spread,
     standing_rows,
     write_tables,
 )
+from hpamdp.analysis.statistics import spread
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised
 from hpamdp.figure_style import LEARNER_COLOURS

@@ -36,8 +36,8 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 import hpamdp
+from experiments.study_tables import Rows, write_tables
 from hpamdp import keys
-from hpamdp.analysis.study import Rows, write_tables
 from hpamdp.env.decisions import with_decisions
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.messages import exit_code

@@ -25,8 +25,8 @@ import gymnasium
 import torch
 
 import hpamdp  # also registers the Gymnasium ids
+from experiments.study_tables import Rows, write_tables
 from hpamdp import keys
-from hpamdp.analysis.study import Rows, write_tables
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv

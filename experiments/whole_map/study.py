@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
-from hpamdp.analysis.study import Rows, Run, add_to_tables, gathered, groups, read_csv, spread
+from experiments.study_tables import Rows, Run, add_to_tables, gathered, groups, read_csv
+from hpamdp.analysis.statistics import spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent

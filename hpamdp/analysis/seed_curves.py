@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from hpamdp.analysis.seed_runs import Configuration
-from hpamdp.analysis.study import mean_curve
+from hpamdp.analysis.statistics import mean_curve
 from hpamdp.figure_style import LEARNER_COLOURS, REFERENCES, STYLE, label_ends
 from hpamdp.messages import one_line
 from hpamdp.metrics_file import EVALUATION

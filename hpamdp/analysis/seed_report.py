@@ -23,7 +23,7 @@ from hpamdp.analysis.seed_runs import (
     configurations,
     read_runs,
 )
-from hpamdp.analysis.study import mean_interval, spread
+from hpamdp.analysis.statistics import mean_interval, spread
 from hpamdp.complaints import no_such
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import regular_size, replacing

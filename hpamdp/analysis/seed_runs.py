@@ -7,14 +7,14 @@ import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hpamdp.analysis.study import fault_of, run_folders
+from hpamdp.complaints import as_json
 from hpamdp.env.facts import NAMING_SETTINGS
 from hpamdp.messages import one_line, reason_of, warn
 from hpamdp.metrics_file import EVALUATION, read_curve
@@ -25,6 +25,8 @@ from hpamdp.run_files import (
     MAX_TEXT_BYTES,
     METRICS_NAME,
     SUMMARY_NAME,
+    TENSORBOARD_NAME,
+    WANDB_NAME,
     flat_settings,
     is_config_of_run,
     saved_config,
@@ -36,6 +38,7 @@ _SEED, _CHOICE = "seed", "choices."
 _NO_METRICS = {"episodes", "finished", "frames", "wall_s", "cpu_s", _SEED}  # numbers of a summary
 _LARGEST = 1e100  # of a number in a statistic or a figure, so that their arithmetic does not overflow
 _LONGEST = 40  # letters of a value in a name
+_MOST_FOLDERS = 100_000  # a link may lead to the whole disk
 
 
 @dataclass(frozen=True)
@@ -285,3 +288,56 @@ def _warn_of_objects(runs: Sequence[SeedRun]) -> None:
                 "config tells apart; they count as one environment"
             )
         )
+
+
+def run_folders(folder: Path, seen: set[str], marks: Collection[str] = (SUMMARY_NAME,)) -> Iterator[Path]:
+    """Yield the folders that hold a file with one of these names, and warn about broken links.
+
+    Links to folders are followed, except to folders above. Folders whose names begin with a dot are left out.
+
+    Args:
+        folder: the folder to search.
+        seen: real paths of folders that were searched before, and are left out. The searched folders are added.
+        marks: the names.
+    """
+
+    def report(error: OSError) -> None:
+        warn(one_line(f"{error.filename}: {error.strerror}, left out"))
+
+    start = Path(os.path.realpath(folder))
+    for path, folders, files in os.walk(folder, onerror=report, followlinks=True):
+        real = os.path.realpath(path)
+        is_above = real != str(start) and start.is_relative_to(real)
+        if real in seen or is_above:  # by a link
+            folders.clear()
+            continue
+        folders[:] = [name for name in folders if name not in (TENSORBOARD_NAME, WANDB_NAME) and name[0] != "."]
+        seen.add(real)
+        if len(seen) > _MOST_FOLDERS:
+            warn(f"{folder}: has more than {_MOST_FOLDERS:,} folders, the others are left out")
+            return
+        if not {*marks}.isdisjoint(files):
+            yield Path(path)
+        for name in files:
+            if name not in marks and not os.path.exists(os.path.join(path, name)):
+                warn(one_line(f"{os.path.join(path, name)}: is a broken link, left out"))
+
+
+def fault_of(summary: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
+    """Return why it is not known which seed a run has or whether it is finished; None if both are known.
+
+    Args:
+        summary: the run's `summary.json`; empty if there is none.
+        config: its `config.yaml`.
+    """
+    if "seed" in config:
+        seed = config["seed"]
+        told = summary.get("seed", seed)
+        if type(seed) is not int:
+            return f"{CONFIG_NAME} has seed={as_json(seed)}, which is no whole number"
+        if type(told) is not int or told != seed:
+            return f"{CONFIG_NAME} has seed={seed}, but {SUMMARY_NAME} has seed={as_json(told)}"
+    is_finished = summary.get("finished", False)
+    if not isinstance(is_finished, bool):
+        return f"{SUMMARY_NAME} has finished={as_json(is_finished)}, which is neither true nor false"
+    return None

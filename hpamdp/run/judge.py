@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.analysis.study import mean_interval
+from hpamdp.analysis.statistics import mean_interval
 from hpamdp.config.compose import choosing, read, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed

@@ -7,7 +7,7 @@ import math
 import os
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -18,7 +18,8 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy import stats
 
-from hpamdp.complaints import as_json
+from hpamdp.analysis.seed_runs import fault_of, run_folders
+from hpamdp.analysis.statistics import mean_curve, mean_interval
 from hpamdp.config.compose import choosing, compose, plain_groups
 from hpamdp.config.errors import MissingChoiceError
 from hpamdp.files import replacing
@@ -30,8 +31,6 @@ from hpamdp.run_files import (
     EVALUATION_NAME,
     METRICS_NAME,
     SUMMARY_NAME,
-    TENSORBOARD_NAME,
-    WANDB_NAME,
     are_same,
     saved_config,
     saved_summary,
@@ -46,7 +45,6 @@ FEWEST_SEEDS = 3  # seeds that a cell needs for a place in a table
 # seeds informed the settings.
 FIRST_PROTOCOL_SEED = 100
 PLAN_NAME = "cells.csv"  # beside a file of runs: the seeds that the protocol plans for each cell of a table
-_MOST_FOLDERS = 100_000  # a link may lead to the whole disk
 
 
 @dataclass(frozen=True)
@@ -97,26 +95,6 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
         else:
             warn(f"{folder}: was stopped, left out")
     return runs
-
-
-def fault_of(summary: Mapping[str, Any], config: Mapping[str, Any]) -> str | None:
-    """Return why it is not known which seed a run has or whether it is finished; None if both are known.
-
-    Args:
-        summary: the run's `summary.json`; empty if there is none.
-        config: its `config.yaml`.
-    """
-    if "seed" in config:
-        seed = config["seed"]
-        told = summary.get("seed", seed)
-        if type(seed) is not int:
-            return f"{CONFIG_NAME} has seed={as_json(seed)}, which is no whole number"
-        if type(told) is not int or told != seed:
-            return f"{CONFIG_NAME} has seed={seed}, but {SUMMARY_NAME} has seed={as_json(told)}"
-    is_finished = summary.get("finished", False)
-    if not isinstance(is_finished, bool):
-        return f"{SUMMARY_NAME} has finished={as_json(is_finished)}, which is neither true nor false"
-    return None
 
 
 def gathered(
@@ -232,39 +210,6 @@ def _own_settings(env: str, low: str) -> dict[str, Any]:
         with suppress(MissingChoiceError):
             return plain_groups(compose(words), {}, ["env"])["env"]
     return {}
-
-
-def run_folders(folder: Path, seen: set[str], marks: Collection[str] = (SUMMARY_NAME,)) -> Iterator[Path]:
-    """Yield the folders that hold a file with one of these names, and warn about broken links.
-
-    Links to folders are followed, except to folders above. Folders whose names begin with a dot are left out.
-
-    Args:
-        folder: the folder to search.
-        seen: real paths of folders that were searched before, and are left out. The searched folders are added.
-        marks: the names.
-    """
-
-    def report(error: OSError) -> None:
-        warn(one_line(f"{error.filename}: {error.strerror}, left out"))
-
-    start = Path(os.path.realpath(folder))
-    for path, folders, files in os.walk(folder, onerror=report, followlinks=True):
-        real = os.path.realpath(path)
-        is_above = real != str(start) and start.is_relative_to(real)
-        if real in seen or is_above:  # by a link
-            folders.clear()
-            continue
-        folders[:] = [name for name in folders if name not in (TENSORBOARD_NAME, WANDB_NAME) and name[0] != "."]
-        seen.add(real)
-        if len(seen) > _MOST_FOLDERS:
-            warn(f"{folder}: has more than {_MOST_FOLDERS:,} folders, the others are left out")
-            return
-        if not {*marks}.isdisjoint(files):
-            yield Path(path)
-        for name in files:
-            if name not in marks and not os.path.exists(os.path.join(path, name)):
-                warn(one_line(f"{os.path.join(path, name)}: is a broken link, left out"))
 
 
 def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:
@@ -496,12 +441,6 @@ def markdown_table(head: str, rows: Iterable[Iterable[object]]) -> str:
     return "\n".join([f"| {head} |", "|---" * (head.count("|") + 1) + "|", *lines])
 
 
-def spread(values: Sequence[float], digits: int = 3) -> str:
-    """Return a text: mean ± standard deviation (of a sample, n - 1) over seeds, or a single value."""
-    mean = f"{np.mean(values):.{digits}f}"
-    return f"{mean} ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else mean
-
-
 def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
     """Return the mean of the middle half, and the bounds of its 95 % expanded percentile bootstrap interval over seeds.
 
@@ -534,19 +473,6 @@ def middle_half(values: Sequence[float]) -> str:
         return ""
     middle, low, high = interquartile_mean(values)
     return f"{middle:.3f}" if np.isnan(low) else f"{middle:.3f} ({low:.3f} to {high:.3f})"
-
-
-def mean_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Return the bounds of Student's 95 % t interval of the mean over seeds; NaN with a single seed.
-
-    They are also NaN if all values are the same, such as a success of 1: such seeds do not tell how far others may lie.
-    The interval assumes that scores are normal over seeds. If one seed in five fails, the mean is less certain.
-    """
-    sample = np.asarray(values, dtype=float)
-    if len(sample) < 2 or np.ptp(sample) == 0.0:
-        return np.nan, np.nan
-    half = float(stats.t.ppf(0.975, len(sample) - 1) * stats.sem(sample))
-    return float(sample.mean()) - half, float(sample.mean()) + half
 
 
 def interval_text(values: Sequence[float], style: str = ".3f") -> str:
@@ -613,21 +539,3 @@ def curve(runs: Rows, x: str, y: str) -> tuple[np.ndarray, np.ndarray, np.ndarra
     at, means, deviations, counts = mean_curve(seeds)
     is_whole = counts == len(seeds)
     return at[is_whole], means[is_whole], deviations[is_whole]
-
-
-def mean_curve(curves: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return frames, and the mean, the standard deviation and the number of the curves there.
-
-    A curve counts from its first to its last point, and is a straight line between two points. The standard deviation
-    is that of a sample; it is 0 where only one curve counts.
-
-    Args:
-        curves: rows of frames and value, sorted by frames.
-    """
-    frames = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
-    heights = np.array([np.interp(frames, curve[:, 0], curve[:, 1], left=np.nan, right=np.nan) for curve in curves])
-    counts = (~np.isnan(heights)).sum(0)
-    frames, heights, counts = frames[counts > 0], heights[:, counts > 0], counts[counts > 0]
-    means = np.nanmean(heights, 0)
-    squares = np.nansum((heights - means) ** 2, 0)
-    return frames, means, np.sqrt(squares / np.maximum(counts - 1, 1)), counts
