@@ -84,7 +84,12 @@ def test_a_job_that_diverges_is_named_with_the_reason(command, jobs):
 
 
 def test_a_sweep_ends_with_a_table_of_means_over_all_its_seeds_also_of_earlier_starts(command, jobs, tmp_path):
-    words = ["high=none", "env=platform", "hydra.sweep.dir=sweep", "hydra.sweep.subdir=${low.lr}/${seed}"]
+    words = [
+        "high=none",
+        "env=platform",
+        "hydra.sweep.dir=sweep",
+        "hydra.sweep.subdir=${hydra:runtime.choices.low}_${low.lr}/${seed}",
+    ]
     command("-m", "low=hppo", "low.lr=0.1,0.2", "seed=4,8", *words)
     code, out, err = command("-m", "low=hppo", "low.lr=0.1,0.2", "seed=4,8,12", *words)
     table = out[out.index("            ") : out.index("6 jobs: ")].splitlines()

@@ -13,7 +13,7 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.complaints import as_json, no_such
@@ -108,7 +108,7 @@ def _as_plain_values(
         node = cfg.hydra if "hydra" in cfg else HydraConfig.get()
         _check_found(node, names)
         folders = searched_folders(node)
-        place_of = partial(_place_of, _words_of(node), names, folders)
+        place_of = partial(_place_of, words_in(node.overrides.task), names, folders)
     return plain(own, may_lack=may_lack), names, place_of, folders
 
 
@@ -164,7 +164,7 @@ def _check_found(node: Any, names: Mapping[str, str]) -> None:
     }
     for group, own_recipe in own_recipes.items():
         recipe = names.get(group)
-        is_said = any(word.startswith(f"{group}=") for word in _words_of(node))
+        is_said = any(word.startswith(f"{group}=") for word in words_in(node.overrides.task))
         if recipe is None or (recipe == own_recipe and not is_said):
             continue
         if recipe not in names_of(group):
@@ -259,7 +259,7 @@ def compose(overrides: list[str]) -> DictConfig:
         MissingChoiceError: no folder has the yaml file that a word chooses.
     """
     if HydraConfig.initialized():
-        given = HydraConfig.get().overrides.hydra
+        given = words_in(HydraConfig.get().overrides.hydra)
         overrides = [*(word for word in given if word.startswith("hydra.searchpath=")), *overrides]
     try:
         if GlobalHydra.instance().is_initialized():
@@ -283,13 +283,12 @@ def chosen_names(cfg: DictConfig) -> Mapping[str, str]:
 
 def job_overrides() -> list[str]:
     """Return the words of the running job's command line, as the user wrote them."""
-    return _words_of(HydraConfig.get())
+    return words_in(HydraConfig.get().overrides.task)
 
 
-def _words_of(node: Any) -> list[str]:
-    words = OmegaConf.to_container(node.overrides.task, resolve=False)
-    assert isinstance(words, list)
-    return [str(word) for word in words]
+def words_in(node: ListConfig) -> list[str]:
+    """Return the words that a part of Hydra's config lists, without resolving `${` in them."""
+    return [str(word) for word in OmegaConf.to_container(node, resolve=False)]
 
 
 def names_of(group: str) -> tuple[str, ...]:

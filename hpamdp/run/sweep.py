@@ -21,7 +21,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from hpamdp.config.compose import job_overrides, setting_of
+from hpamdp.config.compose import job_overrides, setting_of, words_in
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.files import replacing
@@ -76,7 +76,7 @@ class SweepFolderCallback(Callback):
 
 def _check_effects(config: DictConfig, settings: tuple[str, ...], effect: str) -> None:
     """Exit if the command line gives some of these settings of Hydra, which have no effect here."""
-    for word in config.hydra.overrides.hydra:
+    for word in words_in(config.hydra.overrides.hydra):
         if setting_of(word).startswith(settings):
             warn(one_line(f"{word}: {effect}"))
             sys.exit(MISTAKE)
