@@ -235,24 +235,6 @@ def test_a_copy_made_from_a_state_dict_continues_identically(name, memory):
     assert torch.equal(play(target, by_sign, 60, 2)[0], expected)
 
 
-@every_bandit
-@pytest.mark.parametrize(
-    ("entry", "number", "complaint"),
-    [
-        ("statistics.recent_options", 2, "option holds 2 to 2, but must be 0 to 1"),
-        ("statistics.counts", -1.0, r"statistics\.counts holds -1\.0, but must be at least 0"),
-        ("gram", -1.0, r"gram holds -1\.0 on its diagonal, but must be at least 0 there"),
-    ],
-)
-def test_a_state_that_no_decisions_lead_to_is_refused(name, entry, number, complaint):
-    bandit = make(name, memory="sliding_window", window=5)
-    teach(bandit, 7, at_once=1)
-    state = bandit.state_dict()
-    bandit.check_state(state)
-    with pytest.raises(ValueError, match=complaint):
-        bandit.check_state({**state, entry: torch.full_like(state[entry], number)})
-
-
 def test_the_context_is_the_observation_at_which_the_option_was_chosen():
     bandit = make("linucb", degree=1)
     decisions = ended(due(torch.ones(4, 2), option=torch.zeros(4, dtype=torch.long)), torch.ones(4))

@@ -395,7 +395,6 @@ def test_the_ratios_of_an_actors_sequences_are_one_before_an_update():
     selector, _ = decided("actor", "gru", minibatch_size=1000, sequence_length=2)
     rows = torch.cat(selector.waiting)
     assert rows["starts"].sum() > rows["begins"].sum() > 0
-    selector.check_state(selector.state_dict())
     log_probs = selector.logits(selector.features(rows)).log_softmax(-1)
     now = log_probs.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
     torch.testing.assert_close(now, rows["log_prob"])

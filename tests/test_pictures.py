@@ -217,7 +217,6 @@ def test_replay_holds_bytes_and_samples_what_was_stored(make):
     everything = batch[keys.OBSERVATION].reshape(-1, specs.observation_dim)
     assert sample["state"].dtype == everything.dtype
     assert all((everything == state).all(-1).any() for state in sample["state"])
-    learner.check_rows(learner.buffer[:], learner.replay_rows(batch)["buffer"])
     env.close()
 
 
@@ -240,25 +239,11 @@ def test_a_selectors_replay_holds_bytes_and_samples_what_was_stored(memory):
     sample = selector._sample()
     everything = observation.reshape(-1, specs.observation_dim)
     assert all((everything == state).all(-1).any() for state in sample["state"])
-    selector.check_rows(selector.buffer[:], selector.replay_rows(batch)["buffer"])
     env.close()
 
 
 def tiny(entry: ObservationEntry) -> CNN:
     return CNN(entry, channels=(4, 4, 4), num_features=8)
-
-
-def test_rows_with_numbers_that_are_not_finite_are_refused_among_the_bytes():
-    env = GymnasiumEnv(2, make=Mixed, max_steps=5)
-    batch, specs = with_decisions(env).rollout(3), PAMDPSpecs.from_env(env)
-    learner = PDQN(replace(specs, encoder=tiny), hidden_dims=(16,), batch_size=4, buffer_size=64)
-    rows = learner.replay_rows(batch)["buffer"]
-    wrong = rows.clone()
-    wrong["state"][0, :4] = torch.tensor([float("nan")]).view(torch.uint8)
-    learner.check_rows(rows, rows)
-    with pytest.raises(ValueError, match="state is not finite"):
-        learner.check_rows(wrong, rows)
-    env.close()
 
 
 # Encoders.

@@ -581,27 +581,10 @@ class HierarchicalAgent(nn.Module):
             batch = self.next_options.with_ends(batch)
         owner, _, part = name.partition("_")
         if owner == "selector":
-            return self._level(owner).replay_rows(self._seen_by_selector(batch)).get(part)
+            assert self.selector is not None
+            return self.selector.replay_rows(self._seen_by_selector(batch)).get(part)
         views = {f"learner{i}": view for i, view in enumerate(self._views(batch))}
         return views[owner].learner.replay_rows(views[owner].batch).get(part) if owner in views else None
-
-    def check_rows(self, name: str, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse invalid saved rows of a replay buffer.
-
-        Args:
-            name: the buffer's name in `stateful`.
-            rows: the saved rows.
-            example: the rows that `replay_rows` returned.
-
-        Raises:
-            ValueError: a row is invalid.
-        """
-        self._level(name.partition("_")[0]).check_rows(rows, example)
-
-    def _level(self, owner: str) -> Level:
-        level = self.selector if owner == "selector" else self.learners[int(owner.removeprefix("learner"))]
-        assert isinstance(level, Level)
-        return level
 
     def exported(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to act greedily; None if a part cannot be exported.

@@ -17,7 +17,6 @@ from hpamdp.acting import is_greedy
 from hpamdp.cards import ActionFeature, LearnerCard, LevelCard, SelectorCard
 from hpamdp.messages import as_code
 from hpamdp.policies.masks import sample_index
-from hpamdp.policies.stored_rows import check_stored_rows
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
@@ -172,12 +171,10 @@ class Level:
     Attributes:
         specs: sizes and bounds of the problem.
         card: what the class declares.
-        may_be_nan: the columns of the replay buffer that may hold NaN.
         export_refusal: why its greedy policy cannot be exported to ONNX. If None, it can.
     """
 
     card: ClassVar[LevelCard]
-    may_be_nan: ClassVar[frozenset[str]] = frozenset()
     export_refusal: str | None = None
     specs: PAMDPSpecs
 
@@ -222,27 +219,6 @@ class Level:
         rows are not compared.
         """
         return {}
-
-    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse invalid saved rows `[N]` of a replay buffer.
-
-        Args:
-            rows: the rows to put into the buffer.
-            example: the rows that `replay_rows` returned.
-
-        Raises:
-            ValueError: a row is invalid.
-        """
-        check_stored_rows(rows, self.specs, self.may_be_nan)
-
-    def check_state(self, state: Mapping[str, Any]) -> None:
-        """Refuse a state dict with the right names and shapes but invalid values.
-
-        Called before `load_state_dict`. Override it if finite numbers are not enough.
-
-        Raises:
-            ValueError: a value is invalid.
-        """
 
     def exported(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to act greedily; None if it cannot be exported.

@@ -24,7 +24,6 @@ Differs from the sources:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -74,18 +73,6 @@ class Practice(nn.Module):
         With the remaining probability the selector chooses.
         """
         return torch.full_like(self.own_steps, float(frames < self.uniform_steps) / len(self.own_steps)).float()
-
-    def check_state(self, state: Mapping[str, Tensor]) -> None:
-        """Refuse counts below 0, and bins without a width.
-
-        Raises:
-            ValueError: the state is invalid.
-        """
-        for name in ("own_steps", "counts", "squares"):
-            if name in state and (state[name] < 0.0).any():
-                raise ValueError(f"{name} holds {float(state[name].min())}, but must be at least 0")
-        if "width" in state and not state["width"] > 0.0:
-            raise ValueError(f"width is {float(state['width'])}, but must be above 0")
 
     def add(self, options: Tensor, decided: Tensor, returns: Tensor) -> None:
         """Count the steps that each option practised, and record its returns.

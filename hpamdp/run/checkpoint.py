@@ -31,8 +31,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import first_line, reason_of, warn
 from hpamdp.policies.agent import FOR_TRAINING, HierarchicalAgent
-from hpamdp.policies.base import Learner, Level, added_later
-from hpamdp.policies.practice import Practice
+from hpamdp.policies.base import Learner, added_later
 from hpamdp.policies.shared.on_policy import WAITING
 from hpamdp.run import state_file
 from hpamdp.run.state_checks import (
@@ -266,7 +265,7 @@ def load(
             saved = opened.part(name, device)
             if name in buffers:
                 assert steps is not None
-                loaded[name] = _state_for_replay(name, stateful[name], saved, agent.replay_rows(name, steps), agent)
+                loaded[name] = _state_for_replay(name, stateful[name], saved, agent.replay_rows(name, steps))
             else:
                 loaded[name] = _state_for_other(name, stateful[name], saved)
     names = STATES if with_training else STATES[:1]
@@ -378,10 +377,6 @@ def _state_for(module: nn.Module, saved: Any, file: Path, *, may_lack: str = "")
             raise ConfigError(f"{file}: {error}; take an earlier checkpoint") from error
         if not torch.equal(first.setdefault(id(value), tensor), tensor):
             raise ValueError(f"{key} differs from another name of the same weights")
-    for prefix, part in module.named_modules():
-        if isinstance(part, Level | Practice):
-            start = f"{prefix}." if prefix else ""
-            part.check_state({key.removeprefix(start): state[key] for key in state if key.startswith(start)})
     return state
 
 
@@ -408,9 +403,7 @@ def _replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
     return {"rows": rows, "write_count": buffer._writer.state_dict()["_write_count"]}
 
 
-def _state_for_replay(
-    name: str, buffer: ReplayBuffer, saved: Any, example: TensorDictBase | None, agent: HierarchicalAgent
-) -> dict[str, Any]:
+def _state_for_replay(name: str, buffer: ReplayBuffer, saved: Any, example: TensorDictBase | None) -> dict[str, Any]:
     """Return the arguments with which `_fill` fills a replay buffer.
 
     Args:
@@ -418,17 +411,15 @@ def _state_for_replay(
         buffer: the buffer.
         saved: the saved contents.
         example: rows as the buffer holds them; None if its owner does not override `replay_rows`.
-        agent: the agent.
 
     Raises:
-        ValueError: the contents are of another buffer, or hold invalid numbers.
+        ValueError: the contents are of another buffer.
     """
     state = checked(_ReplayState, saved)
     num = min(state.write_count, buffer._storage.max_size)
     rows = TensorDict(state.rows, [num])
     if num and example is not None:
         check_like(f"{name}.rows", rows.to_dict(), example.to_dict(), any_rows=True)
-        agent.check_rows(name, rows, example)
     return {"rows": rows, "write_count": state.write_count}
 
 

@@ -159,22 +159,6 @@ class Actor(OnPolicy, RemembersDecisions):
             rows["allowed"] = decisions.get(ALLOWED)
         return TensorDict(rows, batch_size=decisions.shape)
 
-    def empty_rows(self) -> dict[str, Tensor]:
-        """Return the columns of `rows`."""
-        number = torch.zeros(0, dtype=torch.float32)
-        if self.stores_features:
-            state = torch.zeros(0, self.perception.specs.observation_dim, dtype=torch.float32)
-        else:
-            state = torch.zeros(0, self.specs.observation_dim, dtype=self.specs.observation_dtype)
-        columns = {"state": state, "option": number.long()}
-        columns |= dict.fromkeys(("log_prob", "weight", "target"), number)
-        if self.specs.has_option_mask:
-            columns["allowed"] = torch.zeros(0, self.specs.num_options, dtype=torch.bool)
-        if self.perception.is_recurrent and self.perception.memory is not None:
-            columns["memory"] = torch.zeros(0, self.perception.memory.size, dtype=torch.float32)
-            columns |= dict.fromkeys(("begins", "starts"), number.bool())
-        return columns
-
     def features(self, rows: Mapping[str, Tensor]) -> Tensor:
         """Return what policy and critic see of rows `[N]`, `[N, perception.specs.observation_dim]`."""
         if self.perception.is_recurrent:

@@ -83,10 +83,6 @@ class MetaCritic(RemembersDecisions):
             rows["previous"] = torch.zeros_like(rows["option"])
         return {"buffer": packed_states(rows.flatten(), self.specs)}
 
-    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse invalid saved rows `[N]`; see `Level.check_rows`."""
-        super().check_rows(unpacked_states(rows.copy(), self.specs), example)
-
     def exported(self) -> dict[str, Any] | None:
         """Return the critics, unless they see features: see `hpamdp.policies.shared.exported_policy`."""
         return exported_ensemble(self.critics) if self.perception.is_plain else None

@@ -242,28 +242,6 @@ class HPPO(OnPolicy, Learner):
                 rows["raw_advantage"] = rows["advantage"]
         return TensorDict(rows, batch_size=[int(mask.sum())])
 
-    def empty_rows(self) -> dict[str, Tensor]:
-        """Return the columns of `rows`."""
-        number = torch.zeros(0, dtype=torch.float32)
-        choice = torch.zeros(0, *self.specs.components.shape, dtype=torch.float32)
-        columns = {keys.OBSERVATION: torch.zeros(0, self.specs.observation_dim, dtype=self.specs.observation_dtype)}
-        columns[RAW] = torch.zeros(0, self.specs.num_parameters, dtype=torch.float32)
-        columns |= {"discrete": choice.long(), "advantage": number, "target": number}
-        columns |= {"discrete_log_prob": choice, "parameter_log_prob": choice}
-        if self.credit_critic is not None:
-            columns |= {BASELINE: choice, "raw_advantage": number}
-        if self.is_overruled:
-            columns[OWN] = number
-        if self.specs.has_action_mask:
-            columns[keys.ACTION_MASK] = torch.zeros(0, self.specs.num_discrete, dtype=torch.bool)
-        if self.specs.has_pair_mask:
-            columns[keys.PAIR_MASK] = torch.zeros(0, *[self.specs.num_discrete] * 2, dtype=torch.bool)
-        if self.perception.memory is not None:
-            columns["memory"] = torch.zeros(0, self.perception.memory.size, dtype=torch.float32)
-        if self.perception.is_recurrent:
-            columns |= dict.fromkeys(("begins", "starts"), number.bool())
-        return columns
-
     @torch.no_grad()
     def advantages(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return the generalised advantages and the targets of V, each `[*B, T]`; only the rows in `mask` are valid.

@@ -243,7 +243,6 @@ class HyAR(ReplayLearner):
 
     Options = HyAROptions
     card = CARDS["HyAR"]
-    may_be_nan: ClassVar[frozenset[str]] = frozenset({LATENT})
     progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"episodes", "warmup_rows"}
 
     options: HyAROptions

@@ -34,7 +34,6 @@ Differs from the source:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -556,40 +555,6 @@ class QPAMDP(Learner):
                 score = score * ~batch[keys.IS_HELD].unsqueeze(-1)
             rows["gradient"] = (score.unsqueeze(-1) * psi.unsqueeze(-2)).flatten(-2)
         return TensorDict(rows, batch_size=mask.shape)
-
-    def check_state(self, state: Mapping[str, Any]) -> None:
-        """Refuse sizes that do not fit together, and phases that do not exist.
-
-        Raises:
-            ValueError: the state is invalid.
-        """
-        num_features = []
-        for name, weights in (("phi", state["policy.w"]), ("psi", state["policy.theta"])):
-            basis: FourierBasis = getattr(self.policy, name)
-            basis.check_state({key: state[f"policy.{name}.{key}"] for key, _ in basis.named_buffers()}, len(self.low))
-            num_features.append(len(state[f"policy.{name}.coefficients"]))
-            if weights.shape[-1] != num_features[-1]:
-                raise ValueError(f"{name} has {num_features[-1]} features, but {weights.shape[-1]} weights for each")
-        num_discrete, num_parameters = self.specs.num_discrete, self.specs.num_parameters
-        if len(state["policy.w"]) != num_discrete or len(state["policy.theta"]) != num_parameters:
-            raise ValueError(f"the weights are not of {num_discrete} discrete actions and {num_parameters} parameters")
-        traces = state["sarsa.traces"]
-        if len(traces) and traces.shape[1:] != state["policy.w"].shape:
-            raise ValueError(f"traces {list(traces.shape)} do not fit weights {list(state['policy.w'].shape)}")
-        sizes = {key: list(state[f"enac.{key}"].shape) for key, _ in self.enac.named_buffers()}
-        num, num_regressors = sizes["regressors"]
-        expected = {"is_fresh": [num], "is_whole": [num], "regressors": [num, num_regressors], "returns": [num]}
-        expected |= {"gram": [num_regressors] * 2, "moment": [num_regressors], "num_episodes": []}
-        if sizes != expected or (num_regressors and num_regressors != state["policy.theta"].numel() + num_features[0]):
-            raise ValueError("the parts of the regression do not fit together")
-        lengths = {len(state[name]) for name in ("open.is_open", "open.value") if name in state}
-        if len(lengths) > 1:
-            raise ValueError("open.is_open and open.value differ in length")
-        if state["phase"] not in (SARSA, PARAMETERS):
-            raise ValueError(f"phase is {int(state['phase'])}, but must be {SARSA} or {PARAMETERS}")
-        for name in ("policy.temperature", "policy.sigma", "sarsa.step_size"):
-            if not state[name] > 0.0:
-                raise ValueError(f"{name} is {float(state[name])}, but must be greater than 0")
 
 
 def check_features(options: QPAMDPOptions, specs: PAMDPSpecs) -> None:

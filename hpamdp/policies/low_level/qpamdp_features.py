@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -73,25 +72,6 @@ class FourierBasis(SizedByData):
         self.low = low
         self.width = (high - low).clamp(min=1e-6)
         self.coefficients = fourier_coefficients(len(inputs), self.order, self.max_coupled).to(low)
-
-    def check_state(self, state: Mapping[str, Tensor], observation_dim: int) -> None:
-        """Refuse buffers that `fit` cannot have set.
-
-        Args:
-            state: the buffers by name.
-            observation_dim: length of the observations.
-
-        Raises:
-            ValueError: a buffer is invalid.
-        """
-        inputs, width = state["inputs"], state["width"]
-        num = len(inputs)
-        wanted = fourier_coefficients(num, self.order, self.max_coupled)
-        is_fitted = torch.equal(state["coefficients"].cpu(), wanted)
-        if not is_fitted and not torch.equal(state["coefficients"].cpu(), torch.zeros(1, 1, dtype=torch.float32)):
-            raise ValueError(f"coefficients are not those of order {self.order} for {num} entries")
-        if len(state["low"]) != num or len(width) != num or (inputs >= observation_dim).any() or (width <= 0.0).any():
-            raise ValueError(f"inputs, low and width must be of the same entries of {observation_dim}")
 
     def step_scale(self) -> Tensor:
         """Return the factor 1 / ||c|| on the step of each feature's weight, 1 for the constant, `[num_features]`.

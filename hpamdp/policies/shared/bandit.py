@@ -7,7 +7,7 @@ their episodes, or as the trips in these.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
@@ -19,7 +19,6 @@ from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.bandit_options import BANDIT_CARD, BanditOptions
-from hpamdp.policies.stored_rows import check_choices
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -105,19 +104,6 @@ class RewardStatistics(nn.Module):
         self.counts.mul_(fade).index_add_(0, options, weights)
         self.sums.mul_(fade).index_add_(0, options, weights * rewards)
         self.squares.mul_(fade).index_add_(0, options, weights * rewards.square())
-
-
-def check_statistics(state: Mapping[str, Any], specs: PAMDPSpecs) -> None:
-    """Refuse negative counts and decisions for options that do not exist in the state dict of a bandit.
-
-    Raises:
-        ValueError: the state is invalid.
-    """
-    for name, value in state.items():
-        if name.endswith(("counts", "squares")) and (value < 0.0).any():
-            raise ValueError(f"{name} holds {float(value.min())}, but must be at least 0")
-        if name.endswith("recent_options"):
-            check_choices({"option": value[value >= 0]}, specs)
 
 
 class Bandit(Selector):
@@ -208,14 +194,6 @@ class Bandit(Selector):
     def has_updated(self) -> bool:
         """Return whether any reward is known."""
         return bool(self.statistics.counts.any())
-
-    def check_state(self, state: Mapping[str, Any]) -> None:
-        """Refuse negative counts and decisions for options that do not exist.
-
-        Raises:
-            ValueError: the state is invalid.
-        """
-        check_statistics(state, self.specs)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add the rewards of finished decisions, oldest first; return the mean of each option's known rewards."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
@@ -16,7 +16,7 @@ from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit import RewardStatistics, above_all, check_statistics
+from hpamdp.policies.shared.bandit import RewardStatistics, above_all
 from hpamdp.policies.shared.bandit_options import LINEAR_BANDIT_CARD, LinearBanditOptions
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -188,17 +188,6 @@ class LinearBandit(Selector):
     def has_updated(self) -> bool:
         """Return whether any reward is known."""
         return bool(self.statistics.counts.any())
-
-    def check_state(self, state: Mapping[str, Any]) -> None:
-        """Refuse negative counts and sums of squares, and decisions for options that do not exist.
-
-        Raises:
-            ValueError: the state is invalid.
-        """
-        check_statistics(state, self.specs)
-        squares = state["gram"].diagonal(dim1=-2, dim2=-1)
-        if (squares < 0.0).any():
-            raise ValueError(f"gram holds {float(squares.min())} on its diagonal, but must be at least 0 there")
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add finished decisions, oldest first; return the mean reward of each option among them."""

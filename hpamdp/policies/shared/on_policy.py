@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
 from hpamdp.policies.shared.options import OnPolicyOptions
-from hpamdp.policies.stored_rows import check_choices
 from hpamdp.specs import PAMDPSpecs
 
 # PyTorch's name of an extra state in a state dict: the waiting rows. A saved learner for a new run is read without it.
@@ -44,34 +43,6 @@ class OnPolicy(nn.Module):
     def set_extra_state(self, state: list[dict[str, Tensor]]) -> None:
         """Restore the waiting rows from a state dict."""
         self.waiting = [TensorDict(rows).auto_batch_size_(1) for rows in state]
-
-    def empty_rows(self) -> dict[str, Tensor]:
-        """Return the columns of the rows that an update needs, each empty `[0, ...]`."""
-        raise NotImplementedError
-
-    def check_state(self, state: Mapping[str, Any]) -> None:
-        """Refuse waiting rows with other columns than `empty_rows` has, or with invalid numbers.
-
-        Raises:
-            ValueError: the rows are invalid.
-        """
-        waiting, columns = state.get(WAITING, []), self.empty_rows()
-        if not isinstance(waiting, list) or not all(isinstance(rows, dict) for rows in waiting):
-            raise ValueError("the waiting rows are no list of dicts")
-        num = 0
-        for rows in waiting:
-            if rows.keys() != columns.keys() or not all(isinstance(column, Tensor) for column in rows.values()):
-                raise ValueError(f"the waiting rows must have tensors {', '.join(columns)}")
-            lengths = {len(column) if column.ndim else -1 for column in rows.values()}
-            for name, column in columns.items():
-                if len(lengths) > 1 or rows[name].shape[1:] != column.shape[1:] or rows[name].dtype != column.dtype:
-                    raise ValueError(f"the waiting rows' {name} has another shape or dtype")
-                if not rows[name].isfinite().all():
-                    raise ValueError(f"the waiting rows' {name} is not finite")
-            check_choices(rows, self.specs)
-            num += lengths.pop()
-        if num >= self.options.minibatch_size:
-            raise ValueError(f"{num} rows wait, but an update needs {self.options.minibatch_size}")
 
     def gather(self, rows: TensorDict) -> TensorDict | None:
         """Add rows `[N]` to those waiting; once there are `minibatch_size` or more, hand over all of them.

@@ -270,10 +270,6 @@ class ReplayLearner(Learner):
                 sample = sample.set("unit", self._all_parameters(sample["discrete"], sample["unit"]))
             yield self.augmented(sample)
 
-    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse invalid saved rows `[N]`; see `Level.check_rows`."""
-        super().check_rows(unpacked_states(rows.copy(), self.specs), example)
-
     def augmented(self, sample: TensorDictBase) -> TensorDictBase:
         """Return a sample `[N, *]` with each row mapped by a random symmetry of the problem, if `augment` is set."""
         return sample if self.symmetry is None else self.symmetry(sample)

@@ -8,10 +8,7 @@ from torch import nn
 
 
 class SizedByData(nn.Module):
-    """A module whose buffers are sized by data; loading a state dict resizes them to what was saved.
-
-    The learner says in `check_state` which sizes fit together.
-    """
+    """A module whose buffers are sized by data; loading a state dict resizes them to what was saved."""
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         for name, buffer in list(self.named_buffers(recurse=False)):

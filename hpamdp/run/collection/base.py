@@ -13,7 +13,6 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.cards import CollectorCard
-from hpamdp.policies.stored_rows import check_choices
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.state_checks import SavedPart, check_generator, check_like, checked, example_steps
 
@@ -83,19 +82,6 @@ def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, 
     if "collector" in saved:  # TorchRL's numbers of trajectories
         own["collector"] = {"traj_ids": example.get(keys.DONE).squeeze(-1).long()}
     check_like(where, saved, own)
-    steps = TensorDict(saved)
-    for key in parts.env.fake_tensordict().keys(include_nested=True, leaves_only=True):
-        value = steps.get(key, None)
-        if value is not None and not value.isfinite().all():
-            raise ValueError(f"{where}: {key} is not finite")
-    choices = {"discrete": steps.get(keys.DISCRETE, None), "option": steps.get(keys.OPTION, None)}
-    check_choices({name: column for name, column in choices.items() if column is not None}, parts.agent.specs)
-    held = steps.get(keys.HOLD_DISCRETE, None)
-    if held is not None:
-        check_choices({"discrete": held}, parts.agent.specs)
-    lengths, chosen = parts.agent.option_lengths, steps.get(keys.OPTION_LENGTH, None)
-    if lengths and chosen is not None and not {*chosen.unique().tolist()} <= {*lengths}:
-        raise ValueError(f"{where}: option_length holds {chosen.unique().tolist()}, but must be of {list(lengths)}")
 
 
 def random_seeds(seed: int, first_env: int, frames: int, restart: int = 0) -> tuple[int, int]:

@@ -286,14 +286,6 @@ class DLPA(ReplayLearner):
         previous = torch.cat([last_place.unsqueeze(-1), place[:, :-1]], -1)
         self.buffer[:]["successor"][previous[follows]] = place[follows]
 
-    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse invalid rows, and links to steps or environments that do not exist."""
-        super().check_rows(rows, example)
-        limits = {"successor": len(rows), "environment": int(example["environment"].max()) + 1}
-        for name, limit in limits.items():
-            if not -1 <= int(rows[name].min()) <= int(rows[name].max()) < limit:
-                raise ValueError(f"{name} must be from -1 to {limit - 1}")
-
     def _open_steps(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return which stored step each environment goes on from: its place and its trajectory, each `[N]`.
 
