@@ -53,7 +53,7 @@ coverage: $(VENV)/.installed-dev
 slow-tests: $(SLOW)/.installed
 	$(SLOW)/bin/python -m pytest -n 2 --dist worksteal -m slow -k 'not ($(RAY_TEST))' $(ARGS)
 	$(SLOW)/bin/python -m pytest tests/test_sweeps.py -k 'not missing_launcher' $(ARGS)
-	$(SLOW)/bin/python -m pytest tests/test_primitives.py $(ARGS)
+	$(SLOW)/bin/python -m pytest tests/test_primitives.py tests/test_rddl.py $(ARGS)
 	$(SLOW)/bin/python -m pytest tests/test_traffic.py tests/test_pages.py tests/test_default_dtype.py -k traffic $(ARGS)
 
 ray-launcher: $(RAY)/.installed
@@ -109,7 +109,7 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 
 $(SLOW)/.installed: pyproject.toml constraints.txt
 	$(venv)
-	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray,browser,video,traffic,robots]'
+	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray,browser,video,traffic,robots,rddl]'
 	@touch $@
 
 # This launcher wants cloudpickle < 3, so it has constraints of its own; without them pip searches for an hour.

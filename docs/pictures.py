@@ -34,13 +34,17 @@ PLAYERS = {
         *("env=traffic", "env.render=true", "env.minutes=15", "env.strategies=true"),
         *("env.grouping={max_pressure:[max_pressure]}", "high=uniform", "low=random"),
     ],
+    "rddl": [
+        *("env=rddl", "env.domain=Intruders_Continuous", "env.max_steps=60", "env.render=true"),
+        *("high=none", "low=random"),
+    ],
     "circuit": ["env=circuit", "env.task=toffoli", "high=none", "low=planner"],
 }
 
 
 # A session has several trips, traffic's episodes are long, and the planner's circuits are all the same; three episodes
-# elsewhere.
-EPISODES = {"boatdock_unseen": "1", "traffic": "1", "circuit": "1"}
+# elsewhere. Of RDDL one domain stands for all.
+EPISODES = {"boatdock_unseen": "1", "traffic": "1", "circuit": "1", "rddl": "1"}
 
 
 def film_primitives(to: Path) -> None:

@@ -118,7 +118,7 @@ def choices(group: str) -> list[str]:
 
 
 # The simulators of problems that need an extra that `dev` lacks.
-SIMULATORS = {"traffic": "libsumo", "primitives": "metaworld"}
+SIMULATORS = {"traffic": "libsumo", "primitives": "metaworld", "rddl": "pyRDDLGym"}
 
 
 def buildable(problems: Iterable[str]) -> list:

@@ -20,7 +20,7 @@ from hpamdp.run.train import run
 
 FOLDER = Path(__file__).resolve().parent.parent / "agents"
 # Those of others have none, the released rules are there for comparisons, and pictures are another view of a problem.
-PROBLEMS = {*choices("env")} - {"gymnasium", "boatdock_released", "catch_point_picture"}
+PROBLEMS = {*choices("env")} - {"gymnasium", "rddl", "boatdock_released", "catch_point_picture"}
 AGENTS = sorted(folder.name for folder in FOLDER.iterdir() if folder.is_dir())
 
 

@@ -124,7 +124,7 @@ def test_environments_and_policies_do_not_know_each_other():
 def test_a_problem_knows_no_other_but_the_other_boats_the_boats_and_those_on_gymnasium_gymnasium():
     allowed = {
         "boatdock": {"boatdock_released", "boatdock_unseen"},
-        "gymnasium": {"lunar_lander", "primitives", "traffic"},
+        "gymnasium": {"lunar_lander", "primitives", "rddl", "traffic"},
     }
     rooms = {module.split(".")[2] for module in FILES if is_in(module, "hpamdp.env") and module.count(".") == 3}
     assert {"boatdock", "boatdock_released", "gymnasium", "platform"} <= rooms

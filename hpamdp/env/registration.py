@@ -45,6 +45,7 @@ _OTHERS: dict[str, dict[str, Any]] = {
     "SweepInto": {"entry_point": _MANIPULATION, "kwargs": {"task": "sweep_into"}},
     "Assembly": {"entry_point": _MANIPULATION, "kwargs": {"task": "assembly"}},
     "Disassemble": {"entry_point": _MANIPULATION, "kwargs": {"task": "disassemble"}},
+    "RDDL": {"entry_point": "rddl.problem:RDDLProblem"},
     "TrafficCrossing": {"entry_point": _LIGHTS, "kwargs": {"network": "crossing"}},
     "TrafficCorridor": {"entry_point": _LIGHTS, "kwargs": {"network": "corridor"}},
 }

@@ -535,7 +535,8 @@ class GymnasiumEnv(PAMDPEnv):
 class SimulatorEnv(GymnasiumEnv):
     """A problem with settings of its own, whose copies are Gymnasium environments of the class `simulator`.
 
-    See `GymnasiumEnv` for the arguments and the errors.
+    Settings that have the name of a setting of `GymnasiumEnv`, such as `max_steps`, mean the same. See `GymnasiumEnv`
+    for the arguments and the errors.
     """
 
     Options: ClassVar[type[Settings]]
@@ -558,17 +559,9 @@ class SimulatorEnv(GymnasiumEnv):
         rules = {name: getattr(given, name) for name in self.simulator_options.model_fields}
         make = partial(self.simulator, render_mode="rgb_array" if given.render else None, **rules)
         update_wrapper(make, self.simulator)  # so that errors name the simulator
-        super().__init__(
-            num_envs,
-            make=make,
-            device=device,
-            seed=seed,
-            first_env=first_env,
-            max_steps=getattr(given, "max_steps", None),
-            reward_scaling=given.reward_scaling,
-            num_workers=given.num_workers,
-            **self.reading,
-        )
+        shared = dict(given).keys() & GymnasiumOptions.model_fields.keys() - rules.keys()
+        reading = {**self.reading, **{name: getattr(given, name) for name in shared}}
+        super().__init__(num_envs, make=make, device=device, seed=seed, first_env=first_env, **reading)
         self.options = given
         self._prepare()
 

@@ -1,0 +1,1 @@
+"""Planning problems in RDDL, simulated by pyRDDLGym."""

@@ -1,0 +1,38 @@
+"""Problems of pyRDDLGym as one batched TorchRL environment."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hpamdp.env.gymnasium.environment import SimulatorEnv
+from hpamdp.env.rddl.options import CARDS, RDDLOptions, RDDLRules
+from hpamdp.env.rddl.problem import RDDLProblem
+
+
+class RDDLEnv(SimulatorEnv):
+    """Step `num_envs` copies of an RDDL problem, one after another or in processes.
+
+    `observation` float32 `[N, D]`: the fluents of the state, or those that the instance shows. See `RDDLProblem` for
+    the action, and `GymnasiumEnv` for the arguments and the errors.
+    """
+
+    Options = RDDLOptions
+    card = CARDS["RDDLEnv"]
+    options: RDDLOptions
+    simulator = RDDLProblem
+    simulator_options = RDDLRules
+
+    def _prepare(self) -> None:
+        self.discrete_names = self._copies.call("discrete_names")[0]
+        self.observation_names = self._copies.call("observation_names")[0]
+
+    def file_checksums(self) -> dict[str, Tensor]:
+        """Return the checksum of files of one's own, int64 `[1]`; nothing for a problem of rddlrepository."""
+        if self.options.files is None:
+            return {}
+        checksum = zlib.crc32(b"".join(Path(file).read_bytes() for file in self.options.files))
+        return {"files_checksum": torch.tensor([checksum], dtype=torch.int64, device=self.device)}
