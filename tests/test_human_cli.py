@@ -98,7 +98,7 @@ def test_a_recording_without_a_press_is_checked_and_summarised_and_gives_no_tran
     error = error_of(capsys, "export", path, "--any-file", "--format", "memmap", "--to", tmp_path / "rows")
     assert error == "the episodes have no logged press\n"
     with pytest.raises(DataError, match=r"^the episodes have no logged press$"):
-        HumanExperienceReplay(4, path=path, root=tmp_path / "root", checksum=None)
+        HumanExperienceReplay(4, path=path, checksum=None)
     for rest_to_rest in (True, False):
         with pytest.raises(DataError, match=r"^the episodes have no logged press$"):
             HumanDemonstrations(BoatDockEnv(1), path=str(path), checksum=None, rest_to_rest=rest_to_rest)

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import pickle
 import re
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +17,7 @@ from hpamdp.data.demonstrations import TRAJECTORY
 from hpamdp.data.human import minari
 from hpamdp.data.human.dataset import HumanExperienceReplay, slices, whole_episodes
 from hpamdp.data.human.episodes import keep, scores_by_person, select
-from hpamdp.data.human.released_file import PATH_VARIABLE, HumanData, read
+from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.data.human.transitions import decisions, transitions
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
@@ -203,36 +198,12 @@ def test_selected_episodes_meet_every_condition_and_keep_their_presses(data):
         select(data, best_people=9)
 
 
-def test_replay_buffer_is_memory_mapped_and_complete(path, tmp_path, data):
-    arguments = dict(path=path, root=tmp_path, checksum=None)
-    buffer = HumanExperienceReplay(32, reward="sparse", **arguments)
+def test_replay_buffer_is_complete(path, data):
+    buffer = HumanExperienceReplay(32, reward="sparse", path=path, checksum=None)
     assert len(buffer) == len(data.presses) and buffer.sample().shape == (32,)
     assert buffer[:].exclude("index")[keys.OBSERVATION].equal(transitions(data)[keys.OBSERVATION])
-    assert (buffer.data_path / "observation.memmap").exists()
-    assert [folder.name for folder in tmp_path.iterdir()] == [buffer.data_path.name]
-    with pytest.raises(DataError):
-        HumanExperienceReplay(32, best_people=9, **arguments)
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_replay_buffer_made_once_is_found_again(path, tmp_path, monkeypatch):
-    checksum = hashlib.sha256(path.read_bytes()).hexdigest()
-    made = HumanExperienceReplay(4, path=path, root=tmp_path, checksum=checksum, complete=True)
-    monkeypatch.setenv(PATH_VARIABLE, "nowhere")
-    found = HumanExperienceReplay(4, root=tmp_path, checksum=checksum, complete=True)
-    assert found.data_path == made.data_path and len(found) == len(made)
-    with pytest.raises(DataError, match="no such file"):
-        HumanExperienceReplay(4, root=tmp_path, checksum=checksum, complete=False)
-
-
-def test_a_path_that_is_given_must_be_the_file_even_if_its_rows_are_there(path, tmp_path):
-    arguments = dict(root=tmp_path / "root", checksum=hashlib.sha256(path.read_bytes()).hexdigest())
-    HumanExperienceReplay(4, path=path, **arguments)
-    with pytest.raises(DataError, match="nowhere: there is no such file"):
-        HumanExperienceReplay(4, path="nowhere", **arguments)
-    (tmp_path / "other.mat").write_bytes(path.read_bytes()[:-1])
     with pytest.raises(DataError, match="truncated, altered or another file"):
-        HumanExperienceReplay(4, path=tmp_path / "other.mat", **arguments)
+        HumanExperienceReplay(4, path=path)
 
 
 @pytest.mark.parametrize(
@@ -243,90 +214,15 @@ def test_a_path_that_is_given_must_be_the_file_even_if_its_rows_are_there(path, 
         (dict(best_people=0), "best_people=0, but must be 1 to 3"),
         (dict(controller="congruen"), "controller='congruen', but must be one of incongruent, congruent"),
         (dict(reward="dense"), "reward='dense', but must be one of paper, sparse"),
-        (dict(path=5), "path=5, but must be a path or None"),
     ],
 )
-def test_a_wrong_argument_of_the_replay_buffer_is_refused_in_one_line(path, tmp_path, given, said):
+def test_a_wrong_argument_of_the_replay_buffer_is_refused_in_one_line(path, given, said):
     with pytest.raises(DataError, match=f"^{re.escape(said)}$"):
-        HumanExperienceReplay(4, **{"path": path, "root": tmp_path, "checksum": None, **given})
-    assert not [*tmp_path.iterdir()]
+        HumanExperienceReplay(4, path=path, checksum=None, **given)
 
 
-@pytest.mark.parametrize(
-    ("spoil", "said"),
-    [
-        (lambda folder: pickled(folder), "not of a plain TensorDict"),
-        (lambda folder: meta(folder, _type="<class 'tensordict.tensorclass.NonTensorData'>"), "not of a plain"),
-        (lambda folder: meta(folder, note={"type": "NonTensorData"}), "note is not described as a tensor of numbers"),
-        (lambda folder: meta(folder, **{"../up": {"type": "TensorDict"}}), "'../up' is no name of an entry"),
-        (lambda folder: meta(folder, shape=[10**12]), "reward has shape|observation has shape"),
-        (lambda folder: meta(folder, fuel=leaf("complex64")), "fuel is not described as a tensor of numbers"),
-        (lambda folder: (folder / "meta.json").write_text("[" * 99_999), "meta.json: no JSON"),
-        (lambda folder: (folder / "meta.json").unlink(), "No such file"),
-        (lambda folder: (folder / "fuel.memmap").unlink(), "fuel.memmap: No such file"),
-        (lambda folder: (folder / "fuel.memmap").write_bytes(b"1234"), "fuel.memmap: 4 bytes, but must have"),
-        (lambda folder: linked(folder / "fuel.memmap"), "fuel.memmap: is a link, but must be a regular file"),
-        (lambda folder: piped(folder / "fuel.memmap"), "is a named pipe, but must be a regular file"),
-        (lambda folder: linked(folder / "next"), "next: is a link"),
-        (lambda folder: zeros(folder / "next" / "done.memmap"), "row 0: next.done is false|next.done"),
-        (lambda folder: nan(folder / "observation.memmap"), r"row 0: observation\[0\] is nan, but must be finite"),
-    ],
-)
-def test_a_foreign_folder_of_rows_runs_no_code_and_is_refused_in_one_line(path, tmp_path, spoil, said):
-    checksum = hashlib.sha256(path.read_bytes()).hexdigest()
-    arguments = dict(path=path, root=tmp_path, checksum=checksum, best_people=1, successes=True)
-    folder = HumanExperienceReplay(4, **arguments).data_path
-    spoil(folder)
-    with pytest.raises(DataError, match=said) as refused:
-        HumanExperienceReplay(4, **arguments)
-    assert "\n" not in str(refused.value) and str(refused.value).endswith("and the next call makes it again")
-    assert not Bomb.is_lit
-
-
-class Bomb:
-    """An object that runs code when it is unpickled."""
-
-    is_lit = False
-
-    def __reduce__(self):
-        return exec, ("import test_human_transitions; test_human_transitions.Bomb.is_lit = True",)
-
-
-def pickled(folder: Path) -> None:
-    """Put a pickled object in place of the rows, as `TensorDict.load_memmap` would read it."""
-    meta(folder, _type="<class 'tensordict.tensorclass.NonTensorData'>", _non_tensordict_keys=["data"])
-    (folder / "other.pickle").write_bytes(pickle.dumps({"data": Bomb()}))
-
-
-def meta(folder: Path, **changes: object) -> None:
-    file = folder / "meta.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
-
-
-def leaf(dtype: str) -> dict[str, object]:
-    return {"device": "cpu", "shape": [1, 1], "dtype": f"torch.{dtype}", "is_nested": False}
-
-
-def linked(file: Path) -> None:
-    file.rename(file.with_name("elsewhere"))
-    file.symlink_to("elsewhere")
-
-
-def piped(file: Path) -> None:
-    file.unlink()
-    os.mkfifo(file)
-
-
-def zeros(file: Path) -> None:
-    file.write_bytes(bytes(file.stat().st_size))
-
-
-def nan(file: Path) -> None:
-    file.write_bytes(struct.pack("<f", float("nan")) + file.read_bytes()[4:])
-
-
-def test_replay_buffer_samples_whole_episodes_and_slices(path, tmp_path, data):
-    arguments = dict(path=path, root=tmp_path, checksum=None)
+def test_replay_buffer_samples_whole_episodes_and_slices(path, data):
+    arguments = dict(path=path, checksum=None)
     episodes = HumanExperienceReplay(200, sampler=whole_episodes(), **arguments).sample()
     starts, ends = episodes[keys.IS_DECISION].squeeze(-1), episodes["next", keys.DONE].squeeze(-1)
     assert starts.sum() == ends.sum() == 8 and starts[0] and torch.equal(starts.roll(-1), ends)

@@ -79,7 +79,7 @@ def write_npz(tables: Mapping[str, TensorDict], file: Path) -> None:
 
 
 def write_memmap(batch: TensorDict, folder: Path) -> None:
-    """Write a tensordict as memory-mapped files, which `hpamdp.data.memmap` and `TensorDict.load_memmap` read.
+    """Write a tensordict as memory-mapped files, which `TensorDict.load_memmap` reads.
 
     Raises:
         DataError: the folder exists or cannot be written.

@@ -11,20 +11,18 @@ import shutil
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium import spaces
 from tensordict import TensorDict
 
 from hpamdp import keys
 from hpamdp.data import DataError
 from hpamdp.data.export import check_room
 from hpamdp.data.row_checks import TRAJECTORY, check_transitions
-from hpamdp.files import read_regular, regular_size
+from hpamdp.files import read_regular
 from hpamdp.json_lines import MAX_LINE_BYTES, read_json
 from hpamdp.messages import first_line
 
@@ -32,8 +30,6 @@ if TYPE_CHECKING:
     import minari
 
 
-_MAX_RATIO = 100  # largest size of a data set, in sizes of its file, which may be compressed
-_FEW_BYTES = 1 << 26
 _BYTES_AN_EPISODE = 40_000  # upper bound of the names and descriptions in HDF5
 _SPACES = ("observation_space", "action_space")  # in the metadata
 # What learners read of a state beside its observation. It is kept as an info if the transitions have it.
@@ -151,15 +147,14 @@ def _episode(rows: TensorDict, layout: MinariLayout) -> dict[str, Any]:
 def load(dataset_id: str, layout: MinariLayout) -> TensorDict:
     """Return a Minari data set that `export` wrote as the transitions `[N]` that it was made of.
 
-    Episodes are numbered from 0. The data set may be somebody else's. So nothing that it names is imported, and only
-    its own files are read.
+    Episodes are numbered from 0. The data set may be somebody else's, so nothing that it names is imported.
 
     Raises:
         DataError: Minari is missing, there is no such data set, it has another layout, or a value is wrong.
     """
     library = _import_minari()
     try:
-        _check_files(dataset_id)
+        _check_metadata(dataset_id)
         episodes = list(library.load_dataset(dataset_id).iterate_episodes())
         rows = torch.cat([_transitions(episode, number, layout) for number, episode in enumerate(episodes)])
         check_transitions(rows)
@@ -170,82 +165,16 @@ def load(dataset_id: str, layout: MinariLayout) -> TensorDict:
     return rows
 
 
-def _check_files(dataset_id: str) -> None:
-    """Refuse a data set with which Minari would build an environment, read other files or fill the memory.
-
-    Without spaces in the metadata, Minari would import and build the environment that the metadata name. A link in the
-    file of episodes can lead to any other file, and a few bytes of the file can stand for terabytes. JPEG pictures can
-    do so, too, and Minari reads as many episodes as the metadata say.
-    """
-    from minari.serialization import deserialize_space
+def _check_metadata(dataset_id: str) -> None:
+    """Refuse metadata without spaces: Minari would import and build the environment that they name instead."""
     from minari.storage import get_dataset_path
 
-    folder = get_dataset_path(dataset_id) / "data"
-    metadata = read_json(read_regular(folder / "metadata.json", MAX_LINE_BYTES))
+    metadata = read_json(read_regular(get_dataset_path(dataset_id) / "data" / "metadata.json", MAX_LINE_BYTES))
     for name in _SPACES:
         if not isinstance(metadata.get(name), str):
             raise DataError(f"its metadata have no {name}")
     if metadata.get("data_format") != "hdf5":
         raise DataError(f"its format is {metadata.get('data_format')}, but must be hdf5")
-    for name in _SPACES:
-        if _has_pictures(deserialize_space(metadata[name])):
-            raise DataError(f"its {name} has pictures, but transitions hold vectors alone")
-    names = _checked_episodes(folder / "main_data.hdf5")
-    unknown = sorted(names - {f"episode_{number}" for number in range(len(names))})
-    if unknown:
-        last = len(names) - 1
-        raise DataError(f"its file of episodes has {unknown[0][:80]}, but must have episode_0 to episode_{last} alone")
-    said = metadata.get("total_episodes")
-    if type(said) is not int or said != len(names):
-        raise DataError(f"its metadata say total_episodes={said!r:.40}, but its file has {len(names)}")
-
-
-def _checked_episodes(file: Path) -> set[str]:
-    """Return the names at the root of a file of episodes.
-
-    Raises:
-        DataError: it refers to another file, has something twice or without numbers, or stands for too many bytes.
-    """
-    import h5py
-
-    size = regular_size(file)
-    with h5py.File(file) as episodes:
-        num_bytes = 0
-        places = {h5py.h5o.get_info(episodes.id).addr}
-
-        def problem_of(name: str, link: Any) -> str | None:
-            nonlocal num_bytes
-            if not isinstance(link, h5py.HardLink):
-                return f"{name[:80]} in its file of episodes is a link"
-            values = episodes[name]
-            place = h5py.h5o.get_info(values.id).addr
-            if place in places:
-                return f"{name[:80]} in its file of episodes is there twice, under another name"
-            places.add(place)
-            if isinstance(values, h5py.Dataset):
-                if values.dtype.kind not in "biuf":
-                    return f"{name[:80]} in its file of episodes does not hold numbers"
-                if values.is_virtual or values.external:
-                    return f"{name[:80]} in its file of episodes is kept in another file"
-                num_bytes += values.nbytes
-            return None
-
-        problem = episodes.visititems_links(problem_of)  # stops at the first
-        names = set(episodes)
-    if problem is not None:
-        raise DataError(problem)
-    if num_bytes > max(_MAX_RATIO * size, _FEW_BYTES):
-        raise DataError(f"its file of episodes has {size} bytes, which stand for {num_bytes}")
-    return names
-
-
-def _has_pictures(space: gymnasium.Space) -> bool:
-    """Return whether a space has a part that Minari may keep as JPEG."""
-    if isinstance(space, spaces.Dict):
-        return any(map(_has_pictures, space.spaces.values()))
-    if isinstance(space, spaces.Tuple):
-        return any(map(_has_pictures, space.spaces))
-    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) > 1
 
 
 def _transitions(episode: minari.EpisodeData, number: int, layout: MinariLayout) -> TensorDict:
