@@ -15,8 +15,7 @@ from typing import Any
 from hpamdp.files import read_regular, replacing
 from hpamdp.messages import warn
 
-FRAMES, WALL_SECONDS = "frames", "wall_s"
-STOPPED = "stopped"  # 1 in the last row of a stopped run
+FRAMES, WALL_SECONDS, CPU_SECONDS = "frames", "wall_s", "cpu_s"
 EVALUATION = "eval/"
 
 
@@ -77,10 +76,10 @@ def _numbers(cells: Mapping[str | None, Any]) -> Iterable[tuple[str, float]]:
 def rows_up_to(frames: float, path: Path) -> list[dict[str, float]]:
     """Return the rows of a `metrics.csv` for a run that resumes from this many frames.
 
-    Later rows are left out, and so are the last row of a stopped run and rows without a number of frames.
+    Later rows are left out, and so are rows without a number of frames.
     """
     rows = [row for row in read_rows(path) if FRAMES in row]
-    return list(takewhile(lambda row: STOPPED not in row and row[FRAMES] <= frames, rows))
+    return list(takewhile(lambda row: row[FRAMES] <= frames, rows))
 
 
 def what_is_lost(

@@ -25,7 +25,7 @@ SELECTORS = ("ucb", "linucb", "meta_critic", "actor", "exp3")
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
     with (folder / "metrics.csv").open() as file:
-        return [{name: value for name, value in row.items() if name != "wall_s"} for row in csv.DictReader(file)]
+        return [row | {"wall_s": "", "cpu_s": ""} for row in csv.DictReader(file)]
 
 
 def parts_of_run(folder: Path) -> dict:

@@ -29,6 +29,7 @@ class Evaluation:
         filmed_steps: largest number of their steps that is kept. If None, all of them.
 
     Attributes:
+        one_action: a line if the agent took one discrete action at every step of the last `run_agent`, else empty.
         states: the `film_state` of these episodes at the start and after every step, columns `[num_filmed, ...]`;
             empty before the first `run_agent`, or if the problem has none.
     """
@@ -39,6 +40,8 @@ class Evaluation:
         self.num_filmed = num_filmed
         self.filmed_steps = filmed_steps
         self.states: list[dict[str, Tensor]] = []
+        self.one_action: list[str] = []
+        self._only_action: Tensor | None = None  # of all steps of the last `run`; None if actions differ
         self.problem.warn_if_seed_is_ignored(seed)
         self.episodes = env.fixed_episodes(seed)
         self._reset()
@@ -80,6 +83,7 @@ class Evaluation:
         changes = torch.zeros_like(steps)
         over, options, path = td.get(keys.DONE).squeeze(-1), [], [self.env.position]
         lengths: list[Any] = []
+        first_action, differ = None, torch.zeros((), dtype=torch.bool, device=device)
         self._film(states)
         # A policy that samples even when greedy (a random one) must not move the run's generators.
         with (
@@ -91,6 +95,9 @@ class Evaluation:
             for _ in range(self.env.max_steps):
                 td = self.env.step(policy(td))
                 lengths.append(_chosen_length(td, over))
+                discrete = td.get(keys.DISCRETE).reshape(len(over), -1)
+                first_action = discrete[0] if first_action is None else first_action
+                differ |= ((discrete != first_action).any(-1) & ~over).any()
                 total += td.get(("next", keys.REWARD)).squeeze(-1)
                 steps += ~over
                 options.append(td.get(keys.OPTION, None))
@@ -108,6 +115,7 @@ class Evaluation:
         if not over.all():
             row, limit = int((~over).nonzero()[0]), self.env.max_steps
             raise ProblemError(f"{self.problem.title}: evaluation episode {row} has not ended after max_steps={limit}")
+        self._only_action = None if differ else first_action
         played: dict[str, Tensor] = {"return": total, "steps": steps, "score": total, **self.known}
         if options[0] is not None:
             played["option"] = options[0]
@@ -128,6 +136,12 @@ class Evaluation:
         """
         self.states = []
         played = self.run(agent.policy, self.states)
+        only = None if self._only_action is None or agent.specs.num_discrete < 2 else self._only_action.tolist()
+        self.one_action = (
+            []
+            if only is None
+            else [f"the agent took discrete action {only[0] if len(only) == 1 else only} at every step"]
+        )
         if agent.selector is not None:
             each = [self.run(agent.policy_of(i))["score"] for i in range(agent.specs.num_options)]
             played["option_scores"] = np.stack(each, -1)

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import Field, FiniteFloat
+import torch
+from pydantic import Field, FiniteFloat, NonNegativeInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -18,20 +19,15 @@ from hpamdp.analysis import figures, film
 from hpamdp.config.schema import Config
 from hpamdp.files import replacing
 from hpamdp.messages import warn
-from hpamdp.metrics_file import (
-    FRAMES,
-    STOPPED,
-    WALL_SECONDS,
-    Metrics,
-    rows_up_to,
-    what_is_lost,
-)
+from hpamdp.metrics_file import CPU_SECONDS, FRAMES, WALL_SECONDS, Metrics, rows_up_to, what_is_lost
 from hpamdp.policies.base import Learner
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.loggers import EarlierRun, LenientLogger, Logger
 from hpamdp.run.state_checks import SavedPart, check_like, check_values, checked
 from hpamdp.run.summary import (
+    EVALUATED_FRAMES,
+    ONE_ACTION,
     ONE_OPTION,
     SHORT_SIGHT,
     WITHOUT_UPDATE,
@@ -43,6 +39,7 @@ from hpamdp.run_files import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_N
 
 # Small enough to film in a second or two.
 _FPS, _FILM_SIZE = 20.0, 200
+_MOST_ACTIONS = 20  # discrete actions that have a column each in the metrics
 
 
 class _State(SavedPart):
@@ -50,6 +47,7 @@ class _State(SavedPart):
     scalars: dict[str, FiniteFloat]
     held: dict[str, FiniteFloat]
     own: dict[str, FiniteFloat] = Field(default_factory=dict)
+    actions: list[NonNegativeInt] = Field(default_factory=list)
 
 
 class Recorder:
@@ -65,6 +63,7 @@ class Recorder:
         metrics: the rows so far.
         summary: see `summarise`; empty before `finish`.
         training_return: mean return of the exploring episodes in the last batch in which some ended; None before.
+        eval_cpu_s: CPU time of the evaluations so far.
     """
 
     def __init__(self, config: Config, parts: AssembledRun, output_dir: Path | None) -> None:
@@ -78,8 +77,11 @@ class Recorder:
         self._resumed_from: Path | None = None  # the folder of the run that is continued
         self._ended: list[TensorDictBase] = []
         self._scalars: dict[str, float] = {}
-        # The last evaluation; None once the agent has learned since.
-        self._played: dict[str, np.ndarray] | None = None
+        self.eval_cpu_s = 0.0
+        self._played: dict[str, np.ndarray] | None = None  # the last evaluation
+        self._is_current = False  # whether the agent is as it was then
+        self._evaluated_frames = 0  # frames of training before the last evaluation
+        self._action_counts: Tensor | None = None  # steps with each discrete action, since the last row
         self._callback_metrics: Mapping[str, float] = {}  # the last metrics of callbacks
         self._option_scores: dict[str, float] = {}  # scores with each option held, at the last evaluation
         random = random_agent(parts.agent.specs, parts.device, parts.agent.option_lengths)
@@ -124,6 +126,7 @@ class Recorder:
             "scalars": dict(self._scalars),
             "held": dict(self._option_scores),
             "own": dict(self._callback_metrics),
+            "actions": [] if self._action_counts is None else self._action_counts.tolist(),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -144,6 +147,10 @@ class Recorder:
         self._scalars = saved.scalars
         self._option_scores = saved.held
         self._callback_metrics = saved.own
+        if saved.actions:
+            if len(saved.actions) != sum(self.parts.agent.specs.components.sizes):
+                raise ValueError(f"actions: {len(saved.actions)} counts, of another problem")
+            self._action_counts = torch.tensor(saved.actions, device=self.parts.device)
 
     def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
         """Note a collected batch `[N, T]`, if there is one, and the scalars that the agent returned from learning."""
@@ -151,11 +158,35 @@ class Recorder:
         self.forget_evaluation()
         if batch is None:
             return
+        if keys.DISCRETE in batch.keys(include_nested=True):  # batches of decisions have no actions
+            self._count_actions(batch.get(keys.DISCRETE))
         is_end = batch.get(("next", keys.DONE)).squeeze(-1)
         ended = self._results(batch)[is_end]
         self._ended.append(ended)
         if len(ended):
             self.training_return = self._outcomes(ended)["return"].mean().item()
+
+    def _count_actions(self, discrete: Tensor) -> None:
+        """Add the steps with each discrete action, given the actions `[N, T]`, or `[N, T, num_components]`."""
+        sizes = self.parts.agent.specs.components.sizes
+        if sum(sizes) > _MOST_ACTIONS:
+            return
+        columns = discrete.reshape(-1, len(sizes)).unbind(-1)
+        counts = torch.cat([column.bincount(minlength=size) for column, size in zip(columns, sizes, strict=True)])
+        self._action_counts = counts if self._action_counts is None else self._action_counts + counts
+
+    def _action_shares(self) -> dict[str, float]:
+        """Return the share of the steps since the last row that took each discrete action, of each component."""
+        if self._action_counts is None:
+            return {}
+        sizes = self.parts.agent.specs.components.sizes
+        parts = enumerate(self._action_counts.split(list(sizes)))
+        shares = {(place, i): share for place, part in parts for i, share in enumerate((part / part.sum()).tolist())}
+        self._action_counts = None
+        return {
+            f"train/action_{i}" if len(sizes) == 1 else f"train/action_{place}_{i}": share
+            for (place, i), share in shares.items()
+        }
 
     def _results(self, steps: TensorDictBase) -> TensorDictBase:
         """Return the entries of steps `[*B]` to record at the end of an episode."""
@@ -169,46 +200,36 @@ class Recorder:
         return {"return": ended[keys.EPISODE_RETURN], **self.parts.env.results(ended)}
 
     def forget_evaluation(self) -> None:
-        """Drop the last evaluation, because the agent may have changed."""
-        self._played = None
+        """Have the next figures come from a new evaluation, because the agent may have changed."""
+        self._is_current = False
 
     def log(
         self,
         frames: int,
         wall_s: float,
+        cpu_s: float,
         is_evaluated: bool,
         *,
         own: Mapping[str, float] | None = None,
-        is_stopped: bool = False,
     ) -> dict[str, float]:
         """Write a row of metrics, with an evaluation if `is_evaluated`, and return it.
 
-        `own` are the metrics of callbacks; the summary repeats the last ones. A row with `is_stopped` is the last row
-        of a stopped run. The run that continues it leaves the row out.
+        `own` are the metrics of callbacks; the summary repeats the last ones.
         """
-        row = {FRAMES: float(frames), WALL_SECONDS: wall_s, **self._training_scores(), **self._scalars}
+        times = {FRAMES: float(frames), WALL_SECONDS: wall_s, CPU_SECONDS: cpu_s}
+        row = {**times, **self._training_scores(), **self._action_shares(), **self._scalars}
         if own is not None:
             row |= own
             self._callback_metrics = own
-        if is_stopped:
-            row[STOPPED] = 1.0
         if is_evaluated:
-            measured = self.parts.evaluation.measure(self._play())
+            measured = self.parts.evaluation.measure(self.play())
+            self._evaluated_frames = frames
             row |= {f"eval/{name}": value for name, value in (measured | self._drift(measured)).items()}
         self.metrics.append(row)
         self._pass_on(lambda logger: logger.log(row, frames))
         self._ended = []
         self._scalars = {}
         return row
-
-    def scores_at_end(self, frames: int, wall_s: float, *, is_finished: bool) -> np.ndarray:
-        """Evaluate the agent as training left it, and return the scores `[episodes]`.
-
-        If training did not reach its end, the evaluation is the last row of the metrics.
-        """
-        if not is_finished and self._played is None:
-            self.log(frames, wall_s, is_evaluated=True, is_stopped=True)
-        return self._play()["score"]
 
     def finish(self, frames: int, wall_s: float, cpu_s: float, ending: Mapping[str, Any], *, is_finished: bool) -> str:
         """Evaluate, write the summary and the figures, close the logger, and return the closing table as text.
@@ -222,12 +243,17 @@ class Recorder:
         """
         if self.config.run.mode == "eval":
             wall_before, cpu_before = time.perf_counter(), time.process_time()
-            self._play()
+            self.play()
             wall_s, cpu_s = time.perf_counter() - wall_before, time.process_time() - cpu_before
-        self.scores_at_end(frames, wall_s, is_finished=is_finished)
-        played = self._play()
+        if self._played is None or is_finished:
+            self.play()
+            self._evaluated_frames = frames
+        assert self._played is not None
+        played = self._played
         measured = self.parts.evaluation.measure(played)
-        effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
+        effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s, "eval_cpu_s": self.eval_cpu_s}
+        if self._evaluated_frames != frames:
+            effort[EVALUATED_FRAMES] = self._evaluated_frames
         env = self.parts.evaluation.problem
         summary = summarise(self.config, env, measured, self._random_scores, effort, is_finished=is_finished)
         summary |= {**self._callback_metrics, **ending}
@@ -235,6 +261,7 @@ class Recorder:
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
             summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])
             summary[ONE_OPTION] = self._one_option()
+            summary[ONE_ACTION] = self.parts.evaluation.one_action
             summary["practised"] = self.parts.agent.practised()
         self.summary = summary
         if self.output_dir is not None:
@@ -284,9 +311,13 @@ class Recorder:
             return None
         return path
 
-    def _play(self) -> dict[str, np.ndarray]:
-        if self._played is None:
+    def play(self) -> dict[str, np.ndarray]:
+        """Evaluate the agent unless it is as it was at the last evaluation, and return `Evaluation.run_agent`."""
+        if self._played is None or not self._is_current:
+            cpu_before = time.process_time()
             self._played = self.parts.evaluation.run_agent(self.parts.agent)
+            self.eval_cpu_s += time.process_time() - cpu_before
+            self._is_current = True
         return self._played
 
     def _drift(self, measured: dict[str, float]) -> dict[str, float]:

@@ -49,6 +49,7 @@ class Progress(SavedPart):
     cpu_s: Amount
     last_score: FiniteFloat | None
     evaluation_due: bool = False
+    eval_cpu_s: Amount = 0.0
 
 
 class _OptimizerState(SavedPart):

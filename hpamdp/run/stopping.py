@@ -25,17 +25,30 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
+        self._is_urgent = False
         StopRequest.latest = None
+
+    @contextmanager
+    def taken_at_once(self) -> Iterator[None]:
+        """Let the first signal interrupt the block, which can be repeated, such as an evaluation."""
+        self._is_urgent = True
+        try:
+            yield
+        finally:
+            self._is_urgent = False
 
     def note(self, number: int, frame: FrameType | None) -> None:
         """Note the signal. A second Ctrl-C or SIGTERM interrupts at once.
 
         Raises:
-            KeyboardInterrupt: the signal is the second one.
+            KeyboardInterrupt: the signal is the second one, or came in a block of `taken_at_once`.
         """
-        if self.signal is not None and number in _URGENT:
+        is_first = self.signal is None
+        if is_first:
+            self.signal = StopRequest.latest = signal.Signals(number)
+        if self._is_urgent or (not is_first and number in _URGENT):
+            self._is_urgent = False
             raise KeyboardInterrupt
-        self.signal = StopRequest.latest = signal.Signals(number)
 
 
 @contextmanager

@@ -19,6 +19,8 @@ from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 WITHOUT_UPDATE = "without_update"  # names of the levels that made no update
 ONE_OPTION = "one_option"  # lines about a selector that holds one option in all episodes
 KEPT_FRAMES, KEPT_SCORE = "kept_frames", "kept_score"  # of the best agent, if it is kept in place of the last one
+ONE_ACTION = "one_action"  # lines about a greedy policy that takes one discrete action at all steps
+EVALUATED_FRAMES = "evaluated_frames"  # frames before the evaluation of an interrupted run, if it went on afterwards
 SHORT_SIGHT = "short_sight"  # lines about learners that look far less ahead than episodes last
 _FAR = 4.0  # times the steps that a learner looks ahead; longer episodes count as far longer
 _PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy")
@@ -41,7 +43,7 @@ def summarise(
         measured: means of the agent's final evaluation, from `Evaluation.measure`.
         random: the same means for the uniformly random agent.
         effort: `frames` of training, and `wall_s` and `cpu_s` of this run. With `mode=eval`, they are the times of
-            the evaluation, otherwise of training with its evaluations.
+            the evaluation, otherwise of training with its evaluations, which took `eval_cpu_s`.
         is_finished: whether the run reached its end.
     """
     return {
@@ -76,7 +78,8 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
 
     Args:
         summary: the agent's metrics by their names, `references`, `mode`, `frames`, `wall_s`, `without_update`,
-            `short_sight` and `one_option`; `kept_frames` and `kept_score`, if an earlier agent is kept.
+            `short_sight`, `one_option` and `one_action`; `kept_frames` and `kept_score`, if an earlier agent is kept;
+            `evaluated_frames`, if the figures are those of an earlier agent.
         metrics: the rows. Rows without a value for the agent are left out, and so are columns without any value.
     """
     titles = {name: title for name, (title, _, _) in REFERENCES.items()}
@@ -100,7 +103,9 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
         lines.append("   ".join(aligned).rstrip())
     if any("" in row[1:] for row in cells[1:]):
         lines.append("empty cells: no figure is stored for that reference with these settings")
-    lines += summary.get(SHORT_SIGHT, []) + summary.get(ONE_OPTION, [])
+    lines += [line for name in (SHORT_SIGHT, ONE_OPTION, ONE_ACTION) for line in summary.get(name, [])]
+    if EVALUATED_FRAMES in summary:
+        lines.append(f"these figures are of the agent after {summary[EVALUATED_FRAMES]:,.0f} frames")
     without = summary.get(WITHOUT_UPDATE, [])
     lines += [f"no update was made: {', '.join(without)}"] if without else []
     if KEPT_FRAMES in summary:
@@ -145,5 +150,16 @@ def _effort(summary: Mapping[str, Any]) -> list[str]:
         parts.append(f"{summary[FRAMES]:,.0f} {unit}")
     if _is_known(summary.get(WALL_SECONDS)):
         parts.append(duration(summary[WALL_SECONDS]))
-    joint = " of training, evaluated in " if summary.get("mode") == "eval" else " in "
-    return [joint.join(parts)] if parts else []
+    if summary.get("mode") == "eval":
+        return [" of training, evaluated in ".join(parts)] if parts else []
+    return [" in ".join(parts) + _shares(summary)] if parts else []
+
+
+def _shares(summary: Mapping[str, Any]) -> str:
+    """Return the run's CPU time and what it went to, in brackets; empty for a run of less than a second."""
+    total = summary.get("cpu_s") or 0.0
+    if total < 1.0:
+        return ""
+    named = {"evaluations": summary.get("eval_cpu_s", 0.0), "compiling": summary.get("compile_cpu_s", 0.0)}
+    shares = [f"{name} {seconds / total:.0%}" for name, seconds in named.items() if seconds >= 0.005 * total]
+    return f" ({total:.0f} CPU s" + (f": {', '.join(shares)})" if shares else ")")

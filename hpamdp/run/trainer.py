@@ -52,7 +52,8 @@ class Trainer:
 
     Attributes:
         frames: frames so far.
-        wall_s, cpu_s: wall time and CPU time of training so far.
+        wall_s, cpu_s: wall time and CPU time of training so far, evaluations and compiling included.
+        compile_cpu_s: CPU time of compiling updates in this process.
         last_score: score of the last evaluation; None before the first one.
         stopped_by: class of the callback that has ended training; None if none has.
         stop_reason: why a callback has ended training; empty if none has, or if it gave no reason.
@@ -84,6 +85,7 @@ class Trainer:
         self.frames = 0
         self.wall_s = 0.0
         self.cpu_s = 0.0
+        self.compile_cpu_s = 0.0
         self.last_score: float | None = None
         self.is_evaluation_due = False
         self._last_evaluation = "no evaluation yet"  # in the words of the bar
@@ -105,6 +107,7 @@ class Trainer:
         self.frames = progress["frames"]
         self.wall_s = progress["wall_s"]
         self.cpu_s = progress["cpu_s"]
+        self.recorder.eval_cpu_s = progress.get("eval_cpu_s", 0.0)
         self.last_score = progress["last_score"]
         if self.last_score is not None:
             self._last_evaluation = f"score {self.last_score:.2f}"
@@ -184,10 +187,12 @@ class Trainer:
         episodes that score it. `checkpoint.safetensors`, from which the run can be continued, stays, too.
 
         Args:
-            is_finished: whether training reached its end.
+            is_finished: whether training reached its end. If not, the figures are those of the last evaluation.
         """
-        ending: dict[str, Any] = {} if self.stopped_by is None else {"stopped_by": self.stopped_by}
-        better = self._better_agent(is_finished=is_finished)
+        ending: dict[str, Any] = {"compile_cpu_s": self.compile_cpu_s}
+        if self.stopped_by is not None:
+            ending["stopped_by"] = self.stopped_by
+        better = self._better_agent() if is_finished else None
         if better is not None:
             ending |= {KEPT_FRAMES: better.best_frames, KEPT_SCORE: better.best_score}
         table = self.recorder.finish(self.frames, self.wall_s, self.cpu_s, ending, is_finished=is_finished)
@@ -198,18 +203,18 @@ class Trainer:
                 self.save_policy(self.output_dir / POLICY_NAME)
         return table
 
-    def _better_agent(self, *, is_finished: bool) -> BestAgent | None:
+    def _better_agent(self) -> BestAgent | None:
         """Return what holds the agent of the best evaluation if it is clearly better than the last one."""
         best = next((each for each in self.callbacks.values() if isinstance(each, BestAgent)), None)
         if best is None or self.config.run.mode != "train" or not self.config.run.save_best:
             return None
-        scores = self.recorder.scores_at_end(self.frames, self.wall_s, is_finished=is_finished)
-        return best if best.is_clearly_better(scores) else None
+        return best if best.is_clearly_better(self.recorder.play()["score"]) else None
 
     def train(self) -> bool:
         """Train until `num_frames`, `eval.stop_score` or a callback ends it, and save the agent.
 
-        A signal takes effect between two batches, so that the saved state equals that of an uninterrupted run.
+        A signal takes effect between two batches, so that the saved state equals that of an uninterrupted run. It ends
+        an evaluation at once, which a resumed run repeats.
 
         Returns:
             True if a signal stopped training before its end.
@@ -225,7 +230,7 @@ class Trainer:
             try:
                 self.restore_collection(collection)
                 self._loop(collection, request)
-            except KeyboardInterrupt:  # the second signal, perhaps in the middle of an update
+            except KeyboardInterrupt:  # in an evaluation, or the second signal, perhaps in the middle of an update
                 self.recorder.forget_evaluation()
             except CallbackError:
                 self._save_and_close(collection)
@@ -291,7 +296,7 @@ class Trainer:
         )
         for learner in self.parts.agent.learners:
             assert isinstance(learner, Learner)
-            learner.while_compiling = partial(_said_by, bar, "compiling the updates")
+            learner.while_compiling = partial(self._compiling, bar)
         with bar:
             is_new = self.last_score is None and self.frames == 0
             # Before anything can be saved, because a resumed run does not add the data again.
@@ -299,7 +304,7 @@ class Trainer:
                 self.parts.agent.add_demonstrations(self.parts.data.batch, self.parts.data.decisions)
             self._call(lambda callback: callback.on_start(self))
             if is_new or self.is_evaluation_due:
-                self._evaluate(bar)
+                self._evaluate(bar, request)
             while not self._is_over() and request.signal is None:
                 try:
                     num = self._learn(collection)
@@ -312,10 +317,10 @@ class Trainer:
                 self._show(bar)
                 self._call(lambda callback: callback.on_batch(self))
                 if self._is_over() or _is_due(last, self.frames, run.eval_every):
-                    self._evaluate(bar)
+                    self._evaluate(bar, request)
                 elif _is_due(last, self.frames, run.log_every):
                     own = metrics_of(self.callbacks, self)
-                    self.recorder.log(self.frames, self.wall_s, is_evaluated=False, own=own)
+                    self.recorder.log(self.frames, self.wall_s, self.cpu_s, is_evaluated=False, own=own)
                 is_time = run.checkpoint_minutes > 0.0 and time.monotonic() - saved_at > 60.0 * run.checkpoint_minutes
                 if not self._is_over() and (is_time or _is_due(last, self.frames, run.checkpoint_every)):
                     self.save(collection)
@@ -357,10 +362,23 @@ class Trainer:
         is_reached = stop_score is not None and last_score is not None and last_score >= stop_score
         return self._is_stopped or is_reached or self.frames >= self.config.run.num_frames
 
-    def _evaluate(self, bar: tqdm) -> None:
+    @contextmanager
+    def _compiling(self, bar: tqdm) -> Iterator[None]:
+        """Say before the bar that updates are compiled, and take the time, while the block runs."""
+        bar.set_description_str("compiling the updates")
+        cpu_before = time.process_time()
+        try:
+            yield
+        finally:
+            self.compile_cpu_s += time.process_time() - cpu_before
+            bar.set_description_str(None)
+
+    def _evaluate(self, bar: tqdm, request: StopRequest) -> None:
         self.is_evaluation_due = True  # if it is cut off, the resumed run makes it
         own = metrics_of(self.callbacks, self)
-        row = self.recorder.log(self.frames, self.wall_s, is_evaluated=True, own=own)
+        with request.taken_at_once():
+            self.recorder.play()
+        row = self.recorder.log(self.frames, self.wall_s, self.cpu_s, is_evaluated=True, own=own)
         success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
         self.last_score = row["eval/score"]
         self._last_evaluation = f"score {self.last_score:.2f}{success} at {self.frames:,}{self.unit}"
@@ -438,6 +456,7 @@ class Trainer:
             "frames": self.frames,
             "wall_s": self.wall_s,
             "cpu_s": self.cpu_s,
+            "eval_cpu_s": self.recorder.eval_cpu_s,
             "last_score": self.last_score,
             "evaluation_due": self.is_evaluation_due,
             **self._kept,
@@ -467,16 +486,6 @@ def check_scalars(scalars: Mapping[str, float]) -> None:
     for name, value in scalars.items():
         if not math.isfinite(value):
             raise DivergedError(f"{name} is {value}")
-
-
-@contextmanager
-def _said_by(bar: tqdm, text: str) -> Iterator[None]:
-    """Show a text before the bar while the block runs."""
-    bar.set_description_str(text)
-    try:
-        yield
-    finally:
-        bar.set_description_str(None)
 
 
 def _warn_of_notices(collection: Collection, bar: tqdm) -> None:
