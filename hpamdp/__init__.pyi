@@ -7,6 +7,7 @@ from .api.making import make_gymnasium as make_gymnasium
 from .api.reporting import report as report
 from .api.training import load as load
 from .api.training import train as train
+from .api.tuning import tune as tune
 from .config.errors import ConfigError as ConfigError
 from .env.base import PAMDPEnv as PAMDPEnv
 from .env.errors import EnvironmentFaultError as EnvironmentFaultError

@@ -52,6 +52,7 @@ _COMMANDS = {
     "play": "hpamdp.run.play",
     "report": "hpamdp.analysis.seed_report",
     "judge": "hpamdp.run.judge",
+    "tune": "hpamdp.api.tuning",
 }
 # Errors that Hydra raises for a wrong command line or yaml file.
 _BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError)

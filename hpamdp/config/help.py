@@ -53,6 +53,8 @@ Examples
       compares the runs in a folder by their means over seeds; see {program} report --help
   {program} judge FOLDER... data=human
       orders agents by recorded actions, without their problem; see {program} judge --help
+  {program} tune low=hppo
+      searches for good settings with Optuna; see {program} tune --help
   {program} low=hyar --cfg job
       shows every value and setting without running
   {program} --hydra-help

@@ -245,7 +245,7 @@ class Trainer:
                 self._call(lambda callback: callback.on_end(self))
             finally:
                 self._save_and_close(collection)
-            return self.is_evaluation_due or not self._is_over()
+            return self.is_evaluation_due or not self.is_over()
 
     def _call(self, act: Callable[[Callback], None]) -> None:
         for name, callback in self.callbacks.items():
@@ -305,7 +305,7 @@ class Trainer:
             self._call(lambda callback: callback.on_start(self))
             if is_new or self.is_evaluation_due:
                 self._evaluate(bar, request)
-            while not self._is_over() and request.signal is None:
+            while not self.is_over() and request.signal is None:
                 try:
                     num = self._learn(collection)
                 finally:
@@ -316,13 +316,13 @@ class Trainer:
                 bar.update(num)
                 self._show(bar)
                 self._call(lambda callback: callback.on_batch(self))
-                if self._is_over() or _is_due(last, self.frames, run.eval_every):
+                if self.is_over() or _is_due(last, self.frames, run.eval_every):
                     self._evaluate(bar, request)
                 elif _is_due(last, self.frames, run.log_every):
                     own = metrics_of(self.callbacks, self)
                     self.recorder.log(self.frames, self.wall_s, self.cpu_s, is_evaluated=False, own=own)
                 is_time = run.checkpoint_minutes > 0.0 and time.monotonic() - saved_at > 60.0 * run.checkpoint_minutes
-                if not self._is_over() and (is_time or _is_due(last, self.frames, run.checkpoint_every)):
+                if not self.is_over() and (is_time or _is_due(last, self.frames, run.checkpoint_every)):
                     self.save(collection)
                     saved_at = time.monotonic()
             take_time()
@@ -357,7 +357,8 @@ class Trainer:
         self.recorder.take(batch, scalars)
         return batch.numel()
 
-    def _is_over(self) -> bool:
+    def is_over(self) -> bool:
+        """Return whether training has come to its end, or something has ended it."""
         stop_score, last_score = self.config.run.eval.stop_score, self.last_score
         is_reached = stop_score is not None and last_score is not None and last_score >= stop_score
         return self._is_stopped or is_reached or self.frames >= self.config.run.num_frames

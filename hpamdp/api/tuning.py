@@ -1,0 +1,270 @@
+"""Search for good settings with Optuna, and run `hpamdp tune`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hpamdp.api.arguments import path_argument
+from hpamdp.api.training import train
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.search_space import Range, Space, parsed_space, space_of_learner, split_words
+from hpamdp.messages import as_code, reason_of, say
+from hpamdp.run.callbacks import Callback
+from hpamdp.run.players import whole_number
+from hpamdp.run.trainer import DivergedError
+from hpamdp.shell import for_shell, setting
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
+
+    from hpamdp.run.trainer import Trainer
+
+_DESCRIPTION = """\
+Search for good settings of a learner with Optuna.
+
+  hpamdp tune env=platform low=hppo --trials 40 --to tuned       the learner's settings in conf/search
+  hpamdp tune env=platform low=hppo low.lr=1e-4,1e-3 low.epochs=2,5,10
+  hpamdp tune env=platform low=hppo 'low.lr=tag(log,interval(1e-4,1e-2))'
+
+Words with several values are the space, all others are fixed. The same command with the same --to goes on.
+"""
+TRIALS_NAME = "trials.log"
+_SEED = 1_000_000
+_DEFINITION = "definition"  # entry of a study: what is searched
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The result of a search.
+
+    Attributes:
+        settings: the best settings by name, for `hpamdp.train(env, low=..., **settings)`.
+        score: of the evaluation at the end of this trial. The best of many trials is partly lucky, so score its
+            settings again with other seeds.
+        words: the settings as words of a command line.
+        trials: number of trials, pruned ones included.
+    """
+
+    settings: dict[str, Any]
+    score: float
+    words: str
+    trials: int
+
+
+class _Report(Callback):
+    """Report each evaluation to Optuna, and end a trial that is to be pruned."""
+
+    def __init__(self, trial: Trial) -> None:
+        self._trial = trial
+        self.score: float | None = None
+        self.is_pruned = self.is_over = False
+
+    def on_evaluation(self, trainer: Trainer, row: Mapping[str, float]) -> None:
+        """Report the score of an agent that has learned."""
+        if trainer.frames == 0:
+            return
+        self.score = row["eval/score"]
+        self._trial.report(self.score, trainer.frames)
+        if not trainer.is_over() and self._trial.should_prune():
+            self.is_pruned = True
+            trainer.stop("pruned")
+
+    def on_end(self, trainer: Trainer) -> None:
+        """Note whether the run has come to its end, and was not interrupted."""
+        self.is_over = trainer.is_over() and not trainer.is_evaluation_due
+
+
+def tune(
+    env: Any = None,
+    *,
+    low: Any = "hppo",
+    trials: int = 40,
+    space: Mapping[str, Any] | None = None,
+    folder: str | Path | None = None,
+    seed: int = _SEED,
+    progress: bool = True,
+    **settings: Any,
+) -> Tuned:
+    """Search for the settings with the highest score at the end of a training.
+
+    Optuna's tree-structured Parzen estimator proposes the settings of each trial. A trial ends early if its score is
+    below the median of the earlier ones after as many steps. Trial number i trains with the seed `seed` + i, and all
+    evaluations have `eval.seed=seed`. So the episodes are not those of a usual evaluation, whose seed is 0.
+
+    Ctrl-C ends the search, and the best settings so far are returned.
+
+    Args:
+        env: the problem, as for `train`.
+        low: the learner, as for `train`.
+        trials: number of trials, with those in the folder.
+        space: for each setting a text as on the command line, such as `tag(log, interval(1e-4, 1e-2))`,
+            `interval(0.9, 0.99)`, `range(2, 10)` or `2,5,10`; or a list. If None, the space of `conf/search` for the
+            learner, without the settings that are given.
+        folder: keeps the trials, in a journal of Optuna. If it holds some already, the search goes on. Several
+            processes may search in one folder at the same time. If None, nothing is written.
+        seed: of the search.
+        progress: whether to print a line for each trial, and the best settings at the end.
+        settings: those of all trials, as for `train`.
+
+    Raises:
+        ConfigError: an argument is wrong, Optuna is not installed, the folder has another search, or no trial came to
+            its end.
+
+    Example:
+        >>> import hpamdp
+        >>> best = hpamdp.tune("platform", low="hppo", trials=20, total_frames=50_000)  # doctest: +SKIP
+        >>> agent = hpamdp.train("platform", low="hppo", **best.settings)  # doctest: +SKIP
+    """
+    name, own = (low.get("name"), low) if isinstance(low, Mapping) else (low, {})
+    if space is None:
+        given = {*settings, *(f"low.{each}" for each in own)}
+        space = space_of_learner(str(getattr(name, "__name__", name)), [*given])
+    found = parsed_space(space)
+    return _search(_Objective(env, {"low": low, **settings}, found, seed), trials, folder, tells=progress)
+
+
+@dataclass(frozen=True)
+class _Objective:
+    """What Optuna maximises: the score of a training with the settings of a trial."""
+
+    env: Any
+    fixed: Mapping[str, Any]
+    space: Space
+    seed: int
+
+    @property
+    def definition(self) -> str:
+        """What distinguishes this search from another one, as text."""
+        return json.dumps([self.env, self.fixed, self.space, self.seed], default=_named)
+
+    def __call__(self, trial: Trial) -> float:
+        """Return the score at the end of the training.
+
+        Raises:
+            TrialPruned: the training ended early, or diverged.
+            KeyboardInterrupt: the user stopped it.
+        """
+        from optuna import TrialPruned
+
+        values = {name: _suggested(trial, name, each) for name, each in self.space.items()}
+        report, seeds = _Report(trial), {"seed": self.seed + trial.number, "eval.seed": self.seed}
+        try:
+            train(self.env, callbacks=[report], progress=False, **{**seeds, **self.fixed, **values})
+        except DivergedError as error:
+            raise TrialPruned from error
+        if report.is_pruned:
+            raise TrialPruned
+        if not report.is_over or report.score is None:
+            raise KeyboardInterrupt
+        return report.score
+
+
+def _search(objective: _Objective, trials: int, folder: Any, *, tells: bool) -> Tuned:
+    """Make trials until there are as many as asked, and return the best one's settings; see `tune`."""
+    try:
+        import optuna
+    except ImportError as error:
+        raise ConfigError("Optuna is not installed; pip install 'hpamdp[tune]'") from error
+    if isinstance(trials, bool) or not isinstance(trials, int) or trials < 1:
+        raise ConfigError(f"trials={as_code(trials)}: must be a whole number of at least 1")
+    if not objective.space:
+        raise ConfigError("tune: nothing to search; every setting of the space is given")
+    optuna.logging.set_verbosity(optuna.logging.ERROR)  # it would warn of an error that is raised, with a traceback
+    study = _study(folder, objective)
+    complete, pruned = optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED
+
+    def num(*states: Any) -> int:
+        return len(study.get_trials(deepcopy=False, states=states))
+
+    def tell(study: Study, trial: Any) -> None:
+        end = f"score {trial.value:.3f}" if trial.state == complete else "pruned"
+        say(f"Trial {trial.number}: {end}, {_words(trial.params)}")
+
+    try:
+        while num(complete, pruned) < trials:
+            study.optimize(objective, n_trials=1, callbacks=[tell] if tells else [])
+    except KeyboardInterrupt:
+        say(f"Stopped with {trials - num(complete, pruned)} trials to go")
+    if not num(complete):
+        raise ConfigError("tune: no trial came to its end")
+    best = Tuned(study.best_params, study.best_value, _words(study.best_params), num(complete, pruned))
+    if tells:
+        say(f"Best score {best.score:.3f} in {best.trials} trials, with the settings\n{best.words}")
+    return best
+
+
+def _study(folder: Any, objective: _Objective) -> Study:
+    """Return the study of a folder, or one in memory.
+
+    Raises:
+        ConfigError: the folder has another search, or cannot be written to.
+    """
+    import optuna
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+
+    storage = None
+    if folder is not None:
+        path = path_argument("folder", folder)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            storage = JournalStorage(JournalFileBackend(str(path / TRIALS_NAME)))
+        except OSError as error:
+            raise ConfigError(f"folder={folder}: {reason_of(error)}") from error
+    study = optuna.create_study(storage=storage, study_name="hpamdp", load_if_exists=True, direction="maximize")
+    if study.user_attrs.get(_DEFINITION, objective.definition) != objective.definition:
+        raise ConfigError(f"folder={folder}: has another search; give a folder of its own")
+    study.set_user_attr(_DEFINITION, objective.definition)
+    study.pruner = optuna.pruners.MedianPruner()
+    # With the same seed the sampler would propose its first trials again.
+    study.sampler = optuna.samplers.TPESampler(seed=(objective.seed + len(study.trials)) % 2**32)
+    return study
+
+
+def _suggested(trial: Trial, name: str, values: Range | list[Any]) -> Any:
+    if isinstance(values, list):
+        return trial.suggest_categorical(name, values)
+    if values.is_whole:
+        return trial.suggest_int(name, int(values.low), int(values.high), step=values.step, log=values.is_log)
+    return trial.suggest_float(name, values.low, values.high, log=values.is_log)
+
+
+def _words(settings: Mapping[str, Any]) -> str:
+    words = (
+        setting(name, value) if isinstance(value, str) else for_shell(f"{name}={json.dumps(value)}")
+        for name, value in settings.items()
+    )
+    return " ".join(words)
+
+
+def _named(value: Any) -> Any:
+    """Return what stands for an object in the definition of a search, the same in every process."""
+    return vars(value) if isinstance(value, Range) else getattr(value, "__qualname__", type(value).__name__)
+
+
+def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
+    """Run `hpamdp tune`, and return the exit code.
+
+    Raises:
+        ConfigError: see `tune`.
+    """
+    parser.description = _DESCRIPTION
+    parser.add_argument(
+        "words", nargs="*", metavar="SETTING=VALUE", help="as for a training; several values are searched"
+    )
+    parser.add_argument("--trials", type=whole_number(1, 1_000_000), default=40, help="how many (40)")
+    parser.add_argument("--to", type=Path, help="folder that keeps the trials")
+    parser.add_argument("--seed", type=int, default=_SEED, help=f"of the search ({_SEED})")
+    options = parser.parse_intermixed_args(words)
+    settings, space = split_words(options.words)
+    env = settings.pop("env", None)
+    settings.setdefault("low", "hppo")
+    if not space:
+        space = parsed_space(space_of_learner(settings["low"], [*settings]))
+    _search(_Objective(env, settings, space, options.seed), options.trials, options.to, tells=True)
+    return 0
