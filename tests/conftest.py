@@ -23,6 +23,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from hpamdp.cli import main
+from hpamdp.config import outside_jobs
 from hpamdp.config.command_line import search_word
 from hpamdp.config.compose import read
 from hpamdp.config.schema import Config
@@ -187,6 +188,31 @@ def best_scores_planned_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(planner, "best_scores", plan_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def words_composed_once() -> Iterator[None]:
+    """Have Python code compose the same words once, which takes a third of a short run.
+
+    Words that choose a class or add a folder are composed each time.
+    """
+    compose_words, composed = outside_jobs._compose, {}
+
+    def is_of_the_package(word: str, conf: Path) -> bool:
+        name, _, value = word.partition("=")
+        file = conf / name / (value.strip('"') + ".yaml")
+        return file.is_file() if file.parent.is_dir() else not name.startswith("hydra.")
+
+    def compose_once(words: Sequence[str], conf: Path) -> DictConfig:
+        if not all(is_of_the_package(word, conf) for word in words):
+            return compose_words(words, conf)
+        if tuple(words) not in composed:
+            composed[tuple(words)] = pickle.dumps(compose_words(words, conf))
+        return pickle.loads(composed[tuple(words)])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(outside_jobs, "_compose", compose_once)
         yield
 
 
