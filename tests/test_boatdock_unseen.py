@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs
 
 import hpamdp
 from hpamdp import keys
@@ -292,8 +291,7 @@ def test_the_kernel_does_what_the_tensor_functions_do(settings, is_evaluation):
             ours, theirs = kernel.reset(again.clone()), tensors.reset(again)
 
 
-def test_tensors_are_as_the_specs_say_and_gymnasium_accepts_the_ids():
-    check_env_specs(UnseenBoatsEnv(3), return_contiguous=True)
+def test_gymnasium_accepts_the_ids():
     for family in ("", "Any", "Strength"):
         env = gymnasium.make(f"hpamdp/BoatDockUnseen{family}-v0")
         observation, _ = env.reset(seed=0)
@@ -323,7 +321,6 @@ def test_in_gymnasium_infos_tell_where_trips_end_and_the_sessions_score(boats):
     [
         ("trip", 4, "a session is in its trip 5, but env.trips=3; set at least 5"),
         ("docked", 4, "docked has 0 to 4, not 0 to 3"),
-        ("boat", 1, "boat has 0 to 1, not -1 to 0"),
     ],
 )
 def test_a_saved_state_of_other_sessions_is_refused_in_one_line(column, number, message):
@@ -341,10 +338,7 @@ def test_a_saved_state_of_other_sessions_is_refused_in_one_line(column, number, 
     [
         ({"scored_boats": "training"}, "scored_boats=training: needs a fleet_size"),
         ({"fleet_size": 1, "boats": 2}, "fleet_size=1: a session has boats=2"),
-        ({"trips": 0}, "trips"),
         ({"shortest_press": 0.95}, "shortest_press=0.95: it leads to 85 px/s, but boats dock at no more than 74"),
-        ({"shortest_press": 0.8, "family": "strength"}, "shortest_press=0.8: it leads to"),
-        ({"separation": 120.0}, "separation"),
         ({"fleet_size": 4, "fleet_seed": 2**32}, "fleet_seed=4294967296: must be less than 4294967296"),
     ],
 )
@@ -361,9 +355,3 @@ def test_scores_say_whether_they_are_of_a_trip_or_of_a_boat():
     means = Evaluation.measure(SimpleNamespace(env=env), played)
     scores = {name for name in means if name.startswith("score_")}
     assert scores == {"score_trip_1", "score_trip_2", "score_later", "score_boat_1", "score_boat_2"}
-
-
-def test_a_model_sees_the_velocity_where_the_displacement_has_noise():
-    velocity = {rules.OBSERVATION_NAMES.index(name) for name in ("velocity_x", "velocity_y")}
-    assert velocity <= {*UnseenBoatsEnv(1).geometry.redundant}
-    assert not velocity & {*UnseenBoatsEnv(1, sensor_noise=5.0).geometry.redundant}

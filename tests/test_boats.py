@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from hpamdp import keys
 from hpamdp.config.compose import read
 from hpamdp.env import counter_rng
-from hpamdp.env.boatdock import episode, harbour, physics, planner, rendering
+from hpamdp.env.boatdock import episode, harbour, physics, planner
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.gymnasium_adapter import BoatDock, BoatDockVector
 from hpamdp.env.boatdock.options import BoatDockOptions
@@ -38,12 +38,6 @@ def press(env: BoatDockEnv, key: list[int], duration: list[float], option: list[
     td[keys.DISCRETE] = torch.tensor(key)
     td[keys.PARAMETERS] = torch.tensor(duration).unsqueeze(-1).expand(-1, 3).clone()
     return env.step(td)["next"]
-
-
-def test_the_controllers_are_peoples():
-    boats = made(THREE).boats
-    for table, row in zip(boats.directions, (2, 0, 1), strict=True):
-        np.testing.assert_allclose(table, harbour.DIRECTIONS[row], atol=1e-12)
 
 
 def test_peoples_two_boats_by_name_play_as_they_do_without():
@@ -75,14 +69,6 @@ def test_random_controllers_are_all_of_the_boats_equally_often():
     torch.testing.assert_close(shares, torch.full((4,), 0.25), atol=0.03, rtol=0.0)
 
 
-def test_an_option_that_is_no_boat_is_refused():
-    env = BoatDockEnv(2, boats=THREE)
-    env.reset()
-    press(env, [0, 0], [0.1, 0.1], [0, 2])
-    with pytest.raises(ValueError, match=r"environment 1 got option=3 \(allowed 0 to 2\)"):
-        press(env, [0, 0], [0.1, 0.1], [0, 3])
-
-
 @pytest.mark.parametrize("boats", [None, THREE])
 def test_a_change_of_boats_costs_its_fuel_once_and_turns_the_keys(boats):
     env = BoatDockEnv(1, boats=boats, switch_cost=0.25)
@@ -104,25 +90,11 @@ def test_a_change_that_the_tank_cannot_pay_ends_the_episode():
     assert after[keys.OUTCOME].item() == physics.OUT_OF_FUEL and after["fuel"].item() == 0.0
 
 
-def test_without_a_switch_cost_a_boat_is_kept():
-    env = BoatDockEnv(1, boats=THREE)
-    env.reset()
-    for option in (2, 0):
-        press(env, [0], [0.1], [option])
-        assert env.state.controller.item() == 2
-
-
 def test_the_planner_of_any_boats_gives_peoples_boats_their_scores():
     layout, keymap = layouts(60)
     expected = planner.best_plans(layout, keymap).score
     found = planner.best_scores(made(["incongruent1", "congruent"]), layout, keymap)
     torch.testing.assert_close(found, expected, atol=1e-3, rtol=0.0)
-
-
-def test_boats_with_the_same_directions_are_exactly_as_good():
-    layout, keymap = layouts(50)
-    scores = planner.best_scores(made(THREE), layout, keymap)
-    assert torch.equal(scores[:, 1], scores[:, 2])
 
 
 def test_changes_never_make_a_layout_worse_and_cheaper_ones_are_worth_more():
@@ -192,7 +164,7 @@ def test_boats_that_are_put_elsewhere_have_the_plans_of_that_place(presses):
     assert (restored.read()["oracle"] == planned).all()
 
 
-@pytest.mark.parametrize(("num_presses", "cost"), [(1, 0.1), (3, 0.15), pytest.param(3, 0.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("num_presses", "cost"), [(3, 0.15), pytest.param(3, 0.0, marks=pytest.mark.slow)])
 def test_an_evolutionary_search_over_presses_and_boats_never_beats_the_planner(num_presses, cost):
     num, samples, elite, children = 25, 4000, 30, 8
     rules = made(["congruent", "incongruent1", "sideways"], cost, SIDEWAYS)
@@ -235,7 +207,7 @@ def test_an_evolutionary_search_over_presses_and_boats_never_beats_the_planner(n
         score = torch.maximum(score, best_found)
     excess = score.amax(1) - best
     assert excess.max() < 2e-3
-    assert num_presses == 1 or excess.median() > -0.05  # a fair opponent
+    assert excess.median() > -0.05  # a fair opponent
 
 
 def test_gymnasium_has_the_boats_and_their_changes():
@@ -257,25 +229,7 @@ def test_gymnasium_has_the_boats_and_their_changes():
         BoatDock(boats=["congruent", "upwards"])
 
 
-def test_compiled_adapters_take_other_boats():
-    options = BoatDockOptions(
-        boats=["congruent", "sideways"], switch_cost=0.5, controllers=SIDEWAYS, compile_rules=True
-    )
-    boats = BoatDockVector(2, options=options)._problem
-    assert boats.rows._env.rules == options.rules and boats.observation_space.shape == (16,)
-
-
-def test_the_fuel_of_a_change_is_not_drawn_as_a_press():
-    env = BoatDockEnv(1, switch_cost=1.0, controller="choose")
-    env.reset()
-    env.state = env.state._replace(controller=torch.tensor([0], dtype=torch.int32))
-    before = env.state
-    press(env, [0], [0.2], [1])
-    assert rendering.fuel_at_press(before, env.state, 1.0).item() == pytest.approx(5.0)
-    assert rendering.leg(before, env.state, 1.0).pressed == pytest.approx(1.0 / 1.95, abs=1e-3)
-
-
-@pytest.mark.parametrize("high", ["actor", "option_critic", "oracle"])
+@pytest.mark.parametrize("high", ["actor", "option_critic"])
 def test_selectors_that_end_options_train_with_changes_of_boats(high):
     learned = high == "option_critic"
     ends = ["agent.termination=learned"] if learned else ["agent.termination=steps", "agent.option_length=1"]
@@ -306,16 +260,6 @@ def test_other_boats_are_not_compared_with_people():
     assert env.measure({**played, "option": best})["oracle_agreement"] == 1.0
     equally_good = np.where(best == 1, 2, best)
     assert env.measure({**played, "option": equally_good})["oracle_agreement"] == 1.0
-
-
-def test_a_choice_between_equally_good_boats_is_worth_all_that_it_can_be():
-    played = {
-        "outcome": np.ones(3, dtype=int),
-        "score": np.full(3, 3.0),
-        "optimum": np.full((3, 2), 3.5),
-        "option": np.array([0, 1, 1]),
-    }
-    assert BoatDockEnv(1, boats=["incongruent1", "incongruent2"]).measure(played)["oracle_agreement_weighted"] == 1.0
 
 
 def test_the_ceiling_succeeds_where_a_plan_docks_and_nowhere_else():

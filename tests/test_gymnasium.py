@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -18,7 +17,6 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
-from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -77,11 +75,9 @@ def test_values_outside_their_bounds_are_clipped():
     ("discrete", "parameters", "complaint"),
     [
         ([0, 0], [[0.0, 20.0, 0.2], [0.0, np.nan, 0.2]], r"environment 1 got discrete=0 \(allowed 0 to 2\), .*nan"),
-        ([0, 2], [[0.0, 20.0, 0.2], [0.0, 20.0, np.inf]], "environment 1 got discrete=2"),
         ([3, 0], [[0.0, 20.0, 0.2]] * 2, "environment 0 got discrete=3"),
         ([0.0, 1.0], [[0.0, 20.0, 0.2]] * 2, "has type float32, but must be integer"),
         ([0, 0], [[0.0, 20.0]] * 2, r"'parameters'\) has shape \[2, 2\], but must be \[2, 3\]"),
-        ([[0], [0]], [[0.0, 20.0, 0.2]] * 2, r"'discrete'\) has shape \[2, 1\], but must be \[2\]"),
     ],
 )
 def test_an_invalid_action_is_refused_and_changes_nothing(discrete, parameters, complaint):
@@ -269,30 +265,21 @@ def mistake_in(**options) -> str:
         ({}, "set env.id=Name-v0 or env.entry_point=package.module:name; neither is set"),
         ({"id": "Toy-v0", "entry_point": TOY}, "both are set"),
         ({"id": "Nowhere-v0"}, "Nowhere-v0: Environment `Nowhere` doesn't exist"),
-        ({"id": "nowhere:Toy-v0"}, "nowhere:Toy-v0: No module named 'nowhere'"),
         ({"id": "Endless-v0"}, "Endless-v0: has no time limit of its own; set env.max_steps"),
         (
             {"entry_point": "toy_environments:Texting", "max_steps": 5},
             "Texting: action space Tuple(Discrete(2), Text(1, 5, ",
         ),
-        ({"id": "Toy-v0", "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
         (
             {"id": "hpamdp/CatchPoint-v0", "kwargs": {"wide": 1}},
             "hpamdp/CatchPoint-v0: wide: no such setting of CatchPointOptions",
         ),
         ({"entry_point": "toy_environments:Nobody"}, "there is no class or function Nobody in toy_environments"),
-        ({"entry_point": "toy_environments"}, "must be a class or function, as package.module:name"),
         ({"entry_point": "builtins:object", "max_steps": 5}, "wrap an environment of gym with shimmy"),
     ],
 )
 def test_a_mistake_is_explained_in_one_line(options, complaint):
     assert complaint in mistake_in(**options)
-
-
-@pytest.mark.parametrize(("name", "value"), [("id", "CartPole-v1"), ("entry_point", TOY)])
-def test_a_function_and_a_name_for_the_same_environment_are_refused(name, value):
-    with pytest.raises(SettingError, match=f"make=.* and env.{name}={value}: give only one of them"):
-        GymnasiumEnv(make=lambda: gymnasium.make("CartPole-v1"), **{name: value})
 
 
 STEP = (np.zeros(2), 0.5, False, False, {})
@@ -302,12 +289,9 @@ STEP = (np.zeros(2), 0.5, False, False, {})
     ("returned", "complaint"),
     [
         (STEP[:3], "step returned 3 values, not observation, reward, terminated, truncated and info"),
-        (None, "step returned NoneType, not observation"),
         ((STEP[0], None, *STEP[2:]), "step returned None as reward, which must be a number"),
-        ((*STEP[:2], None, *STEP[3:]), "step returned None as terminated, which must be True or False"),
         ((*STEP[:4], {"is_success": float("nan")}), "step returned nan as info['is_success'], which must be True or"),
         ((*STEP[:4], None), "step returned None as info, which must be a dictionary"),
-        ((None, *STEP[1:]), "gave an observation whose value is None, not numbers that NumPy can hold"),
         ((np.zeros((2, 1)), *STEP[1:]), "gave an observation whose value has shape (2, 1), but its space has (2,)"),
     ],
 )

@@ -15,7 +15,6 @@ from hpamdp.env.gymnasium.scaling import ObservationScaling
 
 UNIT = Box(0, 1, (1,))
 MANY = 1 << 31
-TWO_BOXES = Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
 
 
 @pytest.mark.parametrize(

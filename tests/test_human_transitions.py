@@ -210,7 +210,6 @@ def test_replay_buffer_is_complete(path, data):
     ("given", "said"),
     [
         (dict(complete="false"), "complete='false', but must be True or False"),
-        (dict(best_people="5"), "best_people='5', but must be a whole number or None"),
         (dict(best_people=0), "best_people=0, but must be 1 to 3"),
         (dict(controller="congruen"), "controller='congruen', but must be one of incongruent, congruent"),
         (dict(reward="dense"), "reward='dense', but must be one of paper, sparse"),
@@ -235,11 +234,10 @@ def test_replay_buffer_samples_whole_episodes_and_slices(path, data):
     assert follows[inside].float().mean() > 0.9  # two slices of one episode may lie side by side
 
 
-@pytest.mark.parametrize("has_choice", [True, False])
-def test_minari_returns_the_exported_transitions(data, tmp_path, monkeypatch, has_choice):
+def test_minari_returns_the_exported_transitions(data, tmp_path, monkeypatch):
     library = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    batch = transitions(select(data, complete=True, best_people=1), has_choice=has_choice)
+    batch = transitions(select(data, complete=True, best_people=1))
     dataset = minari.export(batch, "hpamdp/people-v0")
     assert dataset.total_steps == len(batch)
     episode = dataset[0]

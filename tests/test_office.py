@@ -18,7 +18,7 @@ from torchrl.envs.utils import check_env_specs
 import hpamdp
 from hpamdp import keys
 from hpamdp.env.decisions import with_decisions
-from hpamdp.env.office import player, rendering, rules
+from hpamdp.env.office import player, rules
 from hpamdp.env.office.environment import OfficeEnv
 from hpamdp.env.office.rules import COFFEE, DOWN, LEFT, MAIL, RIGHT, TARGET, UP, OfficeState
 from hpamdp.run.assemble import assemble
@@ -151,14 +151,6 @@ def test_the_walls_are_those_of_the_published_map():
         y, x = zip(*polygon, strict=True)
         published.add((min(x), max(x), min(y), max(y)))
     assert {*rules.WALLS} == published and len(rules.WALLS) == len(polygons) == 20
-
-
-def test_this_files_walls_are_those_of_the_rules():
-    boxes = set()
-    for polygon in wall_polygons():
-        y, x = zip(*polygon, strict=True)
-        boxes.add(tuple(round(side, 6) for side in (min(x), max(x), min(y), max(y))))
-    assert boxes == {*rules.WALLS}
 
 
 def moved(place: POINT, discrete: int, length: float, *, slips: bool = False, has: tuple[bool, bool] = (False, False)):
@@ -340,13 +332,6 @@ def test_all_tensors_are_as_the_specs_say(settings):
     check_env_specs(with_decisions(OfficeEnv(3, max_steps=4, oracle=True, **settings), 0.9, 2))
 
 
-def test_a_state_with_two_coffees_is_refused():
-    env = OfficeEnv(1)
-    env.reset()
-    with pytest.raises(ValueError, match="coffee has 2 to 2, not 0 to 1"):
-        env.check_env_state({**env.env_state(), "coffee": torch.tensor([2], dtype=torch.int32)})
-
-
 @pytest.mark.parametrize("words", [["high=none"], ["high=uniform", "env.chooses_goal=true"]], ids=["any", "chosen"])
 def test_the_planner_plays_the_player_with_and_without_options(words):
     parts = assemble(make_config(["env=office", "low=planner", *words, "num_envs=4", "eval.layouts=50"]))
@@ -361,15 +346,3 @@ def test_an_option_ends_when_its_goal_is_reached_if_the_selector_decides_on_ends
     option, mask = td[keys.OPTION], td[keys.OPTION_MASK]
     assert mask.gather(-1, option.unsqueeze(-1)).all()
     assert {*option.flatten().tolist()} == {COFFEE, MAIL, TARGET}
-
-
-def test_a_picture_shows_the_way_and_what_the_agent_has():
-    env = OfficeEnv(1)
-    env.reset()
-    start = env.state
-    there = start._replace(x=torch.tensor([0.8]), y=torch.tensor([0.1]))
-    pictures = [
-        rendering.draw(track) for track in ([start], [start, there], [start, there._replace(coffee=start.coffee + 1)])
-    ]
-    assert all(picture.shape == (480, 480, 3) and picture.dtype == np.uint8 for picture in pictures)
-    assert (pictures[0] != pictures[1]).any() and (pictures[1] != pictures[2]).any()

@@ -75,9 +75,3 @@ class Cue(PAMDPEnv):
             keys.DONE: terminated.clone(),
         }
         return TensorDict({keys.OBSERVATION: observation, **flags}, self.batch_size)
-
-
-class CueOfOptions(Cue):
-    """The cue says which of two options pays."""
-
-    option_names = ("left", "right")
