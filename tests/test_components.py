@@ -93,13 +93,6 @@ def test_of_several_components_each_is_chosen_by_its_own_values():
     torch.testing.assert_close(log_probs[:, 2:].exp().sum(-1), torch.ones(2))
 
 
-def test_the_learners_of_policies_reach_the_best_pair_of_a_step():
-    torch.manual_seed(0)
-    learner = HPPO(PAMDPSpecs.from_env(OneStep()), **FAST)
-    train(learner, OneStep(256), 25)
-    assert greedy_reward(learner) > 0.97
-
-
 @pytest.mark.parametrize(
     "learner_class", [PDQN, *(pytest.param(each, marks=pytest.mark.slow) for each in (HSAC, PADDPG))]
 )
@@ -135,23 +128,6 @@ def test_learners_from_data_reach_the_best_pair_of_a_step(learner_class):
     assert greedy_reward(learner) > 0.9
 
 
-def test_imitation_of_matching_pairs_needs_autoregressive_heads():
-    """Half of the data are pairs (0, 0), half (1, 1); independent heads mix them."""
-    env = OneStep(pays="matched")
-    sampled = {}
-    for autoregressive in (False, True):
-        torch.manual_seed(0)
-        learner = BC(PAMDPSpecs.from_env(env), autoregressive=autoregressive, hidden_dims=(32,))
-        data = random_steps(env, 4000)
-        data = data[data["next", "reward"].flatten() > 0.9]
-        learner.add_demonstrations(data, torch.ones(data.shape, dtype=torch.bool))
-        learner.update(300)
-        steps = with_decisions(OneStep(1000, pays="matched")).rollout(1, learner.policy)
-        sampled[autoregressive] = (steps["next", "reward"] > 0.0).float().mean().item()
-    assert sampled[False] < 0.6
-    assert sampled[True] > 0.97
-
-
 @pytest.mark.parametrize("autoregressive", [False, True])
 def test_a_pair_off_the_marginals_is_reached_by_autoregressive_policies_alone(autoregressive):
     torch.manual_seed(0)
@@ -185,21 +161,6 @@ def test_soft_values_of_pairs_off_the_marginals_are_reached_by_autoregressive_po
     train(learner, OneStep(32, pays="climbing"), 60)
     reward = greedy_reward(learner, pays="climbing")
     assert reward > 0.95 if autoregressive else 0.4 < reward < 0.55
-
-
-def test_critics_see_the_parameters_of_earlier_components_as_they_were_executed(monkeypatch):
-    torch.manual_seed(0)
-    specs = PAMDPSpecs(2, (), (1, 1, 1, 1), (-1.0,) * 4, (1.0,) * 4, component_sizes=(2, 2))
-    learner = HSAC(specs, **SMALL, autoregressive=True)
-    seen, of_discrete = [], learner.critics.of_discrete
-    monkeypatch.setattr(
-        learner.critics,
-        "of_discrete",
-        lambda state, discrete, unit: (seen.append(unit), of_discrete(state, discrete, unit))[1],
-    )
-    executed = torch.tensor([[1.0, -1.0, 0.0, 0.0], [0.5, -0.99, 0.0, 0.0]])
-    learner._turn(1, torch.randn(2, 2), None, None, torch.zeros(2, 2, dtype=torch.long), executed)
-    torch.testing.assert_close(seen[0][:, :2], executed[:, :2].repeat_interleave(2, 0), atol=1e-4, rtol=0.0)
 
 
 def test_the_greedy_action_of_autoregressive_heads_is_the_most_probable_together():

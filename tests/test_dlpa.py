@@ -308,11 +308,6 @@ def test_a_learner_with_end_values_plans_towards_what_they_say(monkeypatch):
     torch.testing.assert_close(unit, torch.full((20,), 0.6), atol=0.1, rtol=0.0)
 
 
-def test_the_copies_of_a_policy_get_the_weights_of_its_end_values():
-    names = make(end_values=True).policy.state_dict()
-    assert any(name.startswith("end_value.end.") for name in names)
-
-
 @pytest.fixture(scope="module")
 def trained() -> DLPA:
     torch.manual_seed(0)

@@ -21,7 +21,6 @@ from toy_steps import SPECS, one_step_rows, states
 import hpamdp
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
-from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Bonus
@@ -268,17 +267,6 @@ def test_qpamdp_gives_held_parameters_no_gradient():
     assert torch.equal((gradient != 0.0).any(-1), ~is_held & has_parameters) and is_held.any()
 
 
-def test_no_plan_is_made_where_an_action_is_held(monkeypatch):
-    torch.manual_seed(0)
-    learner = DLPA(SPECS, num_samples=8, num_elites=4, num_iterations=1, hidden_dims=[8], epsilon=0.0)
-    learner.policy.is_trained.fill_(True)
-    planned = []
-    plan = learner.policy.planner.plan
-    monkeypatch.setattr(learner.policy.planner, "plan", lambda *rows: planned.append(len(rows[0])) or plan(*rows))
-    td = Held(learner, epsilon=0.5).policy(states(64))
-    assert planned == [64 - int(td[keys.IS_HELD].sum())] and 0 < planned[0] < 64
-
-
 # Novelty.
 
 
@@ -367,15 +355,6 @@ def test_the_bonus_of_a_cell_is_one_over_the_root_of_its_visits():
     assert learner.bonus.of(same) == pytest.approx(1.0 / 3.0) and learner.bonus.of(other) == 1.0
 
 
-def test_cells_have_places_of_their_own_in_the_table_of_counts():
-    table = VisitTable(3, CountsOptions(resolution=10.0))
-    axis = torch.linspace(-1.0, 1.0, 21)
-    cells = torch.cartesian_prod(axis, axis, axis)
-    assert len(table.places(cells).unique()) > 0.97 * len(cells), "few of 9,261 cells share one of 262,139 places"
-    table.see(cells)
-    assert table.counts.sum() == len(cells)
-
-
 def test_cells_leave_out_the_entries_whose_resolution_is_0():
     table = VisitTable(4, CountsOptions(resolution=[10.0, 10.0, 0.0, 0.0]))
     place, other = torch.tensor([0.3, -0.6]), torch.tensor([0.3, -0.4])
@@ -383,17 +362,6 @@ def test_cells_leave_out_the_entries_whose_resolution_is_0():
     table.see(torch.cat([place.expand(3, 2), speeds], -1))
     assert table.bonus(torch.cat([place, -speeds[1]])) == pytest.approx(3.0**-0.5)
     assert table.bonus(torch.cat([other, speeds[1]])) == 1.0
-
-
-def test_cells_that_share_a_place_in_the_table_are_counted_all_the_same():
-    table = VisitTable(4, CountsOptions(resolution=10.0))
-    axis = torch.linspace(-1.0, 1.0, 21)
-    cells = torch.cartesian_prod(axis, axis, axis, axis)
-    table.see(cells)
-    assert table.counts.count_nonzero() < 0.75 * len(cells)
-    assert table.num_cells() == pytest.approx(len(cells), rel=0.01)
-    table.see(cells)
-    assert table.num_cells() == pytest.approx(len(cells), rel=0.01), "visits again are no new cells"
 
 
 @pytest.mark.parametrize(
@@ -468,27 +436,6 @@ def test_a_bonus_in_plans_has_the_scale_of_the_rewards(kind):
     assert weights == [3.0, pytest.approx(0.03)]
 
 
-def test_the_members_disagreement_is_the_same_wherever_an_action_points():
-    torch.manual_seed(0)
-    learner = PETS(PAMDPSpecs.from_env(BoatDockEnv(1, controller="congruent")))
-    model, frame = learner.model, learner.model.frame
-    assert frame.turns
-    model.change_scale.copy_(torch.rand(len(model.change_scale)) + 0.01)
-    model.is_predicted[frame.y] = 0.0  # as where steps hardly lead aside
-    learner.take_bonus(Bonus(1.0, None))
-    turned = torch.rand(1, 50, len(model.change_scale)).expand(model.num_members, -1, -1)
-    bonuses = []
-    for action in range(frame.directions.shape[1]):
-        discrete = torch.full(turned.shape[:-1], action)
-        state = frame.turn_back(turned, frame.direction(turned, discrete))
-        ahead = model(state, discrete, torch.ones(*discrete.shape, 1))
-        change = model.scaled_change(state, discrete, ahead.next_state)
-        bonuses.append((change.std(0, correction=0) * model.is_predicted).sum(-1))
-    assert bonuses[0].min() > 0.0
-    for other in bonuses[1:]:
-        torch.testing.assert_close(other, bonuses[0], rtol=1e-3, atol=1e-5)
-
-
 def test_settings_of_networks_have_no_effect_on_an_ensemble_and_a_line_says_so(capfd):
     words = ["env=catch_point", "high=none", "low=pets", "exploration=novelty", "total_frames=512"]
     for more, is_told in (([], False), (["exploration.lr=0.1"], True)):
@@ -535,7 +482,7 @@ def test_each_options_learner_has_its_own_exploration():
         parts.close()
 
 
-@pytest.mark.parametrize(("low", "kind"), pairs(("hyar", "held"), ("pets", "novelty"), ("hppo", "counts")))
+@pytest.mark.parametrize(("low", "kind"), pairs(("hyar", "held"), ("pets", "novelty")))
 def test_every_learner_that_takes_an_exploration_trains_with_it_and_is_reloaded(low, kind, tmp_path):
     words = [*PLATFORM, f"low={low}", f"exploration={kind}", *SHORT.get(low, []), *SMALL, "film=false"]
     assert run(compose_config(words), tmp_path, words) == 0
@@ -564,14 +511,8 @@ REFUSED = [
         "low=random exploration=held",
         "exploration=held: changes actions, which low=random does not take; use exploration",
     ),
-    (
-        "low=planner env=platform exploration=novelty",
-        "exploration=novelty: changes rewards, which low=planner does not",
-    ),
-    ("low=iql exploration=novelty", "exploration=novelty: changes rewards, which low=iql does not take"),
     ("low=bc mode=offline data=human exploration=held", "exploration=held: mode=offline takes no steps"),
     ("low=hppo low.freeze=true exploration=held", "exploration=held: low.freeze=true keeps the learners as they are"),
-    ("low=hppo exploration=held exploration.mu=1", "exploration.mu=1: must be greater than 1 (Held"),
     ("low=pdqn low.augment=true exploration=novelty", "exploration: low.augment=true: maps states to others that were"),
     (
         "low=hppo env=catch_point_picture exploration=counts",
@@ -585,10 +526,6 @@ REFUSED = [
         "high=value low=pets exploration=novelty exploration.in_plans=distillation",
         "use low.augment=false, or exploration=novelty exploration.in_plans=disagreement",
     ),
-    (
-        "low=hppo +low.per_option={congruent:random} exploration=held",
-        "exploration=held: changes actions, which low=random does not take",
-    ),
 ]
 
 
@@ -601,7 +538,7 @@ def test_what_an_exploration_does_not_go_with_is_refused_in_one_line(words, line
 
 @pytest.mark.parametrize(
     ("given", "name", "epsilon"),
-    [({"name": "held", "epsilon": 0.5}, "held", 0.5), (Held, "held", 0.05), (None, "none", None)],
+    [({"name": "held", "epsilon": 0.5}, "held", 0.5), (Held, "held", 0.05)],
 )
 def test_an_exploration_is_chosen_from_python_and_is_part_of_the_saved_config(given, name, epsilon):
     small = {"num_envs": 8, "steps_per_batch": 4, "total_frames": 64, "eval.layouts": 4, "film": False}

@@ -180,32 +180,6 @@ def test_the_greedy_form_or_a_search_leaves_a_discrete_action_whose_neighbours_a
     assert acted[keys.DISCRETE].item() == (2 if is_left else 0)
 
 
-class TwoHills(torch.nn.Module):
-    """Values of z, whatever e: a high hill at -.5 in every entry, and a low one at .6."""
-
-    def forward(self, state, latent, num_members=None):
-        z = latent[..., 3:]
-        hills = torch.maximum(1.0 - 2.0 * (z + 0.5).abs(), 0.5 - 2.0 * (z - 0.6).abs())
-        return hills.sum(-1).unsqueeze(0)
-
-
-@pytest.mark.parametrize(
-    ("discrete", "search_samples", "expected"), [("greedy", 0, 0.6), ("greedy", 16, -0.5), ("nearest", 16, -0.5)]
-)
-def test_the_search_brings_z_to_a_higher_hill_that_the_gradient_does_not_see(discrete, search_samples, expected):
-    torch.manual_seed(0)
-    learner = make(discrete=discrete, search_samples=search_samples, search_weight=10.0, actor_lr=1e-2, latent_dim=2)
-    learner.critics = TwoHills()
-    state = torch.rand(64, 4) * 2 - 1
-    with torch.no_grad():
-        learner.actor.net[-1].weight.zero_()
-        learner.actor.net[-1].bias.fill_(0.5)
-    for _ in range(300):
-        learner.gradient_step("actor", learner.actor_loss, state, None)
-    z = learner.actor.proposals(learner.actor(state), learner.codec.embeddings)[..., 3:]
-    torch.testing.assert_close(z, torch.full_like(z, expected), atol=0.1, rtol=0.0)
-
-
 @pytest.mark.parametrize("discrete", ["greedy", "nearest"])
 def test_the_search_tries_no_forbidden_action(discrete):
     torch.manual_seed(0)
@@ -415,21 +389,6 @@ def test_with_a_window_a_run_that_resumes_without_its_steps_learns_from_the_new_
     resumed.load_state_dict(earlier.state_dict())
     learn(resumed, 1, 70)
     assert resumed.updates == earlier.updates + 70
-
-
-def test_with_a_window_a_run_from_another_runs_networks_leaves_its_own_warm_up_out():
-    torch.manual_seed(0)
-    settings = dict(critic_window=400, warmup_steps=200, codec_pretrain_updates=1, updates_per_step=1.0, batch_size=60)
-    earlier, learner = make(**settings), make(**settings)
-    learn(earlier, 1)
-    learn(earlier, 1, 100)
-    learner.load_networks(earlier.state_dict())
-    learn(learner, 1)
-    learn(learner, 1, 100)
-    assert learner.warmup_rows == 200
-    newest = {row.tobytes() for row in learner.buffer[200:300]["state"].numpy()}
-    seen = {row.tobytes() for sample in learner.sample_batches(20) for row in sample["state"].numpy()}
-    assert seen == newest
 
 
 def test_the_noise_falls_with_the_episodes_after_the_warm_up():

@@ -334,7 +334,7 @@ def test_a_truncated_option_without_an_action_is_followed_by_another_if_the_sele
 
 @pytest.mark.parametrize("option_length", [None, 3])
 @pytest.mark.parametrize("actions", [{"low": [0, 1], "last": [2]}, {"first": [0], "last": [2]}], ids=["one", "none"])
-@pytest.mark.parametrize(("high", "low"), [("uniform", "hyar"), ("uniform", "random"), ("value", "hppo")])
+@pytest.mark.parametrize(("high", "low"), [("uniform", "hyar"), ("value", "hppo")])
 def test_what_is_played_on_after_a_truncation_is_allowed(high, low, actions, option_length):
     env = with_decisions(grouped(Closing(32), actions), 1.0, option_length)
     specs = PAMDPSpecs.from_env(env)
@@ -386,18 +386,3 @@ def test_logits_of_any_size_leave_forbidden_choices_a_probability_of_zero():
     logits = torch.tensor([[-1e12, 0.0], [3.0, -1e20]])
     probability = masked_logits(logits, torch.tensor([[True, False], [False, True]])).softmax(-1)
     assert probability.tolist() == [[1.0, 0.0], [0.0, 1.0]]
-
-
-def test_a_problem_without_masks_has_none():
-    config = make_config(["env=platform", "high=none", "low=random"])
-    specs = PAMDPSpecs.from_env(config.env.build(num_envs=2, device=CPU, seed=0))
-    assert not specs.has_action_mask and not specs.has_option_mask
-    assert specs.allowed(torch.zeros(2, specs.observation_dim)) is None
-    learner = config.low.build(specs=specs)
-    assert HierarchicalAgent(None, [learner], specs).router.in_keys == [keys.OBSERVATION]
-    td = TensorDict({keys.OBSERVATION: torch.zeros(4, specs.observation_dim)}, [4])
-    torch.manual_seed(0)
-    taken = learner.policy(td)[keys.DISCRETE]
-    torch.manual_seed(0)
-    torch.rand(4, specs.num_parameters)
-    assert torch.equal(taken, torch.randint(specs.num_discrete, (4,))), "the same random numbers as without masks"

@@ -17,7 +17,7 @@ import hpamdp
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.decisions import with_decisions
-from hpamdp.policies.agent import AgentNextOptions, HierarchicalAgent
+from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner, Selector
 from hpamdp.policies.high_level.actor import Actor
 from hpamdp.policies.high_level.meta_critic import MetaCritic
@@ -243,14 +243,6 @@ def test_overwritten_rows_are_no_ancestors():
     assert places[0].tolist() == [3, 0, 1] and places[1].tolist() == [2, 3, 0] and places[2, :2].tolist() == [2, 3]
 
 
-def test_asking_for_example_rows_leaves_buffer_and_links_alone():
-    learner, rolled = stored("pdqn", 2)
-    before, num = learner.links.last_rows.clone(), len(learner.buffer)
-    rows = learner.replay_rows(rolled[:, :1])["buffer"]
-    assert set(rows.keys()) == set(learner.buffer[:].keys())
-    assert torch.equal(learner.links.last_rows, before) and len(learner.buffer) == num
-
-
 def test_n_step_returns_with_a_stack_go_on_with_the_state_after_their_last_step():
     learner, rolled = played("pdqn", "stack", n_step=3)
     rows = learner.transitions(rolled)
@@ -400,19 +392,7 @@ def test_the_ratios_of_an_actors_sequences_are_one_before_an_update():
     torch.testing.assert_close(now, rows["log_prob"])
 
 
-def test_the_option_after_a_batch_is_chosen_with_what_the_selector_remembers():
-    selector, batches = decided("actor", "gru", minibatch_size=1000)
-    batch = batches[0]
-    seen = []
-    selector.option_probabilities = lambda td: seen.append(td) or torch.full((len(td), 2), 0.5)
-    options = AgentNextOptions(selector, [], 2, is_shared=False)
-    options.with_next_option(batch)
-    is_missing = (batch["next", keys.OPTION_ENDED] & batch["next", keys.DONE]).squeeze(-1)
-    is_missing[:, -1] |= batch["next", keys.OPTION_ENDED][:, -1, 0]
-    assert torch.equal(seen[0][selector.memory_key], batch[selector.memory_key][is_missing])
-
-
-@pytest.mark.parametrize("high", ["actor", "meta_critic"])
+@pytest.mark.parametrize("high", [pytest.param("actor", marks=pytest.mark.slow), "meta_critic"])
 def test_a_run_of_a_selector_with_a_recurrent_memory_resumes_to_the_last_bit(high, tmp_path, monkeypatch):
     words = [
         *words_of(high, "random"), "env=rooms", "env.max_steps=12", "agent.termination=steps", "agent.option_length=2",
@@ -486,12 +466,9 @@ def test_an_agent_remembers_until_its_episode_ends(memory):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["low=hppo", "low.memory=lstm"], "low.memory"),
         (["low=hppo", "low.memory=gru", "low.vector_products=true"], "vector_products=true: does not go with memory"),
-        (["low=pdqn", "low.memory=stack", "low.augment=true"], "augment=true: does not go with memory=stack"),
         (["low=pets", "low.memory=gru", "low.augment=true"], "augment=true: does not go with memory=gru"),
         (["low=pdqn", "low.memory=gru", "low.n_step=2"], "n_step=2: does not go with memory=gru"),
-        (["low=pdqn", "low.memory=gru", "low.double_q=true"], "double_q=true: does not go with memory=gru"),
         (["low=hppo", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=hppo: memory=gru"),
         (["low=pdqn", "low.memory=gru", "data=human"], "low.memory=gru: .*lacks what a policy remembered"),
         (["low=hppo", "high=actor", "high.memory=gru"], "high.memory=gru: agent.termination=episode has one decision"),
@@ -502,11 +479,6 @@ def test_what_does_not_go_with_a_memory_is_refused_in_one_line(words, message, t
     with pytest.raises(ConfigError, match=message) as error:
         assemble(make_config(words)).close()
     assert "\n" not in str(error.value)
-
-
-def test_learners_without_a_memory_have_no_such_setting():
-    with pytest.raises(ConfigError, match=r"low\.memory: no such setting of QPAMDP"):
-        hpamdp.train("platform", low="qpamdp", **{"low.memory": "gru"})
 
 
 @pytest.mark.slow

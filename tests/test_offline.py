@@ -170,7 +170,7 @@ def test_selectors_of_their_own_choices_alone_are_refused_offline_in_one_line(hi
     assert str(refusal.value) == f"high={high}: learns from its own choices only; use mode=train, or another high"
 
 
-@pytest.mark.parametrize("high", ["exp3", "actor"])
+@pytest.mark.parametrize("high", [pytest.param("exp3", marks=pytest.mark.slow), "actor"])
 def test_selectors_of_their_own_choices_alone_train_beside_a_data_set(high, path, tmp_path):
     words = [f"data.path={path}", "data=human", "data.checksum=null", "low=pdqn", f"high={high}", "eval.layouts=4"]
     words += ["num_envs=8", "steps_per_batch=4", "total_frames=256", "low.batch_size=16", "eval.every=0"]
@@ -243,10 +243,8 @@ REFUSED = [
     (["low=bc"], "low=bc learns from data sets only; use mode=offline and a data set"),
     (["low=hppo", "mode=offline", "data=human"], "low=hppo learns from its own steps only; use data=none"),
     (["low=iql", "mode=offline"], "mode=offline: data=none leaves nothing to learn from; choose a data set"),
-    (["low=iql", "mode=offline", "data=human", "data.path=/nowhere.mat"], "/nowhere.mat: there is no such file"),
     (["low=iql", "high=none", "env=platform", "mode=offline", "data=human"], "people docked boats; use env=boatdock"),
     (["low=iql", "data=human", "mode=offline", "collector=multi"], "mode=offline takes no steps"),
-    (["low=iql", "data=human", "mode=offline", "low.freeze=true"], "mode=offline trains the learners"),
 ]
 
 
@@ -305,8 +303,6 @@ def test_nothing_learns_from_people_who_are_held_out(path):
 PEOPLE_REFUSED = [
     ("data.held_out=[7]", "held_out: the transitions have nobody with the number 7"),
     ("data.held_out=[0,1,2]", "held_out: the transitions are of nobody else"),
-    ("data.people=[5]", "people: nobody has the number 5; the numbers are 0 to 2"),
-    ("data.people=[]", "people"),
     ("data.worst_people=4", "worst_people=4, but must be 1 to 3"),
 ]
 
@@ -329,13 +325,6 @@ def test_an_offline_run_can_be_resumed_and_fine_tuned_online(path, tmp_path):
     tuned = ["low=iql", "high=human", f"low.checkpoint={tmp_path / 'a'}", "total_frames=512", "low.warmup_steps=64"]
     tuned += ["num_envs=16", "eval.layouts=10", "eval.every=0", "low.batch_size=16"]
     assert run(compose_config(tuned), tmp_path / "d", tuned) == 0
-
-
-def test_demonstrations_are_stored_in_the_replay_buffers(path):
-    given = ["low=pdqn", "data=human", "data.checksum=null", f"data.path={path}", "eval.layouts=4", "num_envs=4"]
-    parts = assemble(make_config(given))
-    parts.agent.add_demonstrations(parts.data.batch, parts.data.decisions)
-    assert sum(len(learner.buffer) for learner in parts.agent.learners) == parts.data.batch.numel()
 
 
 def test_a_buffer_that_drops_steps_of_the_data_says_so(path, capsys):

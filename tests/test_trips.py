@@ -19,7 +19,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import choosing_class
 from hpamdp.env.base import ProblemError
 from hpamdp.env.decisions import with_decisions
-from hpamdp.policies.agent import HierarchicalAgent, ended_with_trips, with_option
+from hpamdp.policies.agent import HierarchicalAgent, with_option
 from hpamdp.policies.base import Learner, Selector, States
 from hpamdp.policies.high_level.actor import Actor
 from hpamdp.policies.high_level.meta_critic import MetaCritic
@@ -278,17 +278,6 @@ def test_a_step_before_a_batch_ends_its_trip_for_a_selector_that_ends_options():
     assert (rows["discount"][ended] == 0.0).all() and (rows["discount"][~ended] > 0.0).all()
 
 
-def test_a_batch_stays_as_it_was_collected():
-    env = Sessions(1)
-    specs = PAMDPSpecs.from_env(env)
-    agent = agent_of([Random(specs)], specs, "trip")
-    batch = played(env, agent)
-    before = batch.clone()
-    ended = ended_with_trips(batch)
-    assert ended["next", keys.DONE].tolist() != batch["next", keys.DONE].tolist()
-    assert (batch == before).all()
-
-
 # Memories.
 
 LEARNERS = {"hppo": (HPPO, {"minibatch_size": 1000}), "pdqn": (PDQN, {}), "hsac": (HSAC, {})}
@@ -514,10 +503,7 @@ def test_an_agent_that_chooses_by_the_rewards_of_a_session_does_not_act_without_
     [
         ("platform", {"agent.values_end": "trip"}, "agent.values_end=trip: episodes of env=platform have no trips"),
         ("boatdock_unseen", {"agent.selector_values_end": "trip"}, "values_end=trip: high=none has no values; use"),
-        ("boatdock", {"high": "value", "high.untried_first": True}, "high.untried_first=true: episodes of"),
         (HiddenOption, {"high": "exp3", "high.memory": "session"}, "high.memory=.session.: must be"),
-        (HiddenOption, {"low.freeze": True}, "low.freeze=true: plays whole episodes"),
-        (HiddenOption, {"data": "human"}, "data=human: env=HiddenOption has sessions of trips"),
         (HiddenOption, {"compile_updates": True}, "compile_updates=true: env=HiddenOption has trips"),
         (
             HiddenOption,
@@ -531,13 +517,6 @@ def test_what_does_not_go_with_trips_is_refused_in_one_line(env, settings, messa
     with pytest.raises(ConfigError, match=message) as error:
         hpamdp.train(env, low="hppo", **{**SMALL, **settings})
     assert "\n" not in str(error.value)
-
-
-def test_a_learner_that_no_option_uses_is_not_compared_with_the_others():
-    own = {name: {"name": "hppo", "memory": "none", "minibatch_size": 64} for name in ("boat_1", "boat_2")}
-    more = {"low.per_option": own, "env.boats": 2, "env.trips": 2, "progress": False}
-    agent = hpamdp.train("boatdock_unseen", high="ucb", low="hppo", **{**QUIET, **more})  # the recipe sets memory=gru
-    assert not any("gru" in key for key in agent._kept)
 
 
 def test_an_evaluation_learns_nothing_and_so_ignores_where_values_end(command):
