@@ -238,10 +238,6 @@ def test_a_resumed_run_tells_that_schedules_have_ended(tmp_path, capsys):
     hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **{**TINY, "low.anneal_steps": 1024})
     hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 2048})
     assert "but low.anneal_steps stay at 1,024" in capsys.readouterr().err
-    sizes = {"low.buffer_size": 1024, "low.warmup_steps": 1024, "low.lr_steps": 2048}
-    hpamdp.train("platform", low="pdqn", folder=tmp_path / "pdqn", **TINY, **sizes)
-    hpamdp.train(resume=tmp_path / "pdqn", folder=tmp_path / "longer", **{**TINY, "total_frames": 2048})
-    assert "total_frames is raised" not in capsys.readouterr().err
 
 
 def test_another_preset_of_a_problem_keeps_none_of_the_agents_settings():
@@ -357,12 +353,8 @@ def test_an_evaluation_returns_means_or_one_entry_for_each_episode(platform_agen
     ("observation", "more", "message"),
     [
         (np.zeros(8), {}, r"shape \[8\], but must have \[9\] or \[N, 9\]"),
-        (np.zeros((2, 3, 9)), {}, r"shape \[2, 3, 9\]"),
-        (np.zeros((0, 9)), {}, r"shape \[0, 9\]"),
         (np.full(9, np.nan), {}, "entry 0 of the observation is not finite"),
         ("left", {}, "must hold 9 numbers, but is 'left'"),
-        (["1"] * 9, {}, "must hold 9 numbers"),
-        (np.zeros(9, complex), {}, "must hold 9 numbers"),
         (TensorDict({"observation": torch.zeros(2, 9)}, [2]), {}, "must hold 9 numbers, but is TensorDict"),
         (np.zeros(9), {"greedy": "no"}, "must be True or False"),
         (np.zeros(9), {"info": 3}, "must be a dict"),
@@ -462,7 +454,6 @@ WITHOUT_FOLDER = {"folder": None}
         ({"low": "hpp"}, "low=hpp: no such choice"),
         ({"total_frame": 3}, "did you mean total_frames"),
         ({"low": 3}, "must be a name, a class, None, or a dict"),
-        ({"low": gymnasium.Env}, "is no Learner"),
         ({"low.hidden_dims": np.zeros((2, 2))}, "must be a number, a text, or a list or mapping of these"),
         ({"seed": object()}, "must be a number, a text, or a list or mapping"),
         ({"mode": "eval"}, r"use hpamdp.load\(...\).evaluate"),
@@ -470,29 +461,20 @@ WITHOUT_FOLDER = {"folder": None}
         ({"env": lambda: 3}, "is no environment"),
         ({"env": Several}, "Several is no environment, .* one of several agents needs a gymnasium.Env around it"),
         ({"env": lambda: gymnasium.vector.SyncVectorEnv([Reach])}, "give a single one, of which num_envs makes copies"),
-        ({"env": {"env": Reach}}, "env: .*Reach.* is given as 'env'; write {'name': ..., ...}"),
-        ({"low": {"low": "hppo"}}, "low: 'hppo' is given as 'low'; write {'name': ..., ...}"),
         ({"low": {"cls": hpamdp.HPPO}}, "HPPO.* is given as 'cls'; write {'name': ..., ...}"),
         ({"env": lambda: Reach}, "returned the class Reach, not an environment; call it"),
-        ({"env": gymnasium.Env}, "has no action_space"),
         ({"env": Reach}, "no time limit of its own; set env.max_steps"),
-        ({"env": {"name": Reach, "max_stepz": 5}}, "max_stepz"),
         ({"config_dirs": ["nowhere"]}, "there is no folder nowhere"),
-        ({"config_dirs": [3]}, r"config_dirs=\[3\]: must be a list of folders"),
         ({"callbacks": None}, "must be a list of objects of subclasses"),
-        ({"callbacks": [hpamdp.BestAgent]}, "not BestAgent, a class"),
         ({"callbacks": [hpamdp.Patience(evaluations=1)], "eval.every": 0}, "callbacks: Patience needs evaluations"),
         ({"hydra.run.dir": "other"}, "Hydra runs no job here"),
-        ({"folder": ""}, "folder='': must be a path"),
         ({"folder": "file"}, "folder="),
         ({"folder": "file/x"}, "folder="),
-        ({"folder": "n" * 300}, "folder="),
         ({"resume": "auto", **WITHOUT_FOLDER}, "so give folder"),
         ({"logger": "wandb", **WITHOUT_FOLDER}, "writes files, so give the run a folder"),
         ({"overwrite": True, **WITHOUT_FOLDER}, "overwrite=True: has no effect without a folder; give folder, or"),
         ({"trust": True}, "trust=True: has no effect without a saved run; give resume, or leave it out"),
         ({"low": {"name": "hppo", "gamma": 0.9}, "low.gamma": 0.9}, "low.gamma: given twice, as 0.9 and as 0.9"),
-        ({"low.per_option": {"a": "pets"}, "low.per_option.a.name": "hppo"}, "low.per_option.a: given twice"),
         ({"env.grouping": None, "env.grouping.a": [0]}, "env.grouping: given twice, as None and as"),
     ],
 )
@@ -629,12 +611,7 @@ def dict_agent() -> hpamdp.Agent:
             {"pos": np.zeros(2), "time": np.zeros(3)},
             "act: the entry time has the shape [3], but the entry pos holds one observation, so it must have []",
         ),
-        (
-            {"pos": np.zeros((0, 2)), "time": np.zeros(0)},
-            "act: the entry pos has the shape [0, 2], but must have [2] or [N, 2], with N from 1 on",
-        ),
         ({"pos": np.zeros((2, 2))}, "act: the observation lacks the entry time"),
-        (3.0, "act: the observation lacks the entry pos"),
     ],
 )
 def test_entries_that_are_missing_or_hold_other_numbers_of_observations_are_refused(dict_agent, observation, line):
@@ -652,7 +629,7 @@ def test_a_batch_of_entries_of_a_dict_acts_as_its_rows_do(dict_agent):
 # Mistakes that a hostile user found: each is one line, or has the effect that one would expect.
 
 
-@pytest.mark.parametrize("given", [range(16, 0, -8), torch.tensor([16, 8])])
+@pytest.mark.parametrize("given", [torch.tensor([16, 8])])
 def test_a_list_may_be_a_tensor_or_a_range(given):
     agent = hpamdp.train("platform", low={"name": "hppo", "hidden_dims": given}, **TINY)
     assert agent._config.low.settings["hidden_dims"] == (16, 8)
@@ -705,8 +682,6 @@ class FailsToClose(Counted):
     [
         lambda agent: hpamdp.make(Counted, 3, **WRONG_OPTION),
         lambda agent: hpamdp.make(FailsToClose, 3, **WRONG_OPTION),
-        lambda agent: hpamdp.make(Counted, 3),  # without a limit of steps
-        lambda agent: hpamdp.make(Counted, 3, max_steps=5, raw_observations=[7]),
         lambda agent: hpamdp.train({"name": Counted, **WRONG_OPTION}, low="hppo", **TINY),
         lambda agent: hpamdp.train(Counted, low={"name": "hppo", "value_symmetry": True}, **TINY, max_steps=5),
         lambda agent: hpamdp.load(agent, env=Counted),  # another problem than that of the agent
@@ -750,13 +725,10 @@ def test_random_numbers_stay_the_callers(tmp_path):
     ("source", "settings", "message"),
     [
         ("hppo_platform", {"mode": "train"}, "has no effect on a trained agent"),
-        ("hppo_platform", {"low": "hppo"}, "low: a trained agent keeps it; pass its class"),
         ("hppo_platform", {"eval": {"seed": 1, "layouts": 3}}, "has no effect on a trained agent"),
         ("hppo_platform", {"trust": "false"}, "must be True or False"),
         ("hppo_platform", {"max_stps": 5}, r"did you mean env\.max_steps"),
         ("no_such_agent", {}, "linucb_hppo"),
-        ("", {}, "must be a path"),
-        (["a"], {}, "must be a path"),
     ],
 )
 def test_wrong_arguments_of_load_are_refused(source, settings, message):
@@ -773,9 +745,8 @@ def test_home_directories_are_written_and_read_by_the_same_rule(tmp_path, monkey
     hpamdp.train("platform", low="hppo", folder="~/run", **TINY)
     assert {"a.safetensors", "run"} == {path.name for path in (tmp_path / "home").iterdir()}
     assert hpamdp.load("~/a.safetensors").specs == hpamdp.load("~/run").specs
-    for path in ("./~a.safetensors", Path("~nobody.safetensors"), "./~/b.safetensors"):  # are no home directories
-        platform_agent.save(path)
-        assert (tmp_path / path).is_file() and hpamdp.load(path).specs == platform_agent.specs
+    platform_agent.save("./~/b.safetensors")  # no home directory
+    assert hpamdp.load(tmp_path / "~/b.safetensors").specs == platform_agent.specs
 
 
 def test_an_object_takes_the_place_of_the_environment_of_a_saved_run(tmp_path):
@@ -791,16 +762,6 @@ def test_an_object_takes_the_place_of_the_environment_of_a_saved_run(tmp_path):
     assert made and agent._env.envs[0].unwrapped in made
     with pytest.raises(hpamdp.ConfigError, match=r"env\.entry_point=toy_environments:Toy: give only one of them"):
         hpamdp.load(tmp_path / "run", env=make, entry_point="toy_environments:Toy")
-
-
-def test_an_agent_that_holds_nothing_takes_the_mask_of_a_vector_loop(platform_agent):
-    observations = np.zeros((3, 9), np.float32)
-    platform_agent.act(observations)
-    platform_agent.reset(np.array([True, False, True]))
-    platform_agent.act(observations)
-    for junk in ("x", [0.5], np.zeros((2, 2), bool)):
-        with pytest.raises(ValueError, match="starts must be bool"):
-            platform_agent.reset(junk)
 
 
 class Masked(Reach):
@@ -855,58 +816,32 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
     ("make", "message"),
     [
         (lambda: hpamdp.make("platform", 1.5), "num_envs"),
-        (lambda: hpamdp.make("platform", num_envs=10**12), r"^num_envs=1000000000000: must be less than or equal to"),
         (lambda: hpamdp.make("platform", seed=-1), "seed"),
         (lambda: hpamdp.make("platform", oracle="x"), "oracle"),
         (lambda: hpamdp.make("platform", oracle=True), "oracle=True: env=platform has no planner to ask"),
-        (lambda: hpamdp.make("office", human=True), "human=True: env=office has no human data"),
-        (lambda: hpamdp.make("platform", device="cuda:9"), "device"),
         (lambda: hpamdp.make("hpamdp/Platform-v1"), r"no such problem .*; did you mean hpamdp/Platform-v0"),
         (lambda: hpamdp.make("CartPole-v1", id="Acrobot-v1"), r"env\.id: given twice, as 'CartPole-v1' and as 'Acrob"),
         (lambda: hpamdp.make("platform", grouping={"up": ["hop", "hop"]}), "option up has an action twice: hop, hop"),
-        (lambda: hpamdp.make("platform", grouping={"a b": [0]}), "the name 'a b' of an entry must be a text"),
-        (lambda: hpamdp.make("platform", grouping={"up": "hop"}), 'env.grouping.up="hop": must be a list'),
-        (lambda: hpamdp.make_gymnasium(None), "must be the name of a problem"),
         (lambda: hpamdp.make_gymnasium("platform", 2, **{"env.num_envs": 3}), "give it as the argument num_envs"),
-        (lambda: hpamdp.make_gymnasium("platform", **{"env.id": "CartPole-v1"}), "give it as the argument name"),
-        (lambda: hpamdp.make_gymnasium("platform", problem="x:Y"), "problem: no setting of the problem; give it as"),
         (lambda: hpamdp.make_gymnasium("platform", seed=3), "seed=3: no setting of the environment; give it to reset"),
         (lambda: hpamdp.make_gymnasium("platform", render_mode="ansi"), "must be None or rgb_array"),
-        (lambda: hpamdp.make_gymnasium("platform", device="gpu"), 'device="gpu": must be auto, cpu, cuda or cuda:N'),
         (lambda: hpamdp.make_gymnasium("platform", options={}), "options: must be PlatformOptions, not dict$"),
-        (lambda: hpamdp.make_gymnasium("platform", max_steps=-1), "max_steps=-1"),
         (lambda: hpamdp.make_gymnasium("platform", 2, autoreset_mode="x"), "'x' is not a valid AutoresetMode"),
-        (lambda: hpamdp.make_gymnasium("platform", 2, vectorization_mode="x"), "Invalid vectorization mode: 'x'"),
         (lambda: hpamdp.make_gymnasium("platform").reset(options={None: 1, "a": 2}), r"unknown options \[None, 'a'\]"),
-        (lambda: hpamdp.make_gymnasium("office", 2).reset(options=5), "reset: options must be a dict, but is a "),
         (lambda: hpamdp.make_gymnasium("platfom"), "did you mean hpamdp/Platform-v0?"),
-        (lambda: hpamdp.make_gymnasium("no_such_module:Env"), "No module named 'no_such_module'"),
         (lambda: hpamdp.make_gymnasium("BoatDockUnseen", render_mode="rgb_array"), "has no pictures"),
-        (lambda: hpamdp.make_gymnasium("lunar_lander", enable_wind="no"), "enable_wind=.no.: must be a valid boolean"),
         (lambda: hpamdp.make_gymnasium("lunar_lander", gravty=-3.0), r"no such setting .*; did you mean gravity\? It"),
-        (lambda: hpamdp.make_gymnasium("lunar_lander", 2, max_step=3), r"no such setting .*; it has enable_wind, grav"),
         (lambda: hpamdp.make_gymnasium("TrafficCrossing", minute=3), r"minute: no such .*; did you mean minutes\?"),
-        (lambda: gymnasium.make("hpamdp/Office-v0", num_envs=3), "num_envs=3: this is one environment; use "),
         (lambda: hpamdp.train("platform", max_stps=5), r"did you mean env\.max_steps"),
         (lambda: hpamdp.train("platform", low="hppo", lr=1e-3), r"did you mean low\.lr\?"),
         (lambda: hpamdp.train("platfrom"), r"did you mean platform\? conf/env has "),
-        (lambda: hpamdp.train("platform", num_envs=0), r"num_envs=0: .* \(conf/config.yaml, given as an argument\)"),
         (lambda: hpamdp.train("platform", progress="no"), "progress='no': must be True or False"),
         (lambda: hpamdp.report(), "name the folder of a run"),
-        (
-            lambda: hpamdp.report(["runs", "more"]),
-            r"^report: folders in a list; give them one by one, such as ",
-        ),
         (lambda: hpamdp.report(__file__), r"test_api\.py: a file; give the folder of a run, or one that contains runs"),
-        (lambda: hpamdp.report(3), "folders=3: must be a path"),
-        (lambda: hpamdp.report(".", metric=3), "metric=3: must be the name of a column"),
         (lambda: hpamdp.HPPO("platform"), r"specs='platform': must be PAMDPSpecs.from_env\(env\)"),
-        (lambda: hpamdp.HPPO("MlpPolicy", hpamdp.make_gymnasium("platform")), r"specs='MlpPolicy': must be PAMDPSpecs"),
         (lambda: hpamdp.UCB(policy="MlpPolicy", env=3), r"specs='MlpPolicy': .* hpamdp.train\(env, low=...\) trains"),
         (lambda: hpamdp.load("hppo_platform").evaluate(n_eval_episodes=3), "no such argument; use episodes"),
-        (lambda: hpamdp.load("hppo_platform").evaluate(deterministic=True), "no such argument; use act, as evaluate"),
         (lambda: hpamdp.PAMDPSpecs.from_env("platform"), "'platform' is no PAMDPEnv; hpamdp.make makes one"),
-        (lambda: hpamdp.Patience(evaluations=0), "evaluations=0: must be greater than 0"),
         (lambda: hpamdp.Patience(foo=1), "foo: no such setting of PatienceOptions; it has evaluations"),
         (lambda: hpamdp.OwnMetrics(3), "must be a function"),
     ],
@@ -1005,7 +940,6 @@ def test_a_setting_of_the_problem_has_the_same_names_for_all_functions(name, pla
     for agent in (trained, hpamdp.load("hppo_platform", **settings)):
         assert agent.evaluate(episodes=3)["steps"] <= 2.0
     assert platform_agent.evaluate(episodes=3, **settings)["steps"] <= 2.0
-    assert platform_agent.evaluate("platform", episodes=3, **settings)["steps"] <= 2.0
 
 
 def test_make_warns_of_settings_that_count_only_with_another_one(capsys):
@@ -1019,13 +953,6 @@ def test_make_warns_of_settings_that_count_only_with_another_one(capsys):
 def test_make_takes_numpys_whole_numbers():
     assert hpamdp.make("platform", np.int64(2), seed=np.int64(3)).num_envs == 2
     assert hpamdp.make_gymnasium("platform", np.int64(2)).num_envs == 2
-
-
-@pytest.mark.parametrize(("name", "ours"), [("predict", "act\\(observation\\)"), ("learn", "hpamdp.train")])
-def test_a_method_of_another_library_names_ours(name, ours, platform_agent):
-    with pytest.raises(AttributeError, match=f"no attribute '{name}'; use {ours} \\(docs/coming-from.md\\)"):
-        getattr(platform_agent, name)
-    assert not hasattr(platform_agent, "no_such_thing")
 
 
 def test_an_experiment_that_is_a_sweep_is_refused_until_each_swept_setting_has_a_value():

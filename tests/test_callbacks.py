@@ -19,7 +19,6 @@ from hydra.core.hydra_config import HydraConfig
 from test_folders import kill_at
 from toy_callbacks import Faulty
 
-from hpamdp.config import compose as config_compose
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import read_saved
 from hpamdp.config.schema import Config
@@ -126,12 +125,7 @@ def test_a_best_agent_is_clearly_better_beyond_two_standard_errors(best_score, i
     best = BestAgent()
     best.best_score = best_score
     assert best.is_clearly_better(np.array([0.4, 0.6] * 100)) is is_better
-
-
-def test_one_episode_does_not_tell_whether_a_best_agent_is_clearly_better():
-    best = BestAgent()
-    best.best_score = 9.0
-    assert not best.is_clearly_better(np.array([0.4]))
+    assert not best.is_clearly_better(np.array([0.4])), "one episode does not tell"
 
 
 def test_the_best_agent_stays_in_memory_if_the_run_has_no_folder(scores):
@@ -147,11 +141,6 @@ def test_the_best_agent_stays_in_memory_if_the_run_has_no_folder(scores):
     assert not all(map(torch.equal, trainer.parts.agent.parameters(), weights[1]))
     best.restore(trainer)
     assert all(map(torch.equal, trainer.parts.agent.parameters(), weights[1]))
-
-
-def test_a_best_agent_before_any_evaluation_cannot_be_restored():
-    with pytest.raises(RuntimeError, match="there was no evaluation yet"):
-        BestAgent().restore(begin(make_config(SMALL)))
 
 
 def test_a_callback_may_be_used_for_another_run(scores):
@@ -190,21 +179,10 @@ def test_metrics_of_ones_own_are_columns_of_every_row_and_part_of_the_summary(tm
     assert json.loads((folder / "summary.json").read_text())["own/frames"] == 128.0
 
 
-def test_metrics_of_ones_own_are_kept_by_a_run_that_goes_on_where_nothing_is_left_to_do():
-    words = [*SMALL, "total_frames=32"]
-    own = OwnMetrics(lambda trainer: {"frames": trainer.frames})
-    trainer, resumed = train(own, words=words), train(words=words)
-    resumed.recorder.set_state(trainer.recorder.state())
-    resumed.finish()
-    assert resumed.recorder.summary["own/frames"] == 32.0
-
-
 @pytest.mark.parametrize(
     ("returned", "complaint"),
     [
         ({"x": math.nan}, "OwnMetrics.metrics: x=nan: must be a finite number"),
-        ({"x": "3"}, "OwnMetrics.metrics: x='3': must be a finite number"),
-        ({"x": torch.zeros(2)}, "OwnMetrics.metrics: x=tensor([0., 0.]): must be a finite number"),
         ({"a\nb": 1.0}, "the name must be a text in one line"),
         (3.0, "OwnMetrics.metrics: must return numbers by their names, not float"),
     ],
@@ -222,7 +200,7 @@ def test_two_metrics_of_one_name_are_refused():
         train(OwnMetrics(lambda trainer: {"x": 1}), OwnMetrics(lambda trainer: {"x": 2}))
 
 
-@pytest.mark.parametrize("method", ["on_start", "on_batch", "on_evaluation", "on_end", "metrics", "state"])
+@pytest.mark.parametrize("method", ["on_start", "on_batch", "on_end", "state"])
 def test_an_error_in_a_callback_goes_through_after_training_was_saved(method, tmp_path):
     with pytest.raises(ZeroDivisionError) as error:
         train(Faulty(method, at=0 if method == "on_start" else 64), folder=tmp_path / "run")
@@ -267,11 +245,6 @@ def test_a_wrong_metric_of_a_callback_from_yaml_ends_the_run_in_one_line_that_sa
             {"last": "x"},
             "Stateful.state.last is of type str, but must be a real number, a dense tensor or a mapping of them",
         ),
-        (
-            {"of": torch.zeros(2, dtype=torch.complex64)},
-            "Stateful.state.of is of type Tensor, but must be a real number",
-        ),
-        ({"of": torch.zeros(2).to_sparse()}, "Stateful.state.of is of type Tensor, but must be a real number"),
         ({"of": torch.zeros(2, device="meta")}, "Stateful.state.of is of type Tensor, but must be a real number"),
         ({"of": {3: 1.0}}, "Stateful.state.of: 3 must be a text, as the name of a value"),
     ],
@@ -328,15 +301,6 @@ def test_callbacks_are_called_in_the_order_of_the_list_and_before_those_from_pyt
     assert [*begin(make_config(words)).callbacks] == ["TimeLimit", "BestAgent"]
 
 
-def test_a_name_that_is_listed_several_times_is_composed_once(monkeypatch):
-    composed, compose = [], config_compose.compose
-    monkeypatch.setattr(config_compose, "compose", lambda words: composed.append(words) or compose(words))
-    again = [{"name": "patience", "evaluations": i} for i in (1, 2)]
-    listed = config_compose.listed_callbacks(["time_limit", *again, "patience"], {})
-    assert len(composed) == 2
-    assert [settings["evaluations"] for _, settings in listed[1:3]] == [1, 2]
-
-
 LIST = "callbacks=[time_limit,{name:patience,evaluations:5},{name:recording,breaks_at:${total_frames}}]"
 
 
@@ -360,8 +324,6 @@ def saved_with(callbacks: object) -> dict:
         ([{"name": "patience", "_target_": "os.PathLike"}], "callbacks.0._target_: a yaml file names the class"),
         (["../low/random"], 'callbacks.0="../low/random": must be the name of a callback, or its name and settings'),
         ([{"name": "recording", "breaks_at": "${oc.env:HOME}"}], "callbacks.0.breaks_at="),
-        ("patience", 'callbacks="patience": must be a list'),
-        ([["patience"]], "callbacks.0"),
     ],
 )
 def test_a_saved_config_chooses_no_class_but_those_of_todays_yaml_files(callbacks, complaint):
@@ -389,7 +351,6 @@ def test_a_guarded_setting_of_a_callback_in_a_saved_config_needs_trust():
             ["callbacks=[{name:patience,evaluation:3}]"],
             "callbacks.0.evaluation: no such setting of Patience; did you mean ev",
         ),
-        (["callbacks=[{name:time_limit,minutes:0}]"], "callbacks.0.minutes=0: must be greater than 0 (TimeLimit)"),
         (["callbacks=[no_callback]"], "callback=no_callback: OrderedDict is no Callback (hpamdp.run.callbacks)"),
         (["callbacks=[no_class]"], "callbacks.0=no_class: conf/callback/no_class.yaml names no class as _target_"),
         (
@@ -431,14 +392,13 @@ def interrupt_at(batch: int, monkeypatch) -> None:
     monkeypatch.setattr(Recorder, "take", interrupted)
 
 
-@pytest.mark.parametrize("where", ["own", "new"])
-def test_a_resumed_run_counts_on_and_knows_its_best_agent(where, tmp_path, monkeypatch):
+def test_a_resumed_run_counts_on_and_knows_its_best_agent(tmp_path, monkeypatch):
     words = [*PLATFORM, "total_frames=960", "save_best=true", "callbacks=[{name:patience,evaluations:4},recording]"]
     assert run(compose_config(words), tmp_path / "whole", words) == 0
     with monkeypatch.context() as patch:
         interrupt_at(STOPPED_AT, patch)
         assert run(compose_config(words), tmp_path / "stopped", words) == 130
-    resumed = tmp_path / ("stopped" if where == "own" else "resumed")
+    resumed = tmp_path / "resumed"
     again = [f"resume={tmp_path / 'stopped'}"]
     assert run(compose_config(again), resumed, again) == 0
     whole = json.loads((tmp_path / "whole/summary.json").read_text())
@@ -453,8 +413,7 @@ def test_a_resumed_run_counts_on_and_knows_its_best_agent(where, tmp_path, monke
     assert len({checkpoint.progress_of(file)["last_score"] for file in best}) == 1
 
 
-@pytest.mark.parametrize("where", ["own", "new"])
-def test_a_killed_run_keeps_a_best_agent_from_after_its_checkpoint(where, scores, tmp_path):
+def test_a_killed_run_keeps_a_best_agent_from_after_its_checkpoint(scores, tmp_path):
     words = [*PLATFORM, "total_frames=192", "save_best=true", "checkpoint_every=64"]
     scores += [0.0, 1.0, 2.0, 9.0]
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemError):
@@ -463,7 +422,7 @@ def test_a_killed_run_keeps_a_best_agent_from_after_its_checkpoint(where, scores
     assert checkpoint.progress_of(tmp_path / "killed/checkpoint.safetensors")["frames"] == 64
     kept = tensors_in(tmp_path / "killed/best.safetensors")
     scores += [0.0, 3.0, 4.0, 5.0, 6.0]  # of random actions first; the episodes of the resumed run may be other ones
-    folder = tmp_path / ("killed" if where == "own" else "resumed")
+    folder = tmp_path / "killed"
     again = [f"resume={tmp_path / 'killed'}"]
     assert run(compose_config(again), folder, again) == 0
     best = checkpoint.progress_of(folder / "best.safetensors")
@@ -503,16 +462,8 @@ def test_a_run_that_a_callback_ended_is_finished(tmp_path, capsys):
     assert rest_of(make_config([*words, "save_best=true"]), tmp_path).score == summary["score"]
 
 
-@pytest.mark.parametrize(
-    ("state", "complaint"),
-    [
-        ({"best": 1.0, "evaluations": "many"}, "Patience.evaluations is 'many', but must be a number"),
-        ({"best": 1.0}, "Patience without evaluations"),
-        (3, "Patience is int, but must be a mapping"),
-    ],
-)
-def test_the_state_of_another_callback_is_refused_in_one_line(state, complaint, tmp_path, monkeypatch):
-    write = checkpoint.save
+def test_the_state_of_another_callback_is_refused_in_one_line(tmp_path, monkeypatch):
+    write, state = checkpoint.save, {"best": 1.0, "evaluations": "many"}
     monkeypatch.setattr(
         checkpoint,
         "save",
@@ -524,7 +475,7 @@ def test_the_state_of_another_callback_is_refused_in_one_line(state, complaint, 
     words = [f"resume={tmp_path / 'a'}", "total_frames=128"]
     with pytest.raises(ConfigError) as error:
         run(compose_config(words), tmp_path / "b", words)
-    assert complaint in str(error.value) and "\n" not in str(error.value)
+    assert "Patience.evaluations is 'many', but must be a number" in str(error.value) and "\n" not in str(error.value)
 
 
 def test_a_dropped_callback_with_a_state_is_told(tmp_path, capsys):
@@ -544,10 +495,10 @@ def test_a_run_with_callbacks_of_ones_own_is_scored_and_watched_without_their_ya
 
 
 def test_a_new_run_does_not_overwrite_a_best_agent_that_a_killed_run_left(tmp_path):
-    assert start(tmp_path, "save_best=true") == 0
+    assert start(tmp_path, "save_best=true", "total_frames=64") == 0
     for name in ("summary.json", "checkpoint.safetensors", "policy.safetensors"):
         (tmp_path / name).unlink()
     with pytest.raises(ConfigError, match="holds the results of a run"):
         start(tmp_path)
-    assert start(tmp_path, "overwrite=true", "save_best=false") == 0
+    assert start(tmp_path, "overwrite=true", "save_best=false", "total_frames=64") == 0
     assert not (tmp_path / "best.safetensors").exists()

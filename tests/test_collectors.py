@@ -130,17 +130,6 @@ def test_what_was_learned_reaches_the_workers_before_their_next_batch(workers):
     assert collection.cpu_s > 0.0
 
 
-def test_workers_have_the_priority_of_the_learner_that_waits_for_them(workers):
-    listed = subprocess.run(["ps", "-eo", "pid=,ppid=,ni="], capture_output=True, text=True, check=True).stdout
-    rows = [tuple(map(int, line.split())) for line in listed.splitlines() if line.split()[2] != "-"]
-    niceness, family = set(), {os.getpid()}
-    for _ in range(3):  # actors are grandchildren
-        found = [(pid, nice) for pid, parent, nice in rows if parent in family]
-        family |= {pid for pid, _ in found}
-        niceness |= {nice for _, nice in found}
-    assert niceness == {os.getpriority(os.PRIO_PROCESS, 0)}
-
-
 @pytest.mark.parametrize(
     "low",
     [pytest.param(low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow]) for low in TRAINED],
@@ -271,8 +260,6 @@ def test_a_frozen_presser_goes_with_the_share(tmp_path):
     ("overrides", "message"),
     [
         (["collector=multi", "collector.num_workers=3"], "collector.num_workers=3: must divide num_envs=8"),
-        (["collector=multi", "collector.num_workers=16"], "collector.num_workers=16: must divide num_envs=8"),
-        (["collector=multi", "collector.num_workers=0"], "collector.num_workers=0"),
         (
             [
                 *("collector=multi", "high=none", "env=gymnasium", *GYMNASIUM),
@@ -412,19 +399,6 @@ def test_an_error_in_a_batch_leaves_the_state_before_that_batch(tmp_path, monkey
     assert torch.equal(resumed.next()["observation"][:, 0], before["root"]["observation"])
 
 
-def test_an_error_in_workers_that_never_told_their_state_costs_only_the_episodes(tmp_path, monkeypatch):
-    with closing(Mortal(tmp_path, 0)) as collection:
-        first = collection.next()["observation"][:, 0].clone()
-        fail_in_a_batch(collection, monkeypatch)
-        state = collection.state()
-    config = make_config([*SMALL, "high=ucb"])
-    single = config.collector.build(config=config, parts=assemble(config), frames=32)
-    with closing(Mortal(tmp_path, 0, frames=32)) as workers:
-        for resumed in (single, workers):
-            resumed.set_state(state)
-            assert (resumed.next()["observation"][:, 0] != first).any(-1).all()
-
-
 def test_an_error_in_workers_keeps_the_present_scale_of_observations(tmp_path):
     words = ["env=gymnasium", "env.id=CartPole-v1", "env.observation_scaling=running", "high=none"]
     with closing(Mortal(tmp_path, 0, *words, "env.reward_scaling=null")) as collection:
@@ -446,22 +420,13 @@ def test_a_batch_that_was_learned_from_is_not_in_the_last_known_state(tmp_path):
         assert "coming" not in collection.state()
 
 
-class ArrayMemoryError(MemoryError):
-    """As NumPy's own, which is not made from a text."""
-
-    def __init__(self, size, dtype):
-        super().__init__(f"{size} of {dtype}")
-
-
 @pytest.mark.parametrize(
     ("error", "kind", "text"),
     [
         (ProblemError("gave\nnothing"), ProblemError, "gave\nnothing"),
         (RuntimeError("a\nbug"), RemoteError, "RuntimeError: a bug\n\nIn a worker:\nTraceback"),
-        (OSError(28, "No space left on device"), RemoteError, "OSError: "),
         (MemoryError("too much"), MemoryError, "too much"),
         (MisfitError([1], "a number"), ProblemError, "gave [1], which must be a number"),
-        (ArrayMemoryError(9, "float64"), MemoryError, "9 of float64"),
     ],
 )
 def test_an_error_in_a_workers_environment_is_no_death(error, kind, text, tmp_path, monkeypatch):
@@ -480,8 +445,6 @@ def test_an_error_in_a_workers_environment_is_no_death(error, kind, text, tmp_pa
     [
         (OSError(28, "No space left on device"), "shared memory is full (/dev/shm"),
         (RuntimeError("unable to mmap 64 bytes from file </torch_1>: No space left on device (28)"), "--shm-size"),
-        (RuntimeError("unable to open shared memory object </t>: Too many open files (24)"), "ulimit -n is"),
-        (RuntimeError("received 0 items of ancdata"), "use fewer workers"),
         (RuntimeError("can't start new thread"), "ulimit -u is"),
         (ValueError("No space left on device"), None),
     ],
@@ -495,7 +458,7 @@ def test_a_limit_of_the_machine_is_reported_with_its_cure(error, words, tmp_path
         assert words in str(raised.value) and "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("address", ["ray://127.0.0.1:1", "no.such.host.invalid:6379"])
+@pytest.mark.parametrize("address", ["ray://127.0.0.1:1"])
 def test_a_cluster_that_does_not_answer_is_reported_in_one_line(address):
     with pytest.raises(CollectionError, match=f"^collector.address={address}: does not answer") as raised:
         check_answers(address)

@@ -199,21 +199,6 @@ def test_the_function_that_is_exported_acts_as_the_agent(name):
         assert differences(agent, traced_step(agent)) < 1e-5
 
 
-def test_goals_learned_by_pdqn_are_exported_for_any_number_of_rows(tmp_path):
-    pytest.importorskip("onnxscript")
-    agent = fresh_agent("env=office", "env.chooses_goal=true", "high=ucb", "low=pdqn")
-    agent.export(tmp_path / "goals.onnx")
-    session = session_of(tmp_path / "goals.onnx")
-    for num_rows in (1, 5):
-        inputs = {
-            keys.OBSERVATION: np.zeros((num_rows, 4), np.float32),
-            keys.OPTION_MASK: np.array([[False, True, False]] * num_rows),
-            HELD_OPTION: np.zeros(num_rows, np.int64),
-            keys.IS_DECISION: np.ones(num_rows, bool),
-        }
-        assert session.run(None, inputs)[2].tolist() == [1] * num_rows
-
-
 def test_options_end_where_the_selector_ends_them():
     agent = fresh_agent(*CASES["termination"])
     options = []
@@ -302,19 +287,13 @@ class Plain(gymnasium.Env):
         return self.observation_space.sample(), 0.0, False, False, {}
 
 
-class Far(Plain):
-    """Times in seconds since 1970, and a large count, which float32 cannot tell apart."""
+class Mapped(Plain):
+    """Times and counts that float32 cannot tell apart, parameters that it cannot hold, numbers that begin elsewhere."""
 
     observation_space = spaces.Dict(
         count=spaces.Box(2_000_000_000, 2_000_000_009, (1,), np.int64),
         time=spaces.Box(1.7e9, 1.7e9 + 100.0, (2,), np.float64),
     )
-    action_space = spaces.Tuple([spaces.Discrete(3), spaces.Tuple([spaces.Box(0.0, 1.0, (1,))] * 3)])
-
-
-class Mapped(Plain):
-    """Parameters that float32 cannot hold, and numbers that do not begin at 0."""
-
     action_space = spaces.Dict(
         action=spaces.Tuple(
             [
@@ -357,36 +336,23 @@ def about(session) -> dict:
     return {name: json.loads(value) for name, value in session.get_modelmeta().custom_metadata_map.items()}
 
 
-@pytest.mark.parametrize("scaling", ["running", pytest.param("bounds", marks=pytest.mark.slow)])
-def test_observations_that_float32_cannot_hold_are_read_in_float64(scaling, tmp_path):
-    agent = fresh_agent(*own("Far"), f"env.observation_scaling={scaling}", "high=none", "low=hppo")
-    rng = np.random.default_rng(0)
-    time, count = rng.uniform(1.7e9, 1.7e9 + 100.0, (200, 2)), rng.integers(2_000_000_000, 2_000_000_010, (200, 1))
-    vectors = np.concatenate([count, time], -1)
-    if scaling == "running":
-        agent._env.scaling.statistics.update(vectors[:50])
-    agent.export(tmp_path / "far.onnx")
-    session = session_of(tmp_path / "far.onnx")
-    assert session.get_inputs()[0].type == "tensor(double)"
-    discrete, parameters = session.run(None, {"observation": vectors})
-    agent.act({"time": time, "count": count})
-    np.testing.assert_array_equal(discrete, agent._last[keys.DISCRETE].numpy())
-    np.testing.assert_allclose(parameters, agent._last[keys.PARAMETERS].numpy(), atol=1e-5)
-
-
 def test_numbers_that_float32_cannot_hold_are_those_of_the_environment(tmp_path):
-    agent = fresh_agent(*own("Mapped"), "high=linucb", "low=hppo")
+    agent = fresh_agent(*own("Mapped"), "env.observation_scaling=running", "high=linucb", "low=hppo")
+    rng = np.random.default_rng(0)
+    time, count = rng.uniform(1.7e9, 1.7e9 + 100.0, (64, 2)), rng.integers(2_000_000_000, 2_000_000_010, (64, 1))
+    vectors = np.concatenate([count, time], -1)
+    agent._env.scaling.statistics.update(vectors[:50])
     agent.export(tmp_path / "a.onnx")
     session = session_of(tmp_path / "a.onnx")
+    assert session.get_inputs()[0].type == "tensor(double)"
     said = about(session)
     assert (said["discrete_starts"], said["option_start"]) == ([5], 7)
     assert said["parameter_low"] == [1.7e9, 2e7, 2e7, -5e7, -5e7, 0.0, -3.0]
     assert said["parameter_high"] == [1.7e9 + 3600.0, 20_000_009, 20_000_009, 5e7, 5e7, 9.0, 4.0]
     assert said["integer_parameters"] == [False, True, True, True, True, False, True]
-    vectors = np.random.default_rng(0).uniform(-1.0, 1.0, (64, 2)).astype(np.float32)
     inputs = {"observation": vectors, "held_option": np.zeros(64, np.int64), "is_decision": np.ones(64, bool)}
     discrete, parameters, option = session.run(None, inputs)
-    acted = agent.act(vectors)
+    acted = agent.act({"time": time, "count": count})
     chosen, (seconds, (counts, many, real, few)) = acted["action"]
     np.testing.assert_array_equal(discrete + said["discrete_starts"][0], chosen)
     np.testing.assert_array_equal(option + said["option_start"], acted["option"])
@@ -442,7 +408,6 @@ def test_the_file_acts_as_the_agent(name, tmp_path):
     ("words", "message"),
     [
         ([*PLATFORM, "low=dlpa"], "DLPA cannot be exported: it plans at every step"),
-        (["high=human", "low=hppo"], "Human cannot be exported: it reads human entries"),
         (["high=oracle", "low=hppo"], "Oracle cannot be exported: it reads oracle entries"),
         (["high=uniform", "low=hppo"], "cannot be exported: it samples even if it acts greedily"),
         ([*PLATFORM, "low=hppo", "low.greedy_discrete=sampled"], "it samples even if it acts greedily"),

@@ -146,7 +146,6 @@ def test_a_resumed_run_of_wandb_removes_its_own_earlier_folder_alone(tmp_path):
     [
         {"best.safetensors": "my networks", "trajectories.png": "", "learning_curves.png": ""},
         {"learning_curves.png": "my drawing"},
-        {"checkpoint.safetensors": "my backup"},
         {CONFIG_NAME: "title: my site\n"},
         {"summary.json": '{"of": "my thesis"}'},
     ],
@@ -162,7 +161,7 @@ def test_a_file_of_a_users_own_with_the_name_of_a_result_is_never_deleted(own, t
         assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("kept", [CONFIG_NAME, "checkpoint.safetensors", "summary.json"])
+@pytest.mark.parametrize("kept", ["checkpoint.safetensors", "summary.json"])
 def test_a_run_that_has_lost_most_of_its_files_may_be_overwritten(kept, tmp_path):
     start(tmp_path)
     for path in tmp_path.iterdir():
@@ -214,7 +213,6 @@ def test_a_finished_run_that_goes_on_and_is_killed_is_no_longer_finished(tmp_pat
 LOST = {
     "missing": (lambda text: None, "is missing; the rows up to frames=96 are lost"),
     "empty": (lambda text: "", "is damaged; the rows up to frames=96 are lost"),
-    "without header": (lambda text: text.partition("\n")[2], "is damaged; the rows up to frames=96 are lost"),
     "cut": (lambda text: "\n".join(text.splitlines()[:2]) + "\n3", "is cut; the rows after frames=0 are lost"),
 }
 
