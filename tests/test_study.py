@@ -17,7 +17,6 @@ from experiments.study_tables import (
     difference,
     finished,
     gathered,
-    groups,
     interquartile_mean,
     interval_text,
     middle_half,
@@ -68,28 +67,16 @@ def test_a_folder_without_runs_is_named(tmp_path, capsys):
     assert capsys.readouterr().err == f"{tmp_path}: has no runs\n"
 
 
-def test_an_empty_path_is_not_the_working_directory(tmp_path, monkeypatch):
-    leave_run(tmp_path / "a")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match="an empty path; name the folders of the runs"):
-        finished(["a", ""])
-
-
-def test_finished_runs_are_found_at_any_depth_and_unfinished_ones_left_out(tmp_path):
+def test_finished_runs_are_found_at_any_depth_and_unfinished_ones_left_out(tmp_path, capsys):
     leave_run(tmp_path / "b/deep/er", seed=1)
     leave_run(tmp_path / "a", seed=2)
+    leave_run(tmp_path / "stopped", finished=False)
     (tmp_path / "c").mkdir()
     (tmp_path / "c/metrics.csv").write_text("frames\n1\n")
     runs = finished([tmp_path])
     assert [run.summary["seed"] for run in runs] == [2, 1] and runs[1].config["env"]["reward"] == "paper"
+    assert capsys.readouterr().err == f"{tmp_path / 'stopped'}: was stopped, left out\n"
     assert finished([tmp_path / "b", str(tmp_path / "a")])[0].summary["seed"] == 1
-
-
-def test_a_run_gives_its_evaluations_and_its_played_episodes(tmp_path):
-    leave_run(tmp_path)
-    (run,) = finished([tmp_path])
-    assert [row["eval/score"] for row in run.evaluations()] == [-0.9, 1.5, 2.5]
-    assert run.played()["score"].tolist() == [1.0, 2.0]
 
 
 def test_rows_come_back_from_csv_with_numbers_as_numbers_and_gaps_as_gaps(tmp_path):
@@ -104,13 +91,6 @@ def test_of_tables_one_of_which_is_empty_none_is_written(tmp_path):
     with pytest.raises(SystemExit, match=r"b\.csv; nothing was written"):
         write_tables(tmp_path, {"a": [{"x": 1}], "b": []})
     assert [file.name for file in tmp_path.iterdir()] == ["a.csv"] and (tmp_path / "a.csv").read_text() == "kept"
-
-
-def test_stopped_runs_are_left_out_and_named(tmp_path, capsys):
-    leave_run(tmp_path / "a", finished=True)
-    leave_run(tmp_path / "b", finished=False)
-    assert [run.folder.name for run in finished([tmp_path])] == ["a"]
-    assert capsys.readouterr().err == f"{tmp_path / 'b'}: was stopped, left out\n"
 
 
 def test_linked_folders_count_once_and_unreadable_runs_are_named(tmp_path, capsys):
@@ -129,14 +109,6 @@ def test_linked_folders_count_once_and_unreadable_runs_are_named(tmp_path, capsy
     assert sorted(capsys.readouterr().err.splitlines()) == [
         f"{study / 'cut'}: summary.json is missing or damaged, left out",
         f"{study / 'gone'}: is a broken link, left out",
-    ]
-
-
-def test_groups_keep_the_order_of_appearance():
-    rows = [{"a": 2, "b": 0, "x": 1}, {"a": 1, "b": 0, "x": 2}, {"a": 2, "b": 0, "x": 3}]
-    assert [(key, [row["x"] for row in of]) for key, of in groups(rows, "a", "b").items()] == [
-        ((2, 0), [1, 3]),
-        ((1, 0), [2]),
     ]
 
 
@@ -220,17 +192,6 @@ def test_a_curve_joins_runs_that_were_evaluated_at_different_times():
     rows = [{"seed": seed, "frames": at, "score": score} for seed, of in points.items() for at, score in of]
     at, means, deviations = curve(rows, "frames", "score")
     assert at.tolist() == [0, 50, 100] and means.tolist() == [0.0, 0.5, 1.0] and not deviations.any()
-
-
-def test_a_curve_goes_as_far_as_all_seeds_do():
-    rows = [{"seed": 0, "frames": 10 * i, "score": float(i)} for i in range(4)]
-    rows += [{"seed": 1, "frames": 10 * i, "score": i + 2.0} for i in range(3)]
-    x, mean, deviation = curve(rows, "frames", "score")
-    assert (
-        x.tolist() == [0, 10, 20]
-        and mean.tolist() == [1, 2, 3]
-        and deviation.tolist() == pytest.approx([math.sqrt(2)] * 3)
-    )
 
 
 def test_the_learners_study_names_published_forms_and_rewards_and_when_people_were_reached(tmp_path):
@@ -341,13 +302,6 @@ def test_every_stored_run_of_the_protocol_is_planned(plan):
             assert row["seed"] in planned.get(tuple(row[name] for name in names), ()), row
 
 
-def test_a_run_that_is_found_twice_is_refused_and_nothing_is_written(tmp_path):
-    write_tables(tmp_path, {"results": [_row("pdqn", 0)]})
-    with pytest.raises(SystemExit, match="two runs of goal, pdqn, 2; nothing was written"):
-        add_to_tables(tmp_path, {"results": [_row("pdqn", 2)] * 2}, ("domain", "learner", "seed"))
-    assert len(read_csv(tmp_path / "results.csv")) == 1
-
-
 def test_a_run_of_another_length_does_not_replace_a_stored_one(tmp_path):
     write_tables(tmp_path, {"results": [{**_row("pdqn", 2), "frames": 800_000}]})
     with pytest.raises(SystemExit, match=r"the given run has 2,000 steps .* results.csv 800,000; nothing"):
@@ -379,12 +333,6 @@ def test_a_curve_that_is_given_twice_or_is_shorter_than_those_of_its_cell_is_ref
         add(of_run(1, 200))
     add(of_run(1, 384))
     assert read_csv(tmp_path / "curves.csv") == of_run(0, 384) + of_run(1, 384)
-
-
-def test_nothing_is_written_if_there_are_no_new_runs(tmp_path):
-    write_tables(tmp_path, {"results": [_row("pdqn", 0)]})
-    with pytest.raises(SystemExit, match="no finished runs; nothing was written"):
-        add_to_tables(tmp_path, {"results": []}, ("domain", "learner", "seed"))
 
 
 @pytest.mark.parametrize("cut", ["a,b\r\n1,2\r\n3", "a,b\r\n1,2,3\r\n"])
@@ -488,33 +436,6 @@ def test_options_refuses_cells_of_runs_with_different_settings():
         options.standing([*rows, rows[0] | {"sharing": "per_option"}], options.PAIR, ["sharing"])
     with pytest.raises(SystemExit, match="pdqn, ucb: has two runs with the same seed"):
         options.standing([*rows, rows[0]], options.PAIR)
-
-
-def test_scripts_of_options_show_the_row_of_a_run_that_its_table_refuses(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(EXPERIMENTS / "options"))
-    module = load_script(EXPERIMENTS / "options" / "train_rooms.py")
-    file = tmp_path / "rooms.csv"
-    file.write_text("low,seed,steps,share\nhppo,0,100,0.5\n", encoding="utf-8")
-    before = file.read_bytes()
-    with pytest.raises(SystemExit, match=r"hppo: has runs of .*\. The row of the run: hppo,1,200,0\.75"):
-        module.add_row(file, {"low": "hppo", "seed": 1, "steps": 200, "share": 0.75}, ("low", "seed"), steps="steps")
-    assert file.read_bytes() == before
-
-
-def test_robustness_replaces_the_rows_of_an_agent_and_refuses_it_given_twice(tmp_path, monkeypatch):
-    robustness = study("robustness")
-    stored = read_csv(EXPERIMENTS / "robustness" / "results.csv")
-    first = {column: stored[0][column] for column in robustness.AGENT_COLUMNS}
-    of_first = [row for row in stored if all(row[column] == first[column] for column in first)]
-    shutil.copy(EXPERIMENTS / "robustness" / "results.csv", tmp_path)
-    monkeypatch.setattr(robustness, "HERE", tmp_path)
-    run = (None, {**first, "seed": int(first["seed"])})
-    monkeypatch.setattr(robustness, "score", lambda run, evaluations: iter([{**stored[0], "score": 99.0}]))
-    with pytest.raises(SystemExit, match="two runs of"):
-        robustness.add([run, run])
-    assert len(read_csv(tmp_path / "results.csv")) == len(stored)
-    robustness.add([run])
-    assert len(read_csv(tmp_path / "results.csv")) == len(stored) - len(of_first) + 1
 
 
 GATHERING = [
