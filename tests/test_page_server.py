@@ -10,7 +10,6 @@ import urllib.request
 from contextlib import contextmanager
 
 import pytest
-import torch
 from play_players import docked
 
 from hpamdp.env.boatdock.play.boat_page import BoatPage
@@ -122,7 +121,7 @@ def test_a_line_that_was_cut_short_stays_one_line(tmp_path):
     assert [json.loads(lines[0]), json.loads(lines[2])] == EPISODES[:2] and len(lines) == 3
 
 
-@pytest.mark.parametrize("text", ["dear diary", "{}", '{"player": "me", "index": 1}', "[1, 2]\n", "\0\0\0", "{\n}\n"])
+@pytest.mark.parametrize("text", ["dear diary", "{}", "\0\0\0"])
 def test_a_file_without_an_episode_is_refused_and_left_as_it_is(tmp_path, text, command):
     path = tmp_path / "notes.txt"
     path.write_text(text)
@@ -141,7 +140,7 @@ def test_two_servers_store_an_episode_once(tmp_path):
     assert len(path.read_text().splitlines()) == 1 and len((tmp_path / "kept.jsonl").read_text().splitlines()) == 2
 
 
-@pytest.mark.parametrize("after", [0, 1, 500])
+@pytest.mark.parametrize("after", [0, 500])
 def test_a_disk_that_is_full_in_the_middle_of_a_line_leaves_the_file_as_it_was(tmp_path, after):
     path = tmp_path / "a.jsonl"
     with serving(path) as server:
@@ -175,8 +174,6 @@ def test_nothing_but_the_files_of_the_page_is_sent(server, path):
     [
         ("{}", {"Content-Type": "text/plain"}, 415),  # as a form of another site could send
         ("{" * 50_000, JSON, 400),
-        ('{"a":NaN}', JSON, 400),
-        ("null", JSON, 422),
         (json.dumps({**EPISODES[0], "score": 4.9}), JSON, 422),
     ],
 )
@@ -214,27 +211,15 @@ def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch,
     assert data["has_server"] is False and len(data["layouts"]["round"]) == 60
 
 
-def test_the_plans_of_the_page_are_made_with_the_threads_that_are_set(tmp_path, monkeypatch, command):
-    monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
-    monkeypatch.setattr(torch, "set_num_threads", (given := []).append)
-    site = str(tmp_path / "site")
-    assert command("play", "--export", site, "--agent", "none", "threads=3")[0] == 0 and given == [3]
-    assert command("play", "--export", site, "--agent", "none")[0] == 0 and given == [3, 1]
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["env=platform"], "there is no page"),
         (["env.slip=0.5"], "env: BoatDockEnv: slip=0.5, but the page has 0.0"),
-        (["env.boats=[congruent,incongruent1]"], "boats=['congruent', 'incongruent1'], but the page has none"),
-        (["--agent", "nowhere"], "no checkpoint there"),
         (
             ["--agent", "hppo_hard_move_8"],
             "--agent hppo_hard_move_8: was trained on env=hard_move, but the page is of env=boatdock\n",
         ),
-        (["--to", "nowhere/a.jsonl", "--agent", "none"], "No such file or directory"),
-        (["--agent", "none", "--host", "256.1.1.1"], "--host 256.1.1.1"),
     ],
 )
 def test_play_tells_a_mistake_in_one_line(monkeypatch, command, words, said):

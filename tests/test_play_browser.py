@@ -142,23 +142,6 @@ def test_the_boat_moves_while_a_key_is_down_glides_when_it_is_released_and_docks
     assert episodes.check(episode).outcome == "success"
 
 
-def test_the_wall_the_speed_limit_and_the_empty_tank_end_an_episode(player):
-    for layout, outcome in ((DOWN_THE_MIDDLE, "too_fast"), ({"start": [60, 60], "goal": [0, -60]}, "out_of_bounds")):
-        player.board(layout=layout)
-        player.hold("k", 1.75)
-        assert player.ends()["outcome"] == outcome
-        player.page.keyboard.press("Enter")
-    player.board(layout={"start": [0, 40], "goal": [80, 40]})
-    # Round and round: three keys of equal length come back to where they began.
-    released = time.time()
-    for turn in range(21):
-        released = player.hold(KEYS[turn % 3], 0.32, released + 0.02)
-        if player.get("screen") == "result":
-            break
-    assert player.ends()["outcome"] == "out_of_fuel" and player.get("state.fuel") == 0
-    assert [episodes.check(each).outcome for each in stored(player, 3)] == ["too_fast", "out_of_bounds", "out_of_fuel"]
-
-
 def test_durations_are_those_of_the_keys_within_five_milliseconds_however_late_the_page_hears_of_them(player):
     wanted = [0.05, 0.12, 0.2, 0.3, 0.08, 0.25] * 4
     player.board(layout=DOWN_THE_MIDDLE)
@@ -243,37 +226,6 @@ def test_the_exported_page_plays_from_files_and_gives_its_episodes_as_a_file(bro
     context.close()
 
 
-def test_a_block_ends_with_the_curve(player):
-    player.page.click("#finish")
-    assert player.get("screen") == "start"  # nothing was played yet
-    player.page.click("[data-mode=round]")
-    for turn in range(3):
-        player.board(layout=DOWN_THE_MIDDLE)
-        player.hold("k", 1.6)
-        player.ends()
-        if turn < 2:
-            player.page.keyboard.press("Space")
-    player.page.click("#finish")
-    assert player.get("screen") == "end" and "3 episodes" in player.page.inner_text("#end-text")
-    rows = player.page.locator("#end-table tr").count()
-    assert rows == 5  # head, you, people, best person, ceiling
-    player.page.click("#go-on")
-    assert player.page.inner_text("#status").endswith("episode 4 of 60")
-
-
-def test_enter_on_a_button_does_what_the_button_says(player):
-    player.board(layout=DOWN_THE_MIDDLE)
-    player.hold("k", 1.8)
-    player.ends()
-    assert player.page.evaluate("document.activeElement.id") == "next"
-    player.page.focus("#finish")
-    player.page.keyboard.press("Enter")
-    assert player.get("screen") == "end"
-    player.page.focus("#again")
-    player.page.keyboard.press("Space")
-    assert player.get("screen") == "start"
-
-
 @pytest.mark.parametrize("boats", [1, 2])
 def test_a_session_shows_where_its_boats_keys_push_only_when_it_is_over_and_is_stored_then(browser, tmp_path, boats):
     page = SessionPage(seed=0, options=UnseenBoatsOptions(trips=2, boats=boats, family="strength"))
@@ -309,21 +261,4 @@ def test_a_session_shows_where_its_boats_keys_push_only_when_it_is_over_and_is_s
         assert player.page.inner_text("#status").startswith("Session 2, trip 1 of 2") and shown() == 0
         assert player.get("session.boats[0].number") != session["boats"][0]["number"]
         assert player.errors == []
-        context.close()
-
-
-def test_a_trip_that_is_left_gives_up_its_session(browser, tmp_path):
-    page = SessionPage(seed=0, options=UnseenBoatsOptions(trips=1))
-    with serving(tmp_path / "played.jsonl", page.data([], has_server=True), page) as address:
-        context = browser.new_context()
-        player = Player(context, address, mode="session")
-        player.until("screen === 'sail'")
-        boat = player.get("session.boats[0].number")
-        player.hold("k", 0.2)
-        player.page.click("#finish")
-        assert player.get("screen") == "start" and player.get("results.session.length") == 0
-        player.page.click("[data-mode=session]")
-        assert player.get("session.boats[0].number") != boat
-        assert player.page.inner_text("#status") == "Session 2, trip 1 of 1"
-        assert player.get("stored.length") == 0 and player.errors == []
         context.close()

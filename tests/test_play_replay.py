@@ -23,17 +23,8 @@ NODE = shutil.which("node")
 START, GOAL = (0.0, 60.0), (0.0, -60.0)  # key 1 of the congruent controller goes from one to the other
 
 
-def test_a_press_lasts_from_key_down_to_key_up():
-    assert settle([(0.5, "down", 1), (1.25, "up", 1)]) == [Press(1, 0.5, 0.75)]
-
-
 def test_a_new_press_ends_the_one_before_whose_release_then_counts_for_nothing():
     events = [(0.0, "down", 0), (0.4, "down", 2), (0.5, "up", 0), (0.9, "up", 2)]
-    assert settle(events) == [Press(0, 0.0, 0.4), Press(2, 0.4, 0.5)]
-
-
-def test_a_key_that_stays_down_does_not_go_on_after_the_one_that_ended_it():
-    events = [(0.0, "down", 0), (0.4, "down", 2), (0.9, "up", 2), (3.0, "up", 0)]
     assert settle(events) == [Press(0, 0.0, 0.4), Press(2, 0.4, 0.5)]
 
 
@@ -120,18 +111,12 @@ GOOD = docked(1)[0]
         ({"score": 5.0}, "score"),
         ({"fuel": 0.99}, "fuel"),
         ({"outcome": "too_fast"}, "outcome"),
-        ({"end": [0.0, 0.0]}, "end"),
         ({"presses": [{"key": 0, "start": 0.3, "duration": 0.2}]}, "presses"),
         ({"events": GOOD["events"][:1]}, "presses"),
         ({"events": GOOD["events"][::-1]}, "times must not decrease"),
         ({"goal": GOOD["start"]}, "goal"),
-        ({"start": [150.0, 0.0]}, "start"),
-        ({"controller": "steamer"}, "controller"),
         ({"consent": False}, "consent"),
-        ({"player": "Ada Lovelace"}, "player"),
         ({"address": "secret"}, "address"),
-        ({"format": 2}, "format"),
-        ({"score": float("nan")}, "not a JSON"),
     ],
 )
 def test_an_episode_that_nobody_can_have_played_is_refused_in_a_line(change, said):
@@ -205,26 +190,6 @@ def test_ten_thousand_random_presses_end_where_python_ends_them(tmp_path, page_d
 
 
 @needs_node
-def test_the_boat_on_the_page_moves_without_a_jump(tmp_path, page_data):
-    events = [{"t": t, "type": kind, "key": key} for t, kind, key in
-              ((0.2, "down", 1), (0.7, "up", 1), (0.9, "down", 0), (1.2, "down", 2), (1.3, "up", 2))]  # fmt: skip
-    script = """
-        const p = makePhysics(given.rules);
-        const way = [];
-        for (let t = 0; t < 2.5; t += 0.005) {
-          const known = given.events.filter((event) => event.t <= t);
-          const boat = p.sail(given, { directions: given.directions.congruent }, p.settle(known), t);
-          way.push([boat.x, boat.y, boat.speed]);
-        }
-        return way;
-    """
-    given = {**page_data, "start": [0, 60], "goal": [0, -60], "events": events}
-    way = np.array(in_node(script, given, tmp_path))
-    steps = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1)
-    assert steps.max() <= 0.005 * way[:, 2].max() + 1e-6 and (steps > 0).sum() > 200
-
-
-@needs_node
 def test_agents_act_in_the_page_as_they_do_in_torch(tmp_path, page_data):
     words = ["high=meta_critic", "low=hppo", "eval.layouts=20", "eval.seed=9", "film=false"]
     for settings in (words, [*words, "agent.sharing=shared"], ["high=linucb", *words[1:]]):
@@ -277,8 +242,6 @@ def test_the_layouts_of_the_page_are_those_of_no_evaluation_and_follow_the_rules
     ("settings", "said"),
     [
         ({"slip": 0.1}, "env.slip=0.1, but the page has 0.0"),
-        ({"controller": "random"}, "env.controller=random, but the page has choose, congruent or incongruent"),
-        ({"keymap": "random"}, "env.keymap=random, but the page has 1 or 2"),
     ],
 )
 def test_an_agent_of_other_rules_is_refused(settings, said):
