@@ -60,7 +60,6 @@ def test_a_mask_can_be_ignored():
             {"source": "info", "action_mask": "info", "mask": [1, float("nan")]},
             r"gave \[1, nan\] as action_mask, which ",
         ),
-        ({"source": "info", "action_mask": "info", "mask": [1]}, r"gave \[1\] as action_mask, which must be 2 numbers"),
     ],
 )
 def test_a_mask_that_is_not_what_was_set_is_told_in_one_line(options, complaint):
@@ -124,7 +123,6 @@ def test_a_method_that_gives_a_mask_is_reported_in_one_line_unless_masks_are_ign
     ("names", "said"),
     [
         (5, "is 5, but must be a list of names"),
-        (("slow", 1, "fast"), "is ('slow', 1, 'fast'), but must"),
         (["slow", "slow", "fast"], "has a name twice: slow, slow, fast"),
     ],
 )

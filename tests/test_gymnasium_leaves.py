@@ -35,26 +35,18 @@ def quickly(space: ObservationSpace, value) -> np.ndarray:
     ("space", "value", "complaint"),
     [
         (INT64, [0.7, 0.0], "value is 0.7 at index 0, which int64 cannot hold"),
-        (INT64, [0.0, np.nan], "value is nan at index 1, which is not finite"),
         (BYTES, [0, 300], "value is 300 at index 1, outside its bounds 0 to 255"),
         (BOOLS, [2, 0], "value is 2 at index 0, outside its bounds 0 to 1"),
-        (HALVES, [0.0, 70000.0], "value is 70000 at index 1, which float16 cannot hold"),
         (WIDE, [1e300, 0.0], r"value is 1e\+300 at index 0, which float32 cannot hold"),
         (UNIT, [0.0, 1.001], "value is 1.001 at index 1, outside its bounds -1 to 1; env.out_of_bounds=clip moves it "),
         (UNIT, [[0.0, 0.0]], r"value has shape \(1, 2\), but its space has \(2,\)"),
-        (UNIT, np.array([0.0, 1.0], object), "not numbers"),
         (UNIT, [[0.0], [0.0, 0.0]], "not numbers"),
-        (spaces.Box(-1.0, 1.0, ()), [0.0], r"value has shape \(1,\), but its space has \(\)"),
         (spaces.Discrete(3), 0.7, r"value is 0.7, outside Discrete\(3\)"),
-        (spaces.Discrete(3), None, "value is None, not numbers"),
         (spaces.MultiDiscrete([2, 3]), [1.0, 2.5], r"value is \[1.0, 2.5\], outside MultiDiscrete"),
-        (spaces.MultiDiscrete([2, 3], start=[5, 0]), [4, 0], r"value is \[4, 0\], outside MultiDiscrete"),
         (spaces.MultiBinary(2), [1, 2], r"value is \[1, 2\], outside MultiBinary\(2\)"),
-        (PARTS, {"a": np.zeros(2), "b": {"c": np.zeros(4)}}, r"entry b.c has shape \(4,\), but its space has \(3,\)"),
         (PARTS, {"a": np.zeros(2), "b": np.zeros(3)}, "without its entry b.c"),
         (PARTS, {"a": np.zeros(2), "b": {"c": [0, 0, 10]}}, "entry b.c is 10 at index 2, outside its bounds -9 to 9"),
         (spaces.Tuple([UNIT, UNIT]), (np.zeros(2),) * 3, "gave an observation of 3 entries, but its space has 2"),
-        (spaces.Tuple([UNIT, UNIT]), "ab", "without its entry 0"),
     ],
 )  # fmt: skip
 def test_a_value_outside_its_space_is_refused_in_a_line_that_names_the_leaf(space, value, complaint):
@@ -69,7 +61,6 @@ def test_a_value_outside_its_space_is_refused_in_a_line_that_names_the_leaf(spac
     ("space", "value", "vector"),
     [
         (INT64, [1.0, -9.0], [1.0, -9.0]),
-        (BYTES, [0, 255], [0.0, 255.0]),
         (HALVES, [0.5, 65504.0], [0.5, 65504.0]),
         # Rounding: bounds of float64 with values of float32, bounds of float32 with values of float64.
         (spaces.Box(-0.1, 0.3, (2,), np.float64), np.float32([-0.1, 0.3]), np.float32([-0.1, 0.3])),
@@ -77,7 +68,6 @@ def test_a_value_outside_its_space_is_refused_in_a_line_that_names_the_leaf(spac
         (spaces.Box(-1.0, 1.0, (2,), np.float64), [0.0, 1.0 + 2e-16], [0.0, 1.0 + 2e-16]),
         (spaces.Discrete(3, start=-1), np.bool_(True), [0.0, 0.0, 1.0]),
         (spaces.MultiDiscrete([2, 2], start=[5, 0]), [6.0, 0.0], [0.0, 1.0, 1.0, 0.0]),
-        (spaces.MultiBinary((1, 2)), [[True, False]], [1.0, 0.0]),
         (spaces.Box(-1.0, 1.0, ()), np.float64(0.5), [0.5]),
     ],
 )
