@@ -187,15 +187,6 @@ def test_learners_of_another_run_bring_their_networks_and_begin_their_schedules_
         assert torch.equal(value, (fresh if name in restarted else trained)[name]), name
 
 
-def test_rows_that_wait_in_a_saved_run_do_not_keep_its_networks_from_one_with_smaller_minibatches(tmp_path):
-    words = [*SMALL, "high=uniform", "low=hppo", *SHORT["hppo"]]
-    first = train(make_config([*words, "low.minibatch_size=70"]), tmp_path / "first").agent.learners
-    assert max(sum(map(len, learner.waiting)) for learner in first) >= 8
-    parts = make(make_config([*words, "low.minibatch_size=8", f"low.checkpoint={tmp_path / 'first'}"]), tmp_path / "on")
-    for learner, trained in zip(parts.agent.learners, first, strict=True):
-        assert not learner.waiting and torch.equal(learner.actor.discrete_head.bias, trained.actor.discrete_head.bias)
-
-
 def test_a_learner_of_another_run_fills_its_replay_before_it_updates(tmp_path):
     words = [*SMALL, "high=uniform", "low=pdqn", *SHORT["pdqn"]]
     parts = train(make_config(words), tmp_path / "first")

@@ -1,6 +1,5 @@
 """What serves any recording: demonstrations, tables and memory-mapped files, and Minari."""
 
-import csv
 import json
 import os
 import re
@@ -421,31 +420,6 @@ def test_wrong_decisions_are_refused_with_their_row():
     ):
         with pytest.raises(DataError, match=rf"^the decisions, {re.escape(said)}"):
             Demonstrations(rows, decisions=spoilt(name, 1, value, given)).check(WITH_OPTIONS)
-
-
-def test_csv_gives_back_every_value(tmp_path):
-    values = torch.tensor([0.1, float("nan"), 3e-8])
-    table = TensorDict(
-        {
-            "single": values,
-            "double": values.double() / 3,
-            "flag": torch.tensor([True, False, True]),
-            "count": torch.tensor([2**40, -1, 0]),
-            "point": torch.arange(6.0).reshape(3, 2),
-        },
-        batch_size=[3],
-    )
-    export.write_csv({"things": table}, tmp_path / "numbered")
-    with (tmp_path / "numbered" / "things.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    for name in ("single", "double"):
-        written = np.array([row[name] or "nan" for row in rows], table[name].numpy().dtype)
-        np.testing.assert_array_equal(written, table[name].numpy())
-    assert [row["flag"] for row in rows] == ["1", "0", "1"]
-    assert [int(row["count"]) for row in rows] == table["count"].tolist()
-    assert [row["point_1"] for row in rows] == ["1.0", "3.0", "5.0"]
-    export.write_csv({"things": table}, tmp_path / "named", axes=("x", "y"))
-    assert (tmp_path / "named" / "things.csv").read_text().splitlines()[0].endswith("point_x,point_y")
 
 
 def with_what_learners_read(rows):

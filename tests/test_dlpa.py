@@ -324,20 +324,6 @@ def test_the_learner_finds_the_best_action_and_its_parameters(trained):
     assert rows["next", keys.REWARD].mean() > 0.85, "the optimum is 1"
 
 
-def test_a_greedy_action_is_determined_by_the_seed_and_lies_in_bounds(trained):
-    td = TensorDict({keys.OBSERVATION: torch.randn(50, 4)}, [50])
-    actions = []
-    for seed in (3, 3):
-        torch.manual_seed(seed)
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            actions.append(trained.policy(td.clone()))
-    assert torch.equal(actions[0][keys.DISCRETE], actions[1][keys.DISCRETE])
-    assert torch.equal(actions[0][keys.PARAMETERS], actions[1][keys.PARAMETERS])
-    parameters = trained.policy(td.clone())[keys.PARAMETERS]
-    assert (parameters >= torch.tensor(SPECS.parameter_low)).all()
-    assert (parameters <= torch.tensor(SPECS.parameter_high)).all()
-
-
 def test_nothing_is_planned_for_finished_episodes_or_before_the_first_update(trained, monkeypatch):
     planned = []
     plan = trained.policy.planner.plan
@@ -368,8 +354,3 @@ def test_states_and_their_changes_are_scaled_by_standard_deviations_over_all_sto
     torch.testing.assert_close(learner.model.change_scale, (next_state - state).std(0).clamp(min=1e-2))
     scaled = (state - learner.model.state_mean) / learner.model.state_scale
     assert scaled.abs().max() < 5.0
-
-
-def test_more_elites_than_samples_are_refused():
-    with pytest.raises(ValueError, match="num_elites=200"):
-        make(num_elites=200)

@@ -369,15 +369,3 @@ def test_a_largest_scale_that_ends_outside_its_range_is_refused(final):
 def test_a_scale_outside_its_range_is_refused():
     with pytest.raises(ValueError, match=r"initial_scale=2.0: must lie between min_scale=0.05 and max_scale=1.0"):
         make(initial_scale=2.0)
-
-
-def test_each_pass_hands_every_gathered_row_to_one_minibatch():
-    learner = make(epochs=2, minibatch_size=4)
-    number = torch.arange(11)
-    rows = TensorDict({"number": number, "same": number.clone()}, [11])
-    seen = list(learner.minibatches(rows))
-    assert all(torch.equal(minibatch["number"], minibatch["same"]) for minibatch in seen)
-    seen = [minibatch["number"] for minibatch in seen]
-    assert sorted(map(len, seen)) == [5, 5, 6, 6]
-    for half in (seen[:2], seen[2:]):
-        assert torch.cat(half).sort().values.equal(number)

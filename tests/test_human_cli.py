@@ -116,24 +116,11 @@ def test_presses_of_which_none_is_from_rest_to_rest_are_refused_in_one_line(tmp_
     assert len(HumanDemonstrations(BoatDockEnv(1), path=path, checksum=None, rest_to_rest=False).batch)
 
 
-def test_the_json_of_a_single_episode_has_null_where_there_is_no_number(capsys, tmp_path, recwarn):
-    path = synthetic_human.write(tmp_path / "one.mat", [synthetic_human.recording()[0][:1]])
-
-    def refuse(name: str) -> None:
-        raise AssertionError(name)
-
-    figures = json.loads(printed(capsys, "summary", path, "--any-file", "--json"), parse_constant=refuse)
-    assert figures["all"]["score_error"] is None and None in figures["congruent_by_offset"]
-    assert not recwarn.list
-
-
 @pytest.mark.parametrize(
     ("form", "given", "said"),
     [
         ("csv", ["--reward", "sparse", "--observation", "pixels"], "--reward sparse, --observation pixels: no effect"),
-        ("npz", ["--reward", "paper"], "--reward paper: no effect on tables"),
         ("memmap", ["--one-frame"], "--one-frame: no effect on transitions, which always have one frame"),
-        ("minari", ["--one-frame"], "leave it out with --format minari"),
     ],
 )
 def test_options_that_an_export_would_ignore_are_refused(capsys, path, tmp_path, form, given, said):

@@ -81,9 +81,7 @@ def test_features_use_only_the_inputs():
     ("changes", "complaint"),
     [
         ({"inputs": [0, 2]}, "high: inputs=[0, 2]: the observation has entries 0 to 1; null: all (LinUCB)"),
-        ({"inputs": [-1]}, "high.inputs.0=-1: must be greater than or equal to 0"),
         ({"features": "random_fourier", "degree": 2000}, "high: degree=2000: 2001 features of 2 inputs; at most 2000"),
-        ({"features": "cubic"}, "high.features=\"cubic\": must be 'polynomial' or 'random_fourier'"),
     ],
 )
 def test_impossible_features_are_refused_in_one_line(changes, complaint):
@@ -207,19 +205,6 @@ def test_bandits_that_forget_follow_a_swap_of_the_better_options_and_others_lag(
         after[memory] = regret.mean().item()
         assert memory == "all" or regret[-500:].mean() < 0.2
     assert after["all"] > 0.3 + max(after["discounted"], after["sliding_window"])
-
-
-@every_bandit
-def test_regret_on_a_linear_problem_grows_far_more_slowly_than_time(name):
-    weights = torch.tensor([[0.5, 0.0], [-0.5, 0.3]])
-    horizon = 2000
-    curves = []
-    for seed in range(3):
-        torch.manual_seed(seed)
-        curves.append(play(make(name, degree=1), lambda x: x @ weights.T, 4 * horizon, 40, noise=0.5)[1].cumsum(0))
-    regret = torch.stack(curves).mean(0)
-    assert regret[horizon - 1] < 0.02 * horizon
-    assert regret[-1] / regret[horizon - 1] < 2.4  # sqrt(T) log(T) grows by 2.4
 
 
 @every_bandit

@@ -5,7 +5,7 @@ import math
 import pytest
 import wandb
 
-from hpamdp.env.base import Metric, PAMDPEnv
+from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised, human_references
 from hpamdp.messages import duration
@@ -37,14 +37,6 @@ def log_a_run(logger, output_dir):
     logger.film(output_dir / "episodes.gif")
     logger.summary({"eval/score": 1.5, "references": {"ceiling": 3.64}})
     logger.close()
-
-
-def test_rows_come_back_as_they_were_written(tmp_path):
-    file = Metrics(tmp_path / "metrics.csv")
-    rows = [{"frames": 10.0, "loss": 0.1}, {"frames": 2**33 + 1.0, "loss": -1e-17}]
-    for row in rows:
-        file.append(row)
-    assert file.rows() == rows
 
 
 def test_a_row_with_a_new_column_keeps_old_rows_and_the_columns_order(tmp_path):
@@ -219,17 +211,6 @@ def test_human_normalised_is_0_for_random_presses_and_1_for_people_with_the_same
         assert human_normalised(RANDOM["score"], controller) == pytest.approx(0.0)
     assert human_normalised(3.0, "congruent") < human_normalised(3.0, "incongruent")  # where people reach less
     assert human_normalised(3.0, "random") == human_normalised(3.0)
-
-
-def test_the_closing_table_shows_what_the_environment_asks_for_and_any_reference():
-    metrics = [Metric("laps", "laps", "count"), Metric("score", "score")]
-    table = closing_table({"score": 0.5, "laps": 2.0, "references": {"record": {"laps": 3.0}}}, metrics)
-    assert [line.split() for line in table.splitlines()] == [
-        ["this", "agent", "record"],
-        ["laps", "2.00", "3.00"],
-        ["score", "0.500"],
-        ["empty", "cells:", "no", "figure", "is", "stored", "for", "that", "reference", "with", "these", "settings"],
-    ]
 
 
 def test_the_closing_table_leaves_out_what_is_not_known():

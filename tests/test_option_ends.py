@@ -145,15 +145,6 @@ def test_options_that_the_selector_ends_have_the_right_accounts_and_are_heard_of
     assert sorted(expected) == sorted(account(decision) for decision in decisions)
 
 
-def test_the_same_option_is_held_where_the_selector_does_not_end_it():
-    torch.manual_seed(0)
-    agent = ending(Moody(SPECS))
-    rows = torch.cat([batch.clone() for batch in collect(agent, Toll(4, start=6.0), 60, 5, 4)], 1)
-    goes_on = ~rows[keys.IS_DECISION][:, 1:].squeeze(-1)
-    assert 50 < goes_on.sum() < 200
-    assert torch.equal(rows[keys.OPTION][:, 1:][goes_on], rows[keys.OPTION][:, :-1][goes_on])
-
-
 def train(selector, batch_steps: int = 10) -> HierarchicalAgent:
     agent = ending(selector)
     for batch in collect(agent, Crossing(50, start=6.0), 180, batch_steps, 50):

@@ -265,13 +265,6 @@ def test_multi_pass_stores_the_chosen_actions_parameters_alone_and_samples_them_
         assert any(all(unit[i] == row[i] for i in mine) for unit in played)
 
 
-def test_single_pass_stores_all_parameters():
-    learner = make(multipass=False, warmup_steps=10_000)
-    td = one_step_rows(learner, 50)
-    learner.learn(td, torch.ones(50, 1, dtype=torch.bool))
-    torch.testing.assert_close(learner.buffer[:]["unit"], SPECS.to_unit(td[keys.PARAMETERS])[:, 0])
-
-
 WEIGHT = ((0.5, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
 
 
@@ -357,19 +350,6 @@ def test_epsilon_can_fall_with_the_episodes_from_the_start():
     assert learner.policy.epsilon == pytest.approx(1.0 - 0.8 * 0.5)
     learn(learner, 2, size=50)
     assert learner.policy.epsilon == pytest.approx(0.2)
-
-
-def test_updates_with_one_hidden_layer_do_not_count_as_worth_compiling():
-    assert make(hidden_dims=[32]).num_updates(10**6) == 0
-    assert make(hidden_dims=[32, 32]).num_updates(10**6) > 0
-
-
-def test_rewards_are_stored_scaled():
-    torch.manual_seed(0)
-    learner = make(reward_scale=0.1, warmup_steps=10_000)
-    td = one_step_rows(learner, 50)
-    learner.learn(td, torch.ones(50, 1, dtype=torch.bool))
-    torch.testing.assert_close(learner.buffer[:]["reward"], 0.1 * td["next", keys.REWARD].flatten())
 
 
 def test_the_published_recipe_runs_where_there_are_no_initial_parameters():

@@ -20,7 +20,6 @@ from conftest import CONF, compose_config, parts_of
 from test_grid import SHORT
 
 from hpamdp import cli, keys
-from hpamdp.config.errors import ConfigError
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.run import checkpoint
@@ -51,7 +50,7 @@ def spoil_rewards(monkeypatch, value: float, after: int) -> None:
     monkeypatch.setattr(BoatDockEnv, "_step", spoiled)
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("value", [float("nan")])
 def test_a_reward_that_is_not_finite_stops_the_run_and_keeps_the_good_checkpoint(value, tmp_path, monkeypatch, capsys):
     given = [*SMALL, "low=random", "checkpoint_every=64", "total_frames=8192"]
     spoil_rewards(monkeypatch, value, after=150)  # well after the evaluations at the start
@@ -230,16 +229,6 @@ def test_a_second_run_in_the_folder_of_one_that_runs_is_refused(tmp_path, printe
     process.join()
     (line,) = lines_of(printed)
     assert "another process is at work in this folder" in line
-
-
-def test_a_folder_with_results_is_refused_unless_they_may_be_overwritten(tmp_path):
-    given = [*SMALL, "low=random"]
-    assert run(compose_config(given), tmp_path, given) == 0
-    before = (tmp_path / "summary.json").read_bytes()
-    with pytest.raises(ConfigError, match="holds the results of a run; continue it with resume="):
-        run(compose_config(given), tmp_path, given)
-    assert (tmp_path / "summary.json").read_bytes() == before
-    assert run(compose_config([*given, "overwrite=true"]), tmp_path, given) == 0
 
 
 @pytest.mark.parametrize(

@@ -103,20 +103,6 @@ def test_a_choices_probability_is_held_with_the_option_while_the_selector_learns
     assert not torch.isclose(rows[key], now).all(), "the selector has not learned while options were held"
 
 
-@pytest.mark.parametrize(("make", "key"), [(make_actor, LOG_PROB), (make_exp3, PROBABILITY)])
-def test_a_finished_decision_has_the_probability_it_was_made_with(make, key):
-    torch.manual_seed(0)
-    env = with_decisions(BoatDockEnv(6))
-    specs = PAMDPSpecs.from_env(env)
-    selector = make(specs)
-    agent = HierarchicalAgent(selector, [Random(specs), Random(specs)], specs)
-    rows = env.rollout(40, agent.policy, break_when_any_done=False)
-    ended = rows[rows["next", keys.IS_DECISION].squeeze(-1)]
-    decided = ended.select(keys.OPTION).set(keys.OBSERVATION, ended["next", keys.DECISION_OBSERVATION])
-    assert len(ended) > 20
-    torch.testing.assert_close(ended[key], probability_now(selector, decided))
-
-
 class Keeper(Stepper):
     """Count the transitions of a data set."""
 

@@ -14,7 +14,6 @@ from hydra.core.override_parser.types import QuotedString
 from omegaconf import OmegaConf
 
 from hpamdp import cli
-from hpamdp.data.human import cli as human
 from hpamdp.files import replacing
 from hpamdp.messages import say
 from hpamdp.run import train
@@ -246,18 +245,6 @@ def test_a_limit_of_the_process_is_reported_in_one_line_wherever_a_library_finds
     monkeypatch.setattr(train, "run", run)
     code, _, err = command()
     assert code == 1 and err.endswith(line) and err.count("\n") == 1
-
-
-def test_the_commands_of_the_recording_tell_a_full_device_too(tmp_path):
-    def run() -> None:
-        sys.stdout = open("/dev/full", "w")  # noqa: SIM115
-        sys.stderr = (tmp_path / "err.txt").open("w")
-        code = human.main(["--help"])
-        sys.stderr.close()
-        os._exit(code)
-
-    assert forked(run) == 1
-    assert (tmp_path / "err.txt").read_text() == "stdout: No space left on device\n"
 
 
 def test_the_printed_command_continues_the_run_when_pasted(command, tmp_path, monkeypatch):
