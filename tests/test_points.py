@@ -225,3 +225,12 @@ def test_our_rules_play_as_the_reference_code(tool, name):
         assert report.steps == sum(len(episode["steps"]) for episode in document["episodes"]) > 300
         assert not report.mismatches
         assert report.worst <= tolerance
+
+
+@pytest.mark.parametrize("change", [{"outcome": "caught"}, {"reward": math.nan}], ids=str)
+def test_the_replay_finds_a_wrong_outcome_and_a_nan(tool, change, tmp_path):
+    document = json.loads(recording("catch_point").read_text())
+    document["episodes"][1]["steps"][3].update(change)
+    path = tmp_path / "changed.json"
+    path.write_text(json.dumps(document))
+    assert tool.main([str(path)]) == 1

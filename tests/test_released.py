@@ -40,14 +40,21 @@ def test_a_recorded_episode_is_reproduced(dtype, tolerance):
     assert steps == 4 and difference < tolerance
 
 
+@pytest.mark.parametrize("change", [{"success": True}, {"reward": math.nan}], ids=str)
+def test_the_replay_finds_a_wrong_flag_and_a_nan(change):
+    other = json.loads(json.dumps(RECORDED))
+    other["steps"][1].update(change)
+    assert load_replay().replay([other])[1] == math.inf
+
+
 @pytest.mark.skipif(not TRACES, reason="HPAMDP_TRACES names no folder with traces")
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-3)])
-@pytest.mark.parametrize("file", TRACES, ids=lambda file: file.stem)
-def test_every_recorded_trace_is_reproduced(file, dtype, tolerance):
-    episodes = json.loads(file.read_text())
-    steps, difference = load_replay().replay(episodes, dtype)
-    assert steps == sum(len(episode["steps"]) for episode in episodes) > 0
-    assert difference < tolerance
+def test_every_recorded_trace_is_reproduced(dtype, tolerance):
+    for file in TRACES:
+        episodes = json.loads(file.read_text())
+        steps, difference = load_replay().replay(episodes, dtype)
+        assert steps == sum(len(episode["steps"]) for episode in episodes) > 0
+        assert difference < tolerance, file.stem
 
 
 @pytest.mark.parametrize(("seconds", "px"), [(0.1, 33.333), (0.2, 66.66), (0.31, -16.0415), (5.0, -1_958_437.5)])
