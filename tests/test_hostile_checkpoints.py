@@ -138,14 +138,16 @@ def mutations(value):
         yield "empty", type(value)()
 
 
+# Settings of optimizers that say only how a step is computed.
+EXECUTION = ("foreach", "fused", "capturable", "differentiable")
+
+
 def is_harmless(place, change):
     """Return whether a file with the change can be resumed: it lacks what it may lack, or could be another run's."""
-    if change == "gone" and str(place[-1]).endswith(ADDED_LATER):
+    if (change == "gone" and str(place[-1]).endswith(ADDED_LATER)) or place[-1] in EXECUTION:
         return True
     if place[0] == "state" and "step" not in place:  # of an optimizer, some of whose weights had no gradient yet
         return change in ("gone", "empty") and len(place) < 3
-    if place[-1] in ("foreach", "fused", "capturable", "differentiable"):
-        return True
     if place[0] == "param_groups" and len(place) == 3 and place[-1] not in ("lr", "weight_decay"):
         return change == "gone"
     if change in ("negative", "huge") or (
