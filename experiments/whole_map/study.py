@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
-from experiments.study_tables import Rows, Run, add_to_tables, gathered, groups, read_csv
+from experiments.study_tables import Rows, Run, add_to_tables, difference, gathered, groups, read_csv
 from hpamdp.analysis.statistics import spread
 from hpamdp.messages import exit_code
 
@@ -110,7 +110,7 @@ def choosing(rows: Rows) -> str:
         alone = single(rows, low)
         columns = ("score", "ceiling", "agreement", "weighted", "regret", "cpu_s")
         mean = {column: np.mean([row[column] for row in runs]) for column in columns}
-        over = f"{mean['score'] - np.mean([row['score'] for row in alone]):+.3f}" if alone else ""
+        over = str(difference([row["score"] for row in runs], [row["score"] for row in alone])) if alone else ""
         lines.append(
             f"| {high} | {low} | {frames:,.0f} | {len(runs)} | {spread([row['score'] for row in runs])} | "
             f"{mean['ceiling'] - mean['score']:.3f} | {over} | {mean['agreement']:.1%} | {mean['weighted']:.1%} | "

@@ -15,7 +15,6 @@ from typing import Any
 import gymnasium
 import torch
 from gymnasium.vector import VectorEnv
-from torchrl.envs import EnvBase
 
 from hpamdp.complaints import no_such
 from hpamdp.config.components import GROUPS, takes_settings_model
@@ -26,8 +25,8 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import as_code, first_line
 
 _ACCEPTED = (
-    "a name such as 'platform', a Gymnasium id, a function or class that returns a Gymnasium environment, such an "
-    "environment, or a PAMDPEnv or its class"
+    "a name such as 'platform', a Gymnasium id, a function or class that returns an environment of Gymnasium or "
+    "TorchRL, such an environment, or a PAMDPEnv or its class"
 )
 
 
@@ -155,7 +154,7 @@ def problem_of(env: Any) -> Problem:
 
 
 def _of_gymnasium(env: Any) -> Problem:
-    if not isinstance(env, EnvBase | VectorEnv):
+    if not isinstance(env, VectorEnv):
         if hasattr(env, "step") and not isinstance(env, type):  # of another kind is refused where it is copied
             return Problem(["env=gymnasium"], objects={"make": _copier(env)})
         if callable(env):

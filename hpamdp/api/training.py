@@ -66,7 +66,7 @@ def train(
 
             - the name of a choice of `env`;
             - a Gymnasium id;
-            - a function or a class that returns a Gymnasium environment;
+            - a function or a class that returns an environment of Gymnasium or TorchRL;
             - such an environment, which is copied and itself stays as it is;
             - a `PAMDPEnv` or its class;
             - a dict of `name` and settings.

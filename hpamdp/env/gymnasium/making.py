@@ -10,9 +10,11 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+from torchrl.envs import EnvBase
 
 from hpamdp.env.errors import ProblemError, fault_of
 from hpamdp.env.gymnasium.contract import checked
+from hpamdp.env.gymnasium.from_torchrl import FromTorchRL
 from hpamdp.messages import one_line
 from hpamdp.settings import SettingError
 
@@ -83,6 +85,11 @@ class Maker:
         """Return what a class or function made as an environment that checks its contract."""
         if isinstance(env, type):
             raise SettingError(f"{self.name}: returned the class {env.__name__}, not an environment; call it")
+        if isinstance(env, EnvBase):
+            try:
+                env = FromTorchRL(env)
+            except SettingError as error:
+                raise SettingError(f"{self.name}: {error}") from error
         if not isinstance(env, gymnasium.Env):
             cure = "wrap an environment of gym with shimmy's GymV21CompatibilityV0"
             if any(hasattr(env, name) for name in _OF_SEVERAL_AGENTS):

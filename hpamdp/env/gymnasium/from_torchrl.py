@@ -1,0 +1,133 @@
+"""A TorchRL environment as a Gymnasium environment, so that it is learned like any other one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec, Unbounded
+from torchrl.envs import EnvBase, StepCounter, TransformedEnv
+from torchrl.envs.utils import step_mdp
+
+from hpamdp.settings import SettingError
+
+
+class FromTorchRL(gymnasium.Env):
+    """Step a single TorchRL environment, of batch size `()` or `(1,)`, on NumPy values.
+
+    The action is the space of the only leaf of the action spec, or a `Dict` of all leaves: a `Discrete` for
+    `Categorical` and `OneHot`, a `MultiDiscrete` for their multiple forms, a `MultiBinary` for `Binary`, a `Box` for
+    `Bounded`. The observation is a `Dict` of all observed leaves, `action_mask` included. Leaves in nested tensordicts
+    are called `OUTER_INNER`. If a step has several rewards, as with `MultiAction`, their sum counts.
+
+    TorchRL's own `register_gym` takes a single action leaf and no seed.
+
+    Attributes:
+        own_time_limit: that of its `StepCounter` transforms, the lowest one; None if there is none.
+
+    Raises:
+        SettingError: it steps several environments at once, or a spec has no such space.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own declaration)
+
+    def __init__(self, env: EnvBase) -> None:
+        num_envs = env.batch_size.numel()
+        if num_envs != 1:
+            raise SettingError(
+                f"steps {num_envs} environments at once; give a single one, of which num_envs makes copies"
+            )
+        self._env = env
+        self._specs = {key: env.full_action_spec[key] for key in env.action_keys}
+        parts = {_name(key): _space(key, spec) for key, spec in self._specs.items()}
+        self.action_space = spaces.Dict(parts) if len(parts) > 1 else next(iter(parts.values()))
+        self._observed = list(env.observation_keys)
+        observed = {_name(key): _space(key, env.full_observation_spec[key]) for key in self._observed}
+        self.observation_space: spaces.Dict = spaces.Dict(observed)
+        self.own_time_limit = _time_limit(env)
+        self._state: TensorDictBase | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode. The environment is seeded if a seed is given."""
+        if seed is not None:
+            self._env.set_seed(seed)
+        self._state = self._env.reset()
+        return self._observation(self._state), {}
+
+    @torch.no_grad()
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take a step.
+
+        Raises:
+            ResetNeeded: no episode has begun.
+        """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("step: call reset first")
+        for key, spec in self._specs.items():
+            value = torch.as_tensor(np.asarray(action[_name(key)] if len(self._specs) > 1 else action))
+            if isinstance(spec, OneHot) and not isinstance(spec, MultiOneHot):
+                value = torch.nn.functional.one_hot(value.long(), spec.shape[-1])
+            elif isinstance(spec, MultiOneHot):
+                hot = zip(value.long(), spec.nvec, strict=True)
+                value = torch.cat([torch.nn.functional.one_hot(each, int(num)) for each, num in hot])
+            self._state.set(key, value.to(spec.device or "cpu", spec.dtype).reshape(spec.shape))
+        stepped = self._env.step(self._state)["next"]
+        self._state = step_mdp(self._state)
+        reward = float(sum(stepped[key].sum() for key in self._env.reward_keys))
+        terminated = bool(stepped["terminated"].any())
+        truncated = bool(stepped["done"].any()) and not terminated
+        return self._observation(stepped), reward, terminated, truncated, {}
+
+    def _observation(self, td: TensorDictBase) -> dict[str, np.ndarray]:
+        named = {_name(key): td[key] for key in self._observed}
+        return {
+            name: value.cpu().numpy().reshape(space.shape).astype(space.dtype)
+            for (name, value), space in zip(named.items(), self.observation_space.values(), strict=True)
+        }
+
+    def close(self) -> None:
+        """Close the environment."""
+        if not self._env.is_closed:
+            self._env.close()
+
+
+def _name(key: NestedKey) -> str:
+    key = unravel_key(key)
+    return key if isinstance(key, str) else "_".join(key)
+
+
+def _space(key: NestedKey, spec: TensorSpec) -> spaces.Space:
+    """Return the space of a leaf, without the batch dimension of size 1."""
+    if isinstance(spec, MultiCategorical | MultiOneHot):
+        return spaces.MultiDiscrete(torch.as_tensor(spec.nvec).flatten().numpy())
+    if isinstance(spec, Binary):
+        return spaces.MultiBinary(max(1, spec.shape.numel()))
+    if isinstance(spec, OneHot | Categorical):
+        if isinstance(spec, Categorical) and spec.shape.numel() > 1:
+            return spaces.MultiDiscrete(np.full(spec.shape.numel(), spec.space.n))
+        return spaces.Discrete(int(spec.space.n))
+    if not isinstance(spec, Bounded | Unbounded):
+        raise SettingError(f"{_name(key)}: a {type(spec).__name__} spec has no space of Gymnasium")
+    shape = spec.shape
+    if shape[:1] == (1,) and len(shape) > 1:
+        shape = shape[1:]
+    if spec.dtype == torch.uint8:
+        return spaces.Box(0, 255, tuple(shape), np.uint8)
+    low, high = (np.full(shape, side, np.float32) for side in (-np.inf, np.inf))
+    if isinstance(spec, Bounded):
+        low, high = (side.cpu().numpy().astype(np.float32).reshape(shape) for side in (spec.space.low, spec.space.high))
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def _time_limit(env: EnvBase) -> int | None:
+    """Return the lowest number of steps of the environment's `StepCounter` transforms, if it has any."""
+    limits = []
+    while isinstance(env, TransformedEnv):
+        counters = [each for each in env.transform.modules() if isinstance(each, StepCounter)]
+        limits += [each.max_steps for each in counters if each.max_steps is not None]
+        env = env.base_env
+    return min(limits, default=None)
