@@ -107,8 +107,6 @@ def test_numbers_outside_their_bounds_are_clipped_or_kept_if_asked():
             space.flat(([0.5, 0], [0.0, 0.0]))
         with pytest.raises(ProblemError, match="entry 1 is nan at index 0, which is not finite"):
             space.flat(([0, 0], [np.nan, 0.0]))
-    with pytest.raises(ValueError, match="out_of_bounds=wrap, but must be one of refuse, clip, allow"):
-        ObservationSpace(UNIT, None, "wrap")
 
 
 def test_bounds_hold_for_resets_and_steps(monkeypatch):

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hpamdp.env.gymnasium.parameter_trees import NotAcceptedError, ParameterTree, by_row
-from hpamdp.env.gymnasium.values import MisfitError, as_numbers
+from hpamdp.env.gymnasium.values import MisfitError, as_numbers, parts_of
 from hpamdp.messages import warn
 
 # Discrete actions of one choice, each of which has outputs of networks. More are too many to learn one by one.
@@ -135,9 +135,7 @@ class Choice(Part):
         if form.is_shared:
             of_parts = [of_parts] * self._copies
         elif form.part_names is not None and isinstance(of_parts, Mapping):
-            if not of_parts.keys() <= {*form.part_names}:
-                raise MisfitError(given, f"a dict with names of {form.part_names}")
-            of_parts = [of_parts.get(name) for name in form.part_names]
+            of_parts = parts_of(of_parts, len(form.part_names), form.part_names)
         self._tree.fill(of_parts, numbers)
 
     def fill_mask(self, given: Any, mask: np.ndarray) -> None:
@@ -158,18 +156,12 @@ class Choice(Part):
         if form.is_one_of:
             return None, given
         if form.names is not None:
-            if not isinstance(given, Mapping):
-                raise MisfitError(given, "a dict")
             first, second = form.names
-            rest = {name: value for name, value in given.items() if name != first}
             names = [first, *(form.part_names or ())] if form.is_flat else [first, second]
-            if not given.keys() <= {*names}:
-                raise MisfitError(given, f"a dict with names of {names}")
-            return given.get(first), rest if form.is_flat else rest.get(second)
-        length = 1 + len(form.parts) if form.is_flat else 2
-        if not isinstance(given, tuple | list) or len(given) != length:
-            raise MisfitError(given, f"a tuple of {length} parts")
-        return given[0], list(given[1:]) if form.is_flat else given[1]
+            chosen, *rest = parts_of(given, len(names), names)
+            return chosen, dict(zip(names[1:], rest, strict=True)) if form.is_flat else rest[0]
+        chosen, *rest = parts_of(given, 1 + len(form.parts) if form.is_flat else 2)
+        return chosen, rest if form.is_flat else rest[0]
 
 
 class PlainChoices(Part):
@@ -275,24 +267,15 @@ class Group(Part):
 
     def fill_bounds(self, given: Any, numbers: np.ndarray) -> None:
         """Write the parts' bounds."""
-        for part, value, own in zip(self._parts, self._divided(given), self._parameters, strict=True):
+        values = parts_of(given, len(self._parts), self._names)
+        for part, value, own in zip(self._parts, values, self._parameters, strict=True):
             part.fill_bounds(value, numbers[own])
 
     def fill_mask(self, given: Any, mask: np.ndarray) -> None:
         """Write the parts' masks."""
-        for part, value, own in zip(self._parts, self._divided(given), self._discrete, strict=True):
+        values = parts_of(given, len(self._parts), self._names)
+        for part, value, own in zip(self._parts, values, self._discrete, strict=True):
             part.fill_mask(value, mask[own])
-
-    def _divided(self, given: Any) -> list[Any]:
-        if given is None:
-            return [None] * len(self._parts)
-        if self._names is not None:
-            if not isinstance(given, Mapping) or not given.keys() <= {*self._names}:
-                raise MisfitError(given, f"a dict with names of {self._names}")
-            return [given.get(name) for name in self._names]
-        if not isinstance(given, tuple | list) or len(given) != len(self._parts):
-            raise MisfitError(given, f"a tuple of {len(self._parts)} parts")
-        return list(given)
 
 
 class ChoiceForm:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -13,7 +13,6 @@ from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.action_parts import max_values
 from hpamdp.env.gymnasium.options import OutOfBounds
 from hpamdp.env.gymnasium.values import as_numbers, shown
-from hpamdp.settings import SettingError
 
 # Units in the last place beyond a bound that count as rounding.
 _ROUNDING = 4.0
@@ -286,12 +285,7 @@ def leaves(
     """Yield the leaves of a space, in the order of its flattened vector.
 
     Entries of more than 100,000 values are boxes of integers.
-
-    Raises:
-        ValueError: `out_of_bounds` has no allowed value.
     """
-    if out_of_bounds not in get_args(OutOfBounds):
-        raise SettingError(f"out_of_bounds={out_of_bounds}, but must be one of {', '.join(get_args(OutOfBounds))}")
     entries = children(space)
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and max_values(space) > _MOST_ONE_HOT:
         sizes: Any = space.n if isinstance(space, spaces.Discrete) else space.nvec

@@ -56,9 +56,6 @@ class Masks:
         source: MaskSource | None = None,
         pair_source: MaskSource | None = None,
     ) -> None:
-        for setting, given in (("action_mask", source), ("pair_mask", pair_source)):
-            if given not in (None, "info", "ignore"):
-                raise SettingError(f"{setting}={given}: must be info, ignore or null")
         if pair_source == "info" and actions.num_components == 1:
             raise SettingError(
                 "pair_mask=info: the action has one component, so there are no pairs; use null, or "

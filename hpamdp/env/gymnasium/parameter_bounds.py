@@ -37,12 +37,10 @@ class ParameterBounds:
         low, high: the bounds of the space's own parameters, float64 `[N, num_parameters]`.
 
     Raises:
-        ValueError: `source` is none of these, or there are no parameters.
+        ValueError: there are no parameters.
     """
 
     def __init__(self, env: gymnasium.Env, num_envs: int, actions: ActionSpace, source: MaskSource | None) -> None:
-        if source not in (None, "info", "ignore"):
-            raise SettingError(f"parameter_bounds={source}: must be info, ignore or null")
         space = env.observation_space
         entries = space.spaces if isinstance(space, spaces.Dict) and source is None else {}
         self.names = tuple(name for name in _NAMES if source == "info" or name in entries)

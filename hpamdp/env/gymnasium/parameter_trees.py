@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.gymnasium.values import MisfitError, as_numbers
+from hpamdp.env.gymnasium.values import MisfitError, as_numbers, parts_of
 from hpamdp.env.gymnasium_form import ParameterMap
 
 # Largest distance between neighbouring float32 numbers that is fine enough, as a fraction of the width of a Box.
@@ -36,6 +36,7 @@ _CROSSED = "a parameter's lower bound must be less than its upper bound"
 
 # Makes M values of a space from parameters `[M, size]` within their bounds, which are given in each dtype of the space.
 _Build = Callable[[Mapping[np.dtype, np.ndarray]], list[Any]]
+_Fill = Callable[[Any, np.ndarray], None]  # writes the parameters of a value; see `ParameterTree.fill`
 
 
 class NotAcceptedError(ValueError):
@@ -176,20 +177,14 @@ class ParameterTree:
         """
         self._fill(given, numbers)
 
-    def _read(self, space: spaces.Space) -> tuple[_Build, Callable[[Any, np.ndarray], None]]:
+    def _read(self, space: spaces.Space) -> tuple[_Build, _Fill]:
         """Return how values of the space are built from parameters, and how parameters are read from a value."""
-        if isinstance(space, spaces.Tuple):
-            parts = [self._read(part) for part in space.spaces]
-            return _build_tuple([part[0] for part in parts]), _fill_sequence([part[1] for part in parts])
-        if isinstance(space, spaces.Dict):
-            named = {name: self._read(part) for name, part in space.spaces.items()}
-            return _build_dict({name: part[0] for name, part in named.items()}), _fill_mapping(
-                {name: part[1] for name, part in named.items()}
-            )
-        if isinstance(space, spaces.OneOf):
-            number = self._read(spaces.Discrete(len(space.spaces)))[0]
-            parts = [self._read(part) for part in space.spaces]
-            return _build_one_of(number, [part[0] for part in parts]), _fill_sequence([part[1] for part in parts])
+        if isinstance(space, spaces.Tuple | spaces.Dict | spaces.OneOf):
+            names = list(space.spaces) if isinstance(space, spaces.Dict) else None
+            number = self._read(spaces.Discrete(len(space.spaces)))[0] if isinstance(space, spaces.OneOf) else None
+            parts = [self._read(part) for part in (space.spaces if names is None else space.spaces.values())]
+            build = _build_parts([part[0] for part in parts], names, number)
+            return build, _fill_parts([part[1] for part in parts], names)
         low, high, is_free = bounds_of(space)
         entry = _Entry(space, low, high, is_free, self.size)
         self._entries.append(entry)
@@ -263,25 +258,20 @@ def _build_entry(entry: _Entry) -> _Build:
     return build
 
 
-def _build_tuple(parts: Sequence[_Build]) -> _Build:
-    if not parts:
-        return lambda columns: [()] * len(next(iter(columns.values())))
-    return lambda columns: list(zip(*[part(columns) for part in parts], strict=True))
+def _build_parts(parts: Sequence[_Build], names: Sequence[str] | None, number: _Build | None) -> _Build:
+    def build(columns: Mapping[np.dtype, np.ndarray]) -> list[Any]:
+        if not parts:
+            rows: list[Any] = [()] * len(next(iter(columns.values())))
+        else:
+            rows = list(zip(*[part(columns) for part in parts], strict=True))
+        if number is not None:  # the alternative of a OneOf
+            return [(index, row[int(index)]) for index, row in zip(number(columns), rows, strict=True)]
+        return rows if names is None else [dict(zip(names, row, strict=True)) for row in rows]
+
+    return build
 
 
-def _build_dict(parts: Mapping[str, _Build]) -> _Build:
-    build = _build_tuple([*parts.values()])
-    return lambda columns: [dict(zip(parts, values, strict=True)) for values in build(columns)]
-
-
-def _build_one_of(number: _Build, parts: Sequence[_Build]) -> _Build:
-    build = _build_tuple(parts)
-    return lambda columns: [
-        (index, values[int(index)]) for index, values in zip(number(columns), build(columns), strict=True)
-    ]
-
-
-def _fill_entry(entry: _Entry) -> Callable[[Any, np.ndarray], None]:
+def _fill_entry(entry: _Entry) -> _Fill:
     shape = entry.space.shape or ()
 
     def fill(given: Any, numbers: np.ndarray) -> None:
@@ -295,26 +285,10 @@ def _fill_entry(entry: _Entry) -> Callable[[Any, np.ndarray], None]:
     return fill
 
 
-def _fill_sequence(parts: Sequence[Callable[[Any, np.ndarray], None]]) -> Callable[[Any, np.ndarray], None]:
+def _fill_parts(fills: Sequence[_Fill], names: Sequence[str] | None) -> _Fill:
     def fill(given: Any, numbers: np.ndarray) -> None:
-        if given is None:
-            return
-        if not isinstance(given, tuple | list) or len(given) != len(parts):
-            raise MisfitError(given, f"a tuple of {len(parts)} parts")
-        for part, value in zip(parts, given, strict=True):
-            part(value, numbers)
-
-    return fill
-
-
-def _fill_mapping(parts: Mapping[str, Callable[[Any, np.ndarray], None]]) -> Callable[[Any, np.ndarray], None]:
-    def fill(given: Any, numbers: np.ndarray) -> None:
-        if given is None:
-            return
-        if not isinstance(given, Mapping) or not given.keys() <= parts.keys():
-            raise MisfitError(given, f"a dict with names of {list(parts)}")
-        for name, value in given.items():
-            parts[name](value, numbers)
+        for fill_part, part in zip(fills, parts_of(given, len(fills), names), strict=True):
+            fill_part(part, numbers)
 
     return fill
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,23 @@ def as_numbers(value: Any) -> np.ndarray | None:
     except (TypeError, ValueError, RuntimeError, OverflowError):
         return None
     return array if array.dtype.kind in "biuf" and not np.ma.is_masked(value) else None
+
+
+def parts_of(given: Any, num: int, names: Sequence[str] | None = None) -> list[Any]:
+    """Return what is given in place of the parts of a `Tuple` or, with names, of a `Dict`; None for a missing part.
+
+    Raises:
+        MisfitError: `given` is no tuple of `num` parts, or no dict with some of the names.
+    """
+    if given is None:
+        return [None] * num
+    if names is not None:
+        if not isinstance(given, Mapping) or not given.keys() <= {*names}:
+            raise MisfitError(given, f"a dict with names of {list(names)}")
+        return [given.get(name) for name in names]
+    if not isinstance(given, tuple | list) or len(given) != num:
+        raise MisfitError(given, f"a tuple of {num} parts")
+    return list(given)
 
 
 def number(name: str, value: Any) -> float:
