@@ -48,11 +48,16 @@ LR = {
 class TransposedLearner(ReplayLearner):
     """Has one weight, which it uses transposed: so its gradient comes transposed, too."""
 
+    Options = ReplayOptions
+
     def __init__(self) -> None:
-        options = ReplayOptions(warmup_steps=0, buffer_size=10, batch_size=2)
-        super().__init__(SPECS, "cpu", options)
+        super().__init__(SPECS, warmup_steps=0, buffer_size=10, batch_size=2)
+
+    def make_networks(self, specs) -> None:
         self.weight = nn.Parameter(torch.randn(3, 5))
-        self.optimizers = {"weight": torch.optim.Adam([self.weight], lr=0.1, fused=True)}
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        return {"weight": torch.optim.Adam([self.weight], lr=0.1, fused=True)}
 
     def loss(self, x: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         loss = (x @ self.weight.T).square().sum()

@@ -13,6 +13,7 @@ TorchRL's BCLoss does not fit: it reads a single action leaf.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from hpamdp.policies.low_level.bc_options import CARDS, BCOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
+from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
 from hpamdp.policies.shared.options import ReplayOptions
 from hpamdp.policies.shared.replay import ReplayLearner, unpacked_states
@@ -34,27 +36,22 @@ class BC(ReplayLearner):
     card = CARDS["BC"]
     stores_own_parameters = True
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: BCOptions | None = None,
-        **settings: Any,
-    ) -> None:
-        options = BCOptions.of(options, settings)
-        # A data set alone fills the buffer, so there is no warm-up.
-        sizes = ReplayOptions(buffer_size=options.buffer_size, batch_size=options.batch_size, warmup_steps=0)
-        super().__init__(specs, device, sizes)
+    def read_options(self, options: BCOptions | None, settings: Mapping[str, Any]) -> ReplayOptions:
+        """Return the settings of the replay buffer; a data set alone fills it, so there is no warm-up."""
+        self.imitation = options = BCOptions.of(options, settings)
+        return ReplayOptions(buffer_size=options.buffer_size, batch_size=options.batch_size, warmup_steps=0)
+
+    def make_networks(self, specs: PAMDPSpecs) -> None:
+        """Make the actor and the policy."""
+        options = self.imitation
         self.actor = (AutoregressiveActor if options.autoregressive else HybridActor)(
             specs, options.hidden_dims, options.scale_range
         )
         self.policy = HybridPolicy(self.actor, specs)
-        self.to(device)
-        optimizer = torch.optim.AdamW(
-            self.actor.parameters(), lr=options.lr, weight_decay=options.weight_decay, fused=True
-        )
-        self.optimizers = {"actor": optimizer}
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return the optimizer of the actor."""
+        return {"actor": adam(self.imitation.lr, self.actor, weight_decay=self.imitation.weight_decay)}
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Make one step up the log-likelihood of transitions `[batch_size]`; return scalars."""

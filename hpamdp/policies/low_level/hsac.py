@@ -53,6 +53,7 @@ from hpamdp.policies.base import States
 from hpamdp.policies.low_level.hsac_options import CARDS, HSACOptions
 from hpamdp.policies.masks import masked_logits, random_discrete, zero_fixed
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
+from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.hybrid_actor import HybridActor
 from hpamdp.policies.shared.hybrid_distribution import (
     Draw,
@@ -170,16 +171,9 @@ class HSAC(ReplayLearner):
     policy: HSACPolicy
     parameter_dims: Tensor
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: HSACOptions | None = None,
-        **settings: Any,
-    ) -> None:
-        options = HSACOptions.of(options, settings)
-        super().__init__(specs, device, options)
+    def make_networks(self, specs: PAMDPSpecs) -> None:
+        """Make the networks and the policy."""
+        options = self.options
         self.max_discrete_entropy = sum(math.log(size) for size in specs.components.sizes)
         self.register_buffer("parameter_dims", torch.tensor(specs.parameter_dims).float(), persistent=False)
         self.set_perception(options)
@@ -198,14 +192,15 @@ class HSAC(ReplayLearner):
             options.parameter_temperature, is_tuned=options.tune_parameter_temperature
         )
         self.policy = HSACPolicy(self.actor, self.perception, specs)
-        self.to(device)
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return the optimizers by the names of what they learn."""
+        options = self.options
         temperatures = [self.log_discrete_temperature, self.log_parameter_temperature]
         self.tunes_temperatures = any(temperature.requires_grad for temperature in temperatures)
-        self.optimizers = {
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
-            "critics": torch.optim.Adam(
-                [*self.critics.parameters(), *self.perception.parameters()], lr=options.critic_lr, fused=True
-            ),
+        return {
+            "actor": adam(options.actor_lr, self.actor),
+            "critics": adam(options.critic_lr, self.critics, self.perception),
             "temperatures": torch.optim.Adam(temperatures, lr=options.temperature_lr, fused=True),
         }
 

@@ -47,7 +47,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -63,7 +63,7 @@ from hpamdp.policies.low_level.hyar_options import CARDS, HyAROptions
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.actor_search import even_normal, in_pieces, searching_actor_loss, with_variations
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
-from hpamdp.policies.shared.gradients import set_learning_rates
+from hpamdp.policies.shared.gradients import adam, set_learning_rates
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     InvertingGradients,
@@ -251,16 +251,9 @@ class HyAR(ReplayLearner):
     episodes: Tensor
     warmup_rows: Tensor
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: HyAROptions | None = None,
-        **settings: Any,
-    ) -> None:
-        options = HyAROptions.of(options, settings)
-        super().__init__(specs, device, options)
+    def make_networks(self, specs: PAMDPSpecs) -> None:
+        """Make the networks and the policy."""
+        options = self.options
         if specs.num_parameters == 0:
             raise SettingError("HyAR encodes parameters, but no discrete action of the problem has one; use low=pdqn")
         self.policy_delay = options.policy_delay if options.twin else 1
@@ -283,13 +276,13 @@ class HyAR(ReplayLearner):
         self.register_buffer("episodes", torch.zeros((), dtype=torch.long), persistent=self.counts_episodes)
         has_window = options.critic_window is not None
         self.register_buffer("warmup_rows", torch.zeros((), dtype=torch.long), persistent=has_window)
-        self.to(device)
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return the optimizers by the names of what they learn."""
+        options = self.options
         self.learning_rates = {"codec": options.codec_lr, "actor": options.actor_lr, "critics": options.critic_lr}
         modules = {"codec": self.codec, "actor": self.actor, "critics": self.critics}
-        self.optimizers = {
-            name: torch.optim.Adam(modules[name].parameters(), lr=rate, fused=True)
-            for name, rate in self.learning_rates.items()
-        }
+        return {name: adam(rate, modules[name]) for name, rate in self.learning_rates.items()}
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Store the batch's transitions; after the warm-up, make the updates that are due."""

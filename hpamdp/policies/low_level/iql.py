@@ -28,7 +28,7 @@ TorchRL's IQLLoss does not fit: it reads a single action leaf.
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -39,7 +39,7 @@ from hpamdp.policies.base import States
 from hpamdp.policies.low_level.iql_options import CARDS, IQLOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.exploration import cosine_schedule
-from hpamdp.policies.shared.gradients import expectile_loss, set_learning_rates
+from hpamdp.policies.shared.gradients import adam, expectile_loss, set_learning_rates
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, JointCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -57,16 +57,9 @@ class IQL(ReplayLearner):
     options: IQLOptions
     actor_updates: Tensor
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: IQLOptions | None = None,
-        **settings: Any,
-    ) -> None:
-        options = IQLOptions.of(options, settings)
-        super().__init__(specs, device, options)
+    def make_networks(self, specs: PAMDPSpecs) -> None:
+        """Make the networks and the policy."""
+        options = self.options
         actor = AutoregressiveActor if options.autoregressive else HybridActor
         self.actor = actor(specs, options.hidden_dims, options.scale_range)
         self.state_value = mlp(specs.observation_dim, options.hidden_dims, 1)
@@ -79,11 +72,14 @@ class IQL(ReplayLearner):
         self.policy = HybridPolicy(self.actor, specs)
         # Those of this run, for the schedule of the learning rate.
         self.register_buffer("actor_updates", torch.zeros((), dtype=torch.long))
-        self.to(device)
-        self.optimizers = {
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
-            "state_value": torch.optim.Adam(self.state_value.parameters(), lr=options.critic_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=options.critic_lr, fused=True),
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return the optimizers by the names of what they learn."""
+        options = self.options
+        return {
+            "actor": adam(options.actor_lr, self.actor),
+            "state_value": adam(options.critic_lr, self.state_value),
+            "critics": adam(options.critic_lr, self.critics),
         }
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:

@@ -30,7 +30,6 @@ inverting gradients, for which the gradient must be changed between critic and a
 from __future__ import annotations
 
 import copy
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -44,6 +43,7 @@ from hpamdp.policies.base import States
 from hpamdp.policies.low_level.paddpg_options import CARDS, PADDPGOptions
 from hpamdp.policies.masks import masked_values, zero_fixed
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
+from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     InitialLayer,
@@ -150,16 +150,9 @@ class PADDPG(ReplayLearner):
     options: PADDPGOptions
     policy: PADDPGPolicy
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: PADDPGOptions | None = None,
-        **settings: Any,
-    ) -> None:
-        options = PADDPGOptions.of(options, settings)
-        super().__init__(specs, device, options)
+    def make_networks(self, specs: PAMDPSpecs) -> None:
+        """Make the networks and the policy."""
+        options = self.options
         self.max_grad_norm = options.max_grad_norm
         self.policy_delay = options.policy_delay if options.twin else 1
         self.actor = PADDPGActor(specs, options)
@@ -168,11 +161,11 @@ class PADDPG(ReplayLearner):
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = PADDPGPolicy(self.actor, specs, options.parameter_noise)
-        self.to(device)
-        self.optimizers = {
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=options.critic_lr, fused=True),
-        }
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return the optimizers by the names of what they learn."""
+        options = self.options
+        return {"actor": adam(options.actor_lr, self.actor), "critics": adam(options.critic_lr, self.critics)}
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""

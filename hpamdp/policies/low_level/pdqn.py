@@ -43,7 +43,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -57,7 +56,7 @@ from hpamdp.policies.low_level.pdqn_options import CARDS, PDQNOptions
 from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete, zero_fixed
 from hpamdp.policies.shared.actor_search import even_normal, in_pieces, searching_actor_loss, with_variations
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
-from hpamdp.policies.shared.gradients import set_learning_rates
+from hpamdp.policies.shared.gradients import adam, set_learning_rates
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,
@@ -230,16 +229,9 @@ class PDQN(ReplayLearner):
     policy: PDQNPolicy
     episodes: Tensor
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: PDQNOptions | None = None,
-        **settings: Any,
-    ) -> None:
-        options = PDQNOptions.of(options, settings)
-        super().__init__(specs, device, options)
+    def make_networks(self, specs: PAMDPSpecs) -> None:
+        """Make the networks and the policy."""
+        options = self.options
         self.stores_own_parameters = options.multipass and specs.components.is_single
         self.max_grad_norm = options.max_grad_norm
         self.register_buffer("episodes", torch.zeros((), dtype=torch.long))
@@ -254,13 +246,14 @@ class PDQN(ReplayLearner):
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = PDQNPolicy(self.actor, self.critics, self.perception, specs, options)
-        self.to(device)
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return the optimizers by the names of what they learn."""
+        options = self.options
         self.learning_rates = {"actor": options.actor_lr, "critics": options.critic_lr}
-        self.optimizers = {
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
-            "critics": torch.optim.Adam(
-                [*self.critics.parameters(), *self.perception.parameters()], lr=options.critic_lr, fused=True
-            ),
+        return {
+            "actor": adam(options.actor_lr, self.actor),
+            "critics": adam(options.critic_lr, self.critics, self.perception),
         }
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:

@@ -26,7 +26,6 @@ TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, wi
 from __future__ import annotations
 
 import copy
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -40,6 +39,7 @@ from hpamdp.policies.base import States
 from hpamdp.policies.low_level.td3_bc_options import CARDS, TD3BCOptions
 from hpamdp.policies.masks import allowed_rows, masked_logits, zero_fixed
 from hpamdp.policies.shared.exploration import with_exploring_noise
+from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
@@ -112,16 +112,9 @@ class TD3BC(ReplayLearner):
     options: TD3BCOptions
     policy: TD3BCPolicy
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: TD3BCOptions | None = None,
-        **settings: Any,
-    ) -> None:
-        options = TD3BCOptions.of(options, settings)
-        super().__init__(specs, device, options)
+    def make_networks(self, specs: PAMDPSpecs) -> None:
+        """Make the networks and the policy."""
+        options = self.options
         hidden_dims = options.hidden_dims
         self.actor = nn.Sequential(mlp(specs.observation_dim, hidden_dims, specs.num_parameters), nn.Tanh())
         self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
@@ -129,11 +122,14 @@ class TD3BC(ReplayLearner):
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = TD3BCPolicy(self.actor, self.critics, self.behaviour, specs, options)
-        self.to(device)
-        self.optimizers = {
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=options.critic_lr, fused=True),
-            "behaviour": torch.optim.Adam(self.behaviour.parameters(), lr=options.actor_lr, fused=True),
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return the optimizers by the names of what they learn."""
+        options = self.options
+        return {
+            "actor": adam(options.actor_lr, self.actor),
+            "critics": adam(options.critic_lr, self.critics),
+            "behaviour": adam(options.actor_lr, self.behaviour),
         }
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from hpamdp.policies.shared.gradients import expectile_loss
+from hpamdp.policies.shared.gradients import adam, expectile_loss
 from hpamdp.policies.shared.networks import mlp, polyak_update
 from hpamdp.policies.shared.options import EndValueOptions
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -75,8 +75,7 @@ class EndValues(nn.Module):
 
     def optimizer(self) -> torch.optim.Optimizer:
         """Return the optimizer of the learned networks, which is the learner's optimizer `end_values`."""
-        learned = [*self.own.parameters(), *self.end.parameters()]
-        return torch.optim.Adam(learned, lr=self.options.end_value_lr, fused=True)
+        return adam(self.options.end_value_lr, self.own, self.end)
 
     def update(
         self, learner: ReplayLearner, rows: TensorDictBase, state: Tensor, next_state: Tensor

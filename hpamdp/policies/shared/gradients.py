@@ -93,6 +93,14 @@ class Descent:
         return scalars
 
 
+def adam(rate: float, *modules: nn.Module, weight_decay: float | None = None) -> torch.optim.Optimizer:
+    """Return Adam for the parameters of these modules; with a weight decay, AdamW."""
+    learned = [parameter for module in modules for parameter in module.parameters()]
+    if weight_decay is None:
+        return torch.optim.Adam(learned, lr=rate, fused=True)
+    return torch.optim.AdamW(learned, lr=rate, weight_decay=weight_decay, fused=True)
+
+
 def set_learning_rates(
     optimizers: Mapping[str, torch.optim.Optimizer], rates: Mapping[str, float], fraction: float
 ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -24,6 +24,7 @@ from hpamdp.policies.shared.options import REPLAY_CARD, MemoryOptions, ReplayMem
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
 from hpamdp.policies.shared.symmetry import RandomSymmetry
+from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
 
 _STATES = ("state", "next_state")
@@ -33,8 +34,8 @@ class ReplayLearner(Learner):
     """A learner with its own replay buffer, which makes `updates_per_step` updates for each step that it stores.
 
     `learn` stores the steps and calls `update`, which samples and calls `update_once`. A subclass implements this
-    method: the algorithm box of its paper. It calls `gradient_step` for each optimizer step. The subclass also fills
-    `optimizers`, and may extend the other methods:
+    method: the algorithm box of its paper. It calls `gradient_step` for each optimizer step. The subclass also makes
+    its networks and optimizers, and may extend the other methods:
 
     - `transitions` or `store`: what the buffer holds;
     - `sample_batches`: what an update sees;
@@ -67,6 +68,7 @@ class ReplayLearner(Learner):
     catches_up: bool = False
     max_grad_norm: float | None = None
 
+    Options: ClassVar[type[Settings]]
     options: ReplayOptions
     optimizers: dict[str, torch.optim.Optimizer]
     perception: Perception
@@ -77,10 +79,17 @@ class ReplayLearner(Learner):
     slots: Tensor
     owner: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, device: torch.device | str, options: ReplayOptions) -> None:
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        *,
+        device: torch.device | str = "cpu",
+        options: Any = None,
+        **settings: Any,
+    ) -> None:
         super().__init__(specs)
         device = checked_device(self, device)
-        self.options = options
+        options = self.options = self.read_options(options, settings)
         self.stores_own_parameters = self.stores_own_parameters and specs.components.is_single
         remembers = isinstance(options, MemoryOptions) and options.memory != "none"
         augment = options.augment
@@ -94,6 +103,23 @@ class ReplayLearner(Learner):
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(options.buffer_size, device=device))
         self.descent = Descent()
         self.links = None
+        self.make_networks(specs)
+        self.to(device)
+        self.optimizers = self.make_optimizers()
+
+    def read_options(self, options: Any, settings: Mapping[str, Any]) -> ReplayOptions:
+        """Return the settings that the constructor was given, as `Settings.of` does."""
+        return self.Options.of(options, settings)
+
+    @abstractmethod
+    def make_networks(self, specs: PAMDPSpecs) -> None:
+        """Make the networks and the policy, from `options`."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return the optimizers of the networks, which are on their device now, by the names of what they learn."""
+        raise NotImplementedError
 
     def set_perception(self, options: ReplayMemoryOptions, *, knows_directions: bool = False) -> None:
         """Make the perception and its target copy; call it before the networks, which are built from its specs."""

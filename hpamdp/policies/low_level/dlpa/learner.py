@@ -56,7 +56,7 @@ predicted states only. On this project's benchmark the score after 8,000 steps w
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -70,6 +70,7 @@ from hpamdp.policies.low_level.dlpa.model import PAMDPModel
 from hpamdp.policies.low_level.dlpa.options import CARDS, DLPAOptions
 from hpamdp.policies.low_level.dlpa.planner import Planner
 from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.memory import Stack
 from hpamdp.policies.shared.networks import polyak_update
 from hpamdp.policies.shared.perception import Perception
@@ -127,16 +128,9 @@ class DLPA(ReplayLearner):
     options: DLPAOptions
     policy: DLPAPolicy
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: DLPAOptions | None = None,
-        **settings: Any,
-    ) -> None:
-        options = DLPAOptions.of(options, settings)
-        super().__init__(specs, device, options)
+    def make_networks(self, specs: PAMDPSpecs) -> None:
+        """Make the networks and the policy."""
+        options = self.options
         self.set_perception(options)
         seen, dims = self.perception.specs, options.hidden_dims
         context_dim = seen.observation_dim - specs.observation_dim
@@ -144,11 +138,11 @@ class DLPA(ReplayLearner):
         self.end_values = EndValues(seen.observation_dim, dims, options) if options.end_values else None
         planner = Planner(self.model, specs, options, self.end_values, self.perception.imagined)
         self.policy = DLPAPolicy(planner, specs, options.epsilon, self.perception)
-        self.to(device)
-        learned = [*self.model.parameters(), *self.perception.parameters()]
-        self.optimizers = {"model": torch.optim.Adam(learned, lr=options.lr, fused=True)}
-        if self.end_values is not None:
-            self.optimizers["end_values"] = self.end_values.optimizer()
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return the optimizers of the model and of the values, if these are learned."""
+        model = {"model": adam(self.options.lr, self.model, self.perception)}
+        return model if self.end_values is None else {**model, "end_values": self.end_values.optimizer()}
 
     def take_bonus(self, bonus: Bonus) -> None:
         """Add a bonus to the rewards of exploring plans, scaled as these are."""

@@ -71,6 +71,7 @@ from hpamdp.policies.low_level.pets.model import PETSModel
 from hpamdp.policies.low_level.pets.options import CARDS, PETSOptions
 from hpamdp.policies.low_level.pets.policy import PETSPolicy
 from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.known_directions import KnownDirections
 from hpamdp.policies.shared.memory import Stack
 from hpamdp.policies.shared.networks import polyak_update
@@ -106,27 +107,29 @@ class PETS(ReplayLearner):
         options = PETSOptions.of(options, settings)
         self.num_entries = specs.observation_dim
         self.entries = list(range(self.num_entries))
-        remembers = options.memory != "none"
-        uses_geometry = options.augment is not False and not remembers
-        is_revealed = uses_geometry and specs.geometry is not None and specs.geometry.revealed is not None
-        if uses_geometry and not is_revealed:
+        uses_geometry = options.augment is not False and options.memory == "none"
+        self.is_revealed = uses_geometry and specs.geometry is not None and specs.geometry.revealed is not None
+        if uses_geometry and not self.is_revealed:
             self.entries, specs = specs.telling_entries, specs.with_telling_entries()
-        super().__init__(specs, device, options)
-        self.set_perception(options, knows_directions=is_revealed)
+        super().__init__(specs, device=device, options=options)
+
+    def make_networks(self, specs: PAMDPSpecs) -> None:
+        """Make the model and the policy that plans in it."""
+        options = self.options
+        self.set_perception(options, knows_directions=self.is_revealed)
         features_dim = self.perception.specs.observation_dim
-        predicted = specs.with_telling_entries() if is_revealed else specs
-        if remembers:
+        predicted = specs.with_telling_entries() if self.is_revealed else specs
+        if options.memory != "none":
             predicted = _without_directions(specs)
         context_dim = features_dim - predicted.observation_dim
-        self.model = PETSModel(predicted, options, context_dim, is_revealed=is_revealed)
+        self.model = PETSModel(predicted, options, context_dim, is_revealed=self.is_revealed)
         self.end_values = EndValues(features_dim, options.outcome_dims, options) if options.end_values else None
         self.policy = PETSPolicy(self.model, specs, self.entries, options, self.perception, self.end_values)
-        self.to(device)
-        learned = [*self.model.parameters(), *self.perception.parameters()]
-        adam = torch.optim.AdamW(learned, lr=options.lr, weight_decay=options.weight_decay, fused=True)
-        self.optimizers = {"model": adam}
-        if self.end_values is not None:
-            self.optimizers["end_values"] = self.end_values.optimizer()
+
+    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return the optimizers of the model and of the values, if these are learned."""
+        model = {"model": adam(self.options.lr, self.model, self.perception, weight_decay=self.options.weight_decay)}
+        return model if self.end_values is None else {**model, "end_values": self.end_values.optimizer()}
 
     def take_bonus(self, bonus: Bonus) -> None:
         """Add a bonus, scaled as rewards are, to the rewards of exploring plans, which all members then make together.
