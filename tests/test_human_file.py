@@ -13,10 +13,10 @@ import torch
 
 from hpamdp.data import DataError
 from hpamdp.data.human import released_file
-from hpamdp.data.human.released_file import read
-from hpamdp.env.boatdock import harbour, physics
+from hpamdp.data.human.released_file import Outcome, read
+from hpamdp.env.boatdock import harbour
 
-OUTCOMES = {1: physics.OUT_OF_FUEL, 2: physics.SUCCESS, 3: physics.TOO_FAST, 4: physics.OUT_OF_BOUNDS}
+OUTCOMES = {1: Outcome.OUT_OF_FUEL, 2: Outcome.SUCCESS, 3: Outcome.TOO_FAST, 4: Outcome.OUT_OF_BOUNDS}
 
 
 def test_tables_hold_the_recording(tmp_path):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from enum import IntEnum
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,7 +34,9 @@ EPISODES_PER_BLOCK = 60
 _LOG_TOLERANCE = 2.5  # ticks by which the tank and the logged presses may differ in a complete log
 _MAX_BYTES = 64 * 2**20  # larger files are not read; the released one has 4 million
 
-# The environment's numbers for the file's outcomes 1 to 4.
+Outcome = IntEnum("Outcome", [name.upper() for name in physics.OUTCOMES], start=0)  # type: ignore[misc]
+"""The outcomes of episodes by their numbers here, such as `Outcome.SUCCESS`."""
+# The numbers here of the file's outcomes 1 to 4.
 _OUTCOMES = np.array([physics.OUT_OF_FUEL, physics.SUCCESS, physics.TOO_FAST, physics.OUT_OF_BOUNDS])
 
 QUIRKS = (
@@ -41,6 +44,8 @@ QUIRKS = (
     "An episode's final press has no next position (NaN here). If a single press was logged, `obs` is empty.",
     "Presses that overlapped another are not logged. In some episodes the first or the only press is missing.",
     "`gas` (1 - logged seconds / 5) ignores the missing presses. `tank` (ticks left of 360) counts them.",
+    "Outcomes are renumbered, see `Outcome`: 1, 2, 3 and 4 of the file (out of fuel, success, too fast, out of bounds) "
+    "are 4, 1, 2 and 3 here.",
     "`complete` marks the episodes whose log agrees with the tank: |tank + 60 x logged seconds - 360| <= 2.5 ticks.",
 )
 
@@ -50,7 +55,7 @@ class HumanData(NamedTuple):
 
     Columns of `episodes` `[E]`:
     - int64: `person`, `index` (number of the person's episode), `block` (of 60 episodes), `controller` (0 incongruent,
-      1 congruent), `keymap` (1 or 2), `presses` (number of logged presses), `outcome` (index of `physics.OUTCOMES`) and
+      1 congruent), `keymap` (1 or 2), `presses` (number of logged presses), `outcome` (see `Outcome`) and
       `tank` (ticks of fuel left, of 360).
     - bool: `complete`.
     - float32 `[E, 2]`: `start`, `goal` and `centre`.
