@@ -188,7 +188,7 @@ def scaled(tmp_path_factory):
     return file
 
 
-@pytest.mark.parametrize("collection", [None, {}, {"env": {}}])
+@pytest.mark.parametrize("collection", [None, {"env": {}}])
 def test_a_policy_file_without_the_statistics_that_scale_its_observations_is_refused(scaled, tmp_path, collection):
     assert hpamdp.load(scaled, trust=True)._env.statistics()["observation_count"] > 0
     file = changed(scaled, tmp_path / "policy.safetensors", collection=collection)

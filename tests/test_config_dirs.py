@@ -68,7 +68,7 @@ def test_a_run_remembers_its_folders_in_both_of_its_files(home):
         assert checkpoint.progress_of(home / "run" / name)["config_dirs"] == [str(home / "own")]
 
 
-@pytest.mark.parametrize(("way", "permission"), [("watch", "folder"), ("score", "trust"), ("resume", "folder")])
+@pytest.mark.parametrize(("way", "permission"), [("watch", "folder"), ("score", "trust")])
 def test_a_run_on_a_problem_of_ones_own_is_opened_from_the_shell(way, permission, home, command):
     words = words_of(way, home, "opened")
     flags = ["--config-dir", str(home / "own")]
@@ -89,7 +89,7 @@ def test_a_run_on_a_problem_of_ones_own_is_opened_from_python(permission, home, 
     assert more.history[-1]["frames"] == 2048
 
 
-@pytest.mark.parametrize("way", ["watch", "score", "resume"])
+@pytest.mark.parametrize("way", ["score", "resume"])
 def test_without_trust_one_line_names_the_folders_of_a_run_and_nothing_in_them_is_read(way, home, unread, command):
     code, _, err = command(*words_of(way, home, "refused"))
     assert code == 2

@@ -39,12 +39,8 @@ def collect(env, policy, num_envs: int, steps: int, batch_steps: int):
     collector.shutdown()
 
 
-@pytest.mark.parametrize("controller", ["choose", "congruent", "random"])
-def test_specs_of_a_tracked_environment_hold(controller):
-    check_env_specs(with_decisions(BoatDockEnv(3, controller=controller)))
-
-
-def test_specs_of_a_tracked_environment_with_options_of_a_fixed_length_hold():
+def test_specs_of_a_tracked_environment_hold():
+    check_env_specs(with_decisions(BoatDockEnv(3, controller="congruent")))
     check_env_specs(with_decisions(Crossing(3, start=6.0), 0.9, 2))
 
 

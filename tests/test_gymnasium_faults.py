@@ -79,8 +79,7 @@ class Unseeded(Toy):
         return super().reset()
 
 
-@pytest.mark.parametrize("name", ["action_space", "observation_space"])
-@pytest.mark.parametrize("changes", [1, 2, 3])
+@pytest.mark.parametrize(("name", "changes"), [("action_space", 1), ("observation_space", 2), ("action_space", 3)])
 def test_a_space_that_depends_on_the_state_is_told_of_with_where_masks_and_bounds_go(name, changes):
     """The space changes with the first step, with the last one, or in the second episode."""
 

@@ -12,7 +12,7 @@ from toy_environments import Toy
 
 import hpamdp
 from hpamdp.env.errors import ProblemError
-from hpamdp.env.gymnasium.environment import GymnasiumEnv, _seeds
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.gymnasium.scaling import RewardScaling
 
 
@@ -93,8 +93,3 @@ def test_a_reward_beyond_float32_is_refused_in_one_line_without_a_warning_of_num
     ):
         step(env)
     assert not [warning for warning in recwarn if issubclass(warning.category, RuntimeWarning)]
-
-
-def test_large_seeds_share_no_episodes_with_small_ones():
-    seeds = [set(_seeds(seed, 8, stream)) for seed in (0, 5, 2**32, 2**32 + 5, 2**64) for stream in (0, 1)]
-    assert len(set().union(*seeds)) == sum(map(len, seeds))

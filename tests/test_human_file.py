@@ -102,15 +102,13 @@ def test_default_path_is_that_of_the_environment_variable_or_in_the_cache(monkey
     assert released_file.default_path().name == "BDtrajectory40.mat"
 
 
-@pytest.mark.parametrize("form", ["empty", "zip", "zeros", "cut", "another variable", "numbers"])
+@pytest.mark.parametrize("form", ["zip", "cut", "another variable"])
 def test_foreign_files_are_refused(tmp_path, form):
     path = synthetic_human.write(tmp_path / "foreign.mat", [synthetic_human.recording()[0][:2]])
-    variables = {"another variable": {"x": 1.0}, "numbers": {"trajectories": np.ones((1, 2))}}
-    if form in variables:
-        scipy.io.savemat(path, variables[form])
+    if form == "another variable":
+        scipy.io.savemat(path, {"x": 1.0})
     else:
-        whole = path.read_bytes()
-        path.write_bytes({"empty": b"", "zip": b"PK\x03\x04" * 100, "zeros": bytes(4096), "cut": whole[:-99]}[form])
+        path.write_bytes({"zip": b"PK\x03\x04" * 100, "cut": path.read_bytes()[:-99]}[form])
     assert "this is not a MATLAB file with people's trajectories" in refusal(path, checksum=None)
 
 

@@ -55,7 +55,7 @@ def mid_episode(selector: MetaCritic | Actor) -> TensorDict:
 # MetaCritic.
 
 
-@pytest.mark.parametrize("changes", [{}, {"exploration": "ucb"}, {"num_members": 1}])
+@pytest.mark.parametrize("changes", [{}, {"exploration": "ucb"}])
 def test_meta_critic_learns_which_option_is_better_where(changes):
     critic = make(MetaCritic, **changes)
     play(critic, by_sign, 3000, 30, noise=0.5)

@@ -5,17 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from platform_players import COURSE, act, action, place, play, random_action, random_columns, rule
-from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.env.platform.rules import FELL, HOP, LEAP, MET_ENEMY, RUN, TIME_LIMIT
 from hpamdp.specs import PAMDPSpecs
-
-
-@pytest.mark.parametrize("num", [1, 3])
-def test_all_tensors_are_as_the_specs_say(num):
-    check_env_specs(PlatformEnv(num), return_contiguous=True)
 
 
 def test_learners_see_three_discrete_actions_of_one_parameter_each_and_no_options():

@@ -99,15 +99,9 @@ def test_forbidden_options_do_not_practise():
     [
         ("high=linucb low=hppo", True),
         ("high=ucb low=hppo", False),
-        ("high=linucb low=hppo agent.practice=0", False),
         ("high=ucb low=hppo agent.practice=curves", True),
         ("high=linucb low=hppo agent.sharing=shared", False),
         ("high=meta_critic low=hppo agent.termination=steps agent.option_length=3 env.switch_cost=0.2", False),
-        (
-            "high=meta_critic low=hppo agent.termination=steps agent.option_length=3 env.switch_cost=0.2 "
-            "agent.practice=curves",
-            True,
-        ),
     ],
 )
 def test_curves_are_the_default_where_a_selector_of_whole_episodes_sees_the_state(words, practises):

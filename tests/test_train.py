@@ -193,19 +193,6 @@ def test_a_saved_agent_is_scored_again_with_the_same_result_and_pictures(tmp_pat
     assert len(np.load(tmp_path / "more" / "evaluation.npz")["score"]) == 33
 
 
-def test_the_agent_of_a_resumed_run_is_scored_and_resumed_again(tmp_path):
-    start(tmp_path / "run", "low=random", "high=uniform")
-    words = [f"resume={tmp_path / 'run'}", "total_frames=2048"]
-    run(compose_config(words), tmp_path / "resumed", words)
-    words = ["mode=eval", f"checkpoint={tmp_path / 'resumed'}"]
-    assert run(compose_config(words), tmp_path / "scored", words) == 0
-    again, first = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("scored", "resumed"))
-    assert again["score"] == first["score"] and again["frames"] == 2048
-    words = [f"resume={tmp_path / 'resumed'}", "total_frames=3072"]
-    run(compose_config(words), tmp_path / "again", words)
-    assert [row["frames"] for row in rows_of(tmp_path / "again")][-1] == "3072.0"
-
-
 def test_a_run_goes_on_in_its_own_folder_with_its_own_rows_before(tmp_path):
     start(tmp_path, "low=random", "high=uniform", "total_frames=512")
     (tmp_path / "summary.json").unlink()
