@@ -532,6 +532,27 @@ def test_bounds_of_an_environment_that_were_edited_are_told_of_wherever_an_agent
         assert err.count("has learned with") == 1 and re.search(r"(_low\[0\]=-1|_width\[0\]=1), but GymnasiumEnv", err)
 
 
+def test_another_order_of_the_observations_entries_is_told_of(tmp_path, capsys):
+    class Ordered(Reach):
+        observation_space = spaces.Dict([("far", spaces.Box(-1.0, 1.0)), ("near", spaces.Box(-1.0, 1.0))])
+
+        def reset(self, **arguments):
+            return self.observation_space.sample(), super().reset(**arguments)[1]
+
+        def step(self, action):
+            return self.observation_space.sample(), *super().step(action)[1:]
+
+    class Turned(Ordered):
+        observation_space = spaces.Dict([("near", spaces.Box(-1.0, 1.0)), ("far", spaces.Box(-1.0, 1.0))])
+
+    trained = hpamdp.train(lambda: Ordered(), folder=tmp_path / "run", **OWN)
+    hpamdp.load(tmp_path / "run", lambda: Ordered())
+    assert "has learned with" not in capsys.readouterr().err
+    for use in (lambda: hpamdp.load(tmp_path / "run", lambda: Turned()), lambda: trained.evaluate(lambda: Turned())):
+        use()
+        assert "entries of the observation whose order or names differ" in capsys.readouterr().err
+
+
 def test_an_agent_is_refused_at_a_problem_of_other_sizes(platform_agent):
     with pytest.raises(hpamdp.ConfigError, match="env=goal has observation_dim=17, but the agent's problem 9"):
         platform_agent.evaluate("goal", episodes=2)

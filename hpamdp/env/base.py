@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from hpamdp.env.play_page import PlayPage
     from hpamdp.settings import Settings
 
+OBSERVATION_ENTRIES = (
+    "observation_entries"  # in `ranges`: checksums of the names of the observation's entries, in order
+)
 # Separates the seeds of an evaluation from the small ones that people give to training.
 _EVALUATION = 0x5EED0000
 

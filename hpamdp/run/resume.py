@@ -18,7 +18,7 @@ from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.outside_jobs import searched, searching
 from hpamdp.config.saved import choices_of, read_saved, upgraded
 from hpamdp.config.schema import Config
-from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.base import OBSERVATION_ENTRIES, PAMDPEnv
 from hpamdp.env.facts import SOURCE_SETTINGS
 from hpamdp.messages import warn
 from hpamdp.run import checkpoint, compatibility
@@ -237,6 +237,9 @@ def warn_of_other_ranges(agent: str, before: Mapping[str, Sequence[float]], env:
         env: the environment that it acts in.
     """
     for name, numbers in env.ranges().items():
+        if name == OBSERVATION_ENTRIES and before.get(name, numbers) != numbers:
+            warn(f"{agent} has learned with entries of the observation whose order or names differ in {env.title}")
+            return
         for place, (was, now) in enumerate(zip(before.get(name, ()), numbers, strict=False)):
             if was != now:
                 both = f"{name}[{place}]={was:g}, but {env.title} has {now:g}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import multiprocessing
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial, update_wrapper
 from typing import Any, ClassVar
@@ -19,7 +20,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Un
 
 from hpamdp import keys
 from hpamdp.env.actions import check_action_values, invalid_action
-from hpamdp.env.base import PAMDPEnv, ProblemError, checked_option_names
+from hpamdp.env.base import OBSERVATION_ENTRIES, PAMDPEnv, ProblemError, checked_option_names
 from hpamdp.env.errors import closed_on_error
 from hpamdp.env.facts import NAMING_SETTINGS
 from hpamdp.env.gymnasium.copies import Copies, Reading
@@ -249,12 +250,14 @@ class GymnasiumEnv(PAMDPEnv):
         return rows
 
     def ranges(self) -> dict[str, list[float]]:
-        """Return the bounds and the first discrete actions of the spaces, and the fixed scale of observations."""
+        """Return bounds, first discrete actions, checksums of the observation's entries, and its fixed scale."""
         actions = self._copies.actions
+        entries = [leaf.path for leaf in self._copies.observations.leaves if leaf.path]
         ranges: dict[str, Iterable[float]] = {
             "parameter_low": actions.own_low,
             "parameter_high": actions.own_high,
             "first_action": [*actions.starts, self._copies.options.start],
+            OBSERVATION_ENTRIES: [zlib.crc32(repr(path).encode()) for path in entries],
         }
         if self.scaling.statistics is None:
             ranges["observation_centre"], ranges["observation_half_width"], _ = self.scaling.linear_map()
