@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image
 from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics
@@ -71,24 +69,16 @@ class Scene:
 
 def draw(scene: Scene, size: int = 480) -> np.ndarray:
     """Return a picture of the scene, uint8 `[size, size, 3]`."""
-    harbour_shapes, harbour_smoothed = _empty_harbour(size)
-    canvas = Canvas(harbour_shapes.copy())
+    canvas = Canvas.for_shapes(size)
+    canvas.disc(_on_paper((0.0, 0.0)), physics.HARBOUR_RADIUS * _SCALE + 1.5, _WATER, _RIM, 3.0)
     _draw_places(canvas, scene)
     _draw_track(canvas, scene)
     _draw_boat(canvas, scene)
     _draw_gauge(canvas, scene.fuel)
     _draw_compass(canvas, scene)
-    finished = canvas.smoothed(harbour_smoothed)
+    finished = canvas.smoothed()
     _write_labels(finished, scene)
     return np.array(finished.image)
-
-
-@lru_cache(maxsize=2)
-def _empty_harbour(size: int) -> tuple[Image.Image, Image.Image]:
-    """Return the harbour before and after smoothing. Callers must not draw on either."""
-    canvas = Canvas.for_shapes(size)
-    canvas.disc(_on_paper((0.0, 0.0)), physics.HARBOUR_RADIUS * _SCALE + 1.5, _WATER, _RIM, 3.0)
-    return canvas.image, canvas.smoothed().image
 
 
 def _on_paper(point: Point) -> Point:
