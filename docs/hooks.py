@@ -8,11 +8,10 @@
   `<!-- docstring of hpamdp/policies/low_level/hppo.py: Source -->`: the paragraphs of a module's docstring that begin
   with this word;
   `<!-- rows of experiments/table1/README.md, table 2: hppo -->`: the rows of a study's table by their first cell;
-  `<!-- csv experiments/domains/published.csv: domain=platform -->`: the rows of a csv file by a column;
   `<!-- runs experiments/domains/results.csv: learner=pdqn, pdqn_published -->`: a study's runs by a column. Runs that
   differ only in their seed become one row, mean ± standard deviation. Which runs stand is the rule of the studies.
   `<!-- public names of hpamdp/__init__.pyi -->`: the names with their docstrings.
-  `experiments/report.py` also writes the tables of `rows of`, `csv` and `runs` into the pages themselves, up to the
+  `experiments/report.py` also writes the tables of `rows of` and `runs` into the pages themselves, up to the
   next `<!-- /table -->`, for readers of a clone. A test compares them with their sources.
 - Notebooks are executed in an empty folder, and become pages with their outputs. An error in a cell ends the build.
 - Every module with a docstring gets a page, which says that the module is internal.
@@ -22,7 +21,6 @@ from __future__ import annotations
 
 import ast
 import base64
-import csv
 import functools
 import json
 import logging
@@ -41,9 +39,9 @@ log = logging.getLogger("mkdocs.hooks.pages")
 
 FENCE = re.compile(r"^ *```.*?^ *```[^\n]*$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?<=\]\()(?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?(?=\))")
-DIRECTIVE = re.compile(r"^<!-- (settings of|docstring of|rows of|csv|runs|public names of) (.+?) -->$", re.MULTILINE)
+DIRECTIVE = re.compile(r"^<!-- (settings of|docstring of|rows of|runs|public names of) (.+?) -->$", re.MULTILINE)
 # A directive whose table is in the page itself.
-FILLED = re.compile(r"^(<!-- (rows of|csv|runs) (.+?) -->\n)(?:[^<\n].*\n)*<!-- /table -->\n", re.MULTILINE)
+FILLED = re.compile(r"^(<!-- (rows of|runs) (.+?) -->\n)(?:[^<\n].*\n)*<!-- /table -->\n", re.MULTILINE)
 TABLE_MARK = re.compile(r"^<!-- /?table.*-->\n", re.MULTILINE)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".csv": "text", ".toml": "toml", ".cff": "yaml"}
 PICTURES = {".png", ".gif", ".svg"}
@@ -407,19 +405,6 @@ def rows_of(words: str) -> str:
     return "\n".join([head, line, *found])
 
 
-def csv_table(words: str) -> str:
-    """Return the rows of a csv file in which a column has a value, as `PATH: column=value`, without that column."""
-    path, _, condition = words.partition(": ")
-    column, _, value = condition.partition("=")
-    with (ROOT / path).open(newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row[column] == value]
-    if not rows:
-        raise SiteError(f"no row has {condition}")
-    names = [name for name in rows[0] if name != column]
-    table = [names, ["---"] * len(names), *([cell(row[name]) for name in names] for row in rows)]
-    return "\n".join(f"| {' | '.join(row)} |" for row in table)
-
-
 def runs_table(words: str) -> str:
     """Return a table of the runs in a csv file whose column has one of some values, as `PATH: column=value, value`.
 
@@ -455,7 +440,6 @@ DIRECTIVES: dict[str, Callable[[str], str]] = {
     "settings of": settings_of,
     "docstring of": docstring_of,
     "rows of": rows_of,
-    "csv": csv_table,
     "runs": runs_table,
     "public names of": public_names,
 }

@@ -113,7 +113,7 @@ def test_a_clone_shows_every_table_as_its_csv_file_has_it_or_says_where_to_look(
     for file in sorted(DOCS.rglob("*.md")):
         text = file.read_text()
         assert hooks.with_tables(text) == text, f"the tables of {file.name} are out of date"
-        marks = re.findall(r"^<!-- (?:rows of|csv|runs) .+ -->$", text, re.MULTILINE)
+        marks = re.findall(r"^<!-- (?:rows of|runs) .+ -->$", text, re.MULTILINE)
         assert len(marks) == len(hooks.FILLED.findall(text)), f"{file.name} has a directive without <!-- /table -->"
         for path in re.findall(r"^<!-- docstring of (.+?):", text, re.MULTILINE):
             assert re.search(rf"\]\([./]*{re.escape(path)}\)", text), f"{file.name} does not link to {path}"
@@ -125,17 +125,15 @@ def test_directives_are_filled_in_and_wrong_ones_are_told(hooks, tmp_path, monke
     (tmp_path / "docs").mkdir()
     (tmp_path / "hpamdp").mkdir()
     (tmp_path / "a.yaml").write_text("# What it is.\n_target_: x.Y\n\n# The size | of it.\nsize: 3\nrate: 0.5\n")
-    (tmp_path / "a.csv").write_text("domain,method,score\nx,m,1\ny,n,2\n")
     (tmp_path / "b.md").write_text("| a | b |\n|---|---|\n| x | 1 |\n| y | 2 |\n")
     (tmp_path / "m.py").write_text('"""One.\n\nSource: me,\narXiv 1234.56789.\n\nDiffers:\n- a\n"""\n')
-    lines = ["settings of a.yaml", "csv a.csv: domain=x", "rows of b.md, table 1: y", "docstring of m.py: Source"]
-    wrong = ["settings of gone.yaml", "csv a.csv: domain=z", "rows of b.md, table 2: y", "docstring of m.py: Sauce"]
+    lines = ["settings of a.yaml", "rows of b.md, table 1: y", "docstring of m.py: Source"]
+    wrong = ["settings of gone.yaml", "rows of b.md, table 2: y", "docstring of m.py: Sauce"]
     (tmp_path / "docs/page.md").write_text("".join(f"<!-- {line} -->\n\n" for line in lines + wrong) + "[a](gone.md)\n")
     monkeypatch.setattr(hooks, "ROOT", tmp_path)
     site = hooks.Site()
     text = site.pages["page.md"]
     assert "| `size` |  | `3` | The size \\| of it. |\n| `rate` |  | `0.5` |  |" in text
-    assert "| m | 1 |" in text and "| n | 2 |" not in text
     assert "| y | 2 |" in text and "| x | 1 |" not in text
     assert "arXiv [1234.56789](https://arxiv.org/abs/1234.56789)." in text
     assert len(site.problems) == len(wrong) + 1
