@@ -83,10 +83,33 @@ def test_specs_become_spaces():
         "flags": (Binary(4), gymnasium.spaces.MultiBinary(4)),
         "kinds": (MultiCategorical([2, 3]), gymnasium.spaces.MultiDiscrete([2, 3])),
         "angle": (Bounded(-1.0, 1.0, shape=()), gymnasium.spaces.Box(-1.0, 1.0, ())),
+        "number": (Bounded(0, 4, shape=(1,), dtype=torch.int64), gymnasium.spaces.Box(0, 4, (1,), np.int64)),
+        "byte": (Bounded(0, 4, shape=(1,), dtype=torch.uint8), gymnasium.spaces.Box(0, 4, (1,), np.uint8)),
     }
     env = Tanks()
     env.action_spec = Composite({name: spec for name, (spec, _) in specs.items()})
-    assert FromTorchRL(env).action_space == gymnasium.spaces.Dict({name: space for name, (_, space) in specs.items()})
+    env.observation_spec = Composite(picture=Unbounded(shape=(1, 8, 8), dtype=torch.uint8))
+    read = FromTorchRL(env)
+    assert read.action_space == gymnasium.spaces.Dict({name: space for name, (_, space) in specs.items()})
+    assert read.observation_space["picture"] == gymnasium.spaces.Box(0, 255, (1, 8, 8), np.uint8)
+
+
+def test_its_random_numbers_are_apart_from_those_of_the_run():
+    class Global(Tanks):
+        def _set_seed(self, seed):
+            self.generator = torch.manual_seed(seed)  # as in TorchRL's tutorial on Pendulum
+
+    envs = [FromTorchRL(Global()) for _ in range(2)]
+    torch.manual_seed(1)
+    expected = torch.rand(3).tolist()
+    torch.manual_seed(1)
+    drawn, begun = [], []
+    for seed in (5, None, None):
+        for env in envs:
+            begun.append(env.reset(seed=seed)[0]["level"].tolist())
+        drawn.append(torch.rand(()).item())
+    assert drawn == expected
+    assert begun[::2] == begun[1::2] and begun[0] != begun[2] != begun[4]
 
 
 def test_an_agent_learns_it_from_a_function_and_from_an_environment():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -24,6 +26,9 @@ class FromTorchRL(gymnasium.Env):
     `Bounded`. The observation is a `Dict` of all observed leaves, `action_mask` included. Leaves in nested tensordicts
     are called `OUTER_INNER`. If a step has several rewards, as with `MultiAction`, their sum counts.
 
+    The environment has a state of torch's random numbers of its own, because many environments draw from the global
+    generator, or seed it. So the seed of `reset` decides these numbers, too, and those of the run stay as they are.
+
     TorchRL's own `register_gym` takes a single action leaf and no seed.
 
     Attributes:
@@ -43,20 +48,38 @@ class FromTorchRL(gymnasium.Env):
             )
         self._env = env
         self._specs = {key: env.full_action_spec[key] for key in env.action_keys}
-        parts = {_name(key): _space(key, spec) for key, spec in self._specs.items()}
+        parts = {_name(key): _space(key, spec, env.batch_dims) for key, spec in self._specs.items()}
         self.action_space = spaces.Dict(parts) if len(parts) > 1 else next(iter(parts.values()))
         self._observed = list(env.observation_keys)
-        observed = {_name(key): _space(key, env.full_observation_spec[key]) for key in self._observed}
+        observed = {_name(key): _space(key, env.full_observation_spec[key], env.batch_dims) for key in self._observed}
         self.observation_space: spaces.Dict = spaces.Dict(observed)
         self.own_time_limit = _time_limit(env)
+        self._random_state: torch.Tensor | None = None
         self._state: TensorDictBase | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode. The environment is seeded if a seed is given."""
-        if seed is not None:
-            self._env.set_seed(seed)
-        self._state = self._env.reset()
+        """Begin an episode. The first reset without a seed takes a random one."""
+        if seed is not None or self._random_state is None:
+            self._seed(int(self.np_random.integers(2**31)) if seed is None else seed)
+        with self._own_random_numbers():
+            self._state = self._env.reset()
         return self._observation(self._state), {}
+
+    def _seed(self, seed: int) -> None:
+        devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+        with torch.random.fork_rng(devices):
+            torch.default_generator.manual_seed(seed)
+            self._env.set_seed(seed)
+            self._random_state = torch.get_rng_state()
+
+    @contextmanager
+    def _own_random_numbers(self) -> Iterator[None]:
+        """Let torch draw the environment's random numbers on the CPU while the block runs."""
+        with torch.random.fork_rng(()):
+            assert self._random_state is not None
+            torch.set_rng_state(self._random_state)
+            yield
+            self._random_state = torch.get_rng_state()
 
     @torch.no_grad()
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -75,7 +98,8 @@ class FromTorchRL(gymnasium.Env):
                 hot = zip(value.long(), spec.nvec, strict=True)
                 value = torch.cat([torch.nn.functional.one_hot(each, int(num)) for each, num in hot])
             self._state.set(key, value.to(spec.device or "cpu", spec.dtype).reshape(spec.shape))
-        stepped = self._env.step(self._state)["next"]
+        with self._own_random_numbers():
+            stepped = self._env.step(self._state)["next"]
         self._state = step_mdp(self._state)
         reward = float(sum(stepped[key].sum() for key in self._env.reward_keys))
         terminated = bool(stepped["terminated"].any())
@@ -100,8 +124,8 @@ def _name(key: NestedKey) -> str:
     return key if isinstance(key, str) else "_".join(key)
 
 
-def _space(key: NestedKey, spec: TensorSpec) -> spaces.Space:
-    """Return the space of a leaf, without the batch dimension of size 1."""
+def _space(key: NestedKey, spec: TensorSpec, batch_dims: int) -> spaces.Space:
+    """Return the space of a leaf, without the batch dimensions, which are of size 1."""
     if isinstance(spec, MultiCategorical | MultiOneHot):
         return spaces.MultiDiscrete(torch.as_tensor(spec.nvec).flatten().numpy())
     if isinstance(spec, Binary):
@@ -110,17 +134,14 @@ def _space(key: NestedKey, spec: TensorSpec) -> spaces.Space:
         if isinstance(spec, Categorical) and spec.shape.numel() > 1:
             return spaces.MultiDiscrete(np.full(spec.shape.numel(), spec.space.n))
         return spaces.Discrete(int(spec.space.n))
-    if not isinstance(spec, Bounded | Unbounded):
-        raise SettingError(f"{_name(key)}: a {type(spec).__name__} spec has no space of Gymnasium")
-    shape = spec.shape
-    if shape[:1] == (1,) and len(shape) > 1:
-        shape = shape[1:]
-    if spec.dtype == torch.uint8:
-        return spaces.Box(0, 255, tuple(shape), np.uint8)
-    low, high = (np.full(shape, side, np.float32) for side in (-np.inf, np.inf))
+    shape = tuple(spec.shape[batch_dims:])
     if isinstance(spec, Bounded):
-        low, high = (side.cpu().numpy().astype(np.float32).reshape(shape) for side in (spec.space.low, spec.space.high))
-    return spaces.Box(low, high, dtype=np.float32)
+        low, high = (side.cpu().numpy().reshape(shape) for side in (spec.space.low, spec.space.high))
+        return spaces.Box(low, high, dtype=low.dtype)
+    if not isinstance(spec, Unbounded):
+        raise SettingError(f"{_name(key)}: a {type(spec).__name__} spec has no space of Gymnasium")
+    is_picture = spec.dtype == torch.uint8
+    return spaces.Box(0, 255, shape, np.uint8) if is_picture else spaces.Box(-np.inf, np.inf, shape, np.float32)
 
 
 def _time_limit(env: EnvBase) -> int | None:
