@@ -17,7 +17,6 @@ import hpamdp
 from hpamdp.config.errors import ConfigError
 from hpamdp.run import checkpoint, state_file
 from hpamdp.run.assemble import assemble
-from hpamdp.run.state_checks import example_steps
 from hpamdp.run.train import run
 from hpamdp.run.trainer import Trainer
 from hpamdp.run_files import DIVERGED_NAME
@@ -48,8 +47,7 @@ def changed(file, target, **parts):
 
 
 def load(file, parts):
-    steps = example_steps(parts.env, parts.policy)
-    return checkpoint.load(file, parts.agent, parts.device, with_training=True, steps=steps)
+    return checkpoint.load(file, parts.agent, parts.device, with_training=True)
 
 
 def refusal(file, parts) -> str:

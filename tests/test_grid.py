@@ -17,7 +17,6 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.shared.symmetry import RandomSymmetry
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
-from hpamdp.run.state_checks import example_steps
 from hpamdp.run.train import run
 
 # What makes a learner's training short; a learner that is not named needs nothing.
@@ -168,8 +167,7 @@ def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(
 
     other = make(high, low, tmp_path)
     torch.manual_seed(99)
-    steps = example_steps(other.env, other.policy)
-    saved = checkpoint.load(file, other.agent, other.device, with_training=True, steps=steps)
+    saved = checkpoint.load(file, other.agent, other.device, with_training=True)
     other.env.set_env_state(saved.states["collection"]["env"])
     assert checkpoint.progress_of(file) == progress
     results = []

@@ -1,12 +1,10 @@
-"""A checkpoint of another form, or with weights that are not finite, is refused in one line and changes nothing."""
+"""A checkpoint of another agent is refused in one line, and changes nothing of the agent."""
 
 import copy
-import math
 
 import pytest
 import torch
-from conftest import TRAINED, compose_config, make_config, parts_of
-from test_grid import SHORT
+from conftest import compose_config, make_config, parts_of
 from torchrl.data import ReplayBuffer
 
 from hpamdp.config.errors import ConfigError
@@ -48,8 +46,7 @@ class Opener:
             self.trainer.restore(self.file)
             self.trainer.restore_collection(self.collection)
         except ConfigError:
-            if not {*changed} & {"collection", "recorder"}:  # which are checked after the agent is complete
-                assert not [part for part in self.replays() if len(part)]
+            assert not [part for part in self.replays() if len(part)]
             raise
         finally:
             for part in self.replays():
@@ -78,125 +75,26 @@ def same(one, other) -> bool:
     return one == other
 
 
-def leaves(state, place=()):
-    """Yield the place of every entry of nested dictionaries and lists."""
-    entries = state.items() if isinstance(state, dict) else enumerate(state) if isinstance(state, list | tuple) else ()
-    for name, value in list(entries)[:40]:  # a generator has 625 numbers
-        yield (*place, name)
-        yield from leaves(value, (*place, name))
-
-
-GONE = object()
-ADDED_LATER = ("practice", "own_steps", "log_max_scale", "is_open", "open.value")
+def tensors(state, place=()):
+    """Yield the place and the value of every tensor in nested dictionaries."""
+    for name, value in state.items() if isinstance(state, dict) else ():
+        if torch.is_tensor(value):
+            yield (*place, name), value
+        yield from tensors(value, (*place, name))
 
 
 def put(state, place, value):
-    """Return nested values with another one at a place."""
+    """Return nested dictionaries with another value at a place."""
     name, *rest = place
-    if isinstance(state, tuple):
-        return tuple(put(list(state), place, value))
-    state = copy.copy(state)
-    if rest:
-        state[name] = put(state[name], rest, value)
-    elif value is GONE:
-        del state[name]
-    else:
-        state[name] = value
-    return state
-
-
-def get(state, place):
-    for name in place:
-        state = state[name]
-    return state
+    return {**state, name: put(state[name], rest, value) if rest else value}
 
 
 def mutations(value):
-    """Yield other values with the name of the change."""
-    yield "gone", GONE
-    yield "None", None if value is not None else "text"
-    yield "text", "text" if value != "text" else 1
-    yield "list", [[value]]
-    if torch.is_tensor(value):
-        yield "shape", torch.cat([value.reshape(-1), value.new_zeros(1)])
-        yield "dim", value.unsqueeze(0)
-        yield "dtype", value.to(torch.complex64 if value.dtype != torch.bool else torch.int64)
-        yield "other", value.to(torch.float64 if value.dtype != torch.float64 else torch.int16)
-        if value.is_floating_point() and value.numel():
-            yield "nan", torch.full_like(value, math.nan)
-            yield "inf", torch.full_like(value, math.inf)
-        elif value.dtype in (torch.int32, torch.int64) and value.numel():
-            yield "negative", torch.full_like(value, -(2**30))
-            yield "huge", torch.full_like(value, torch.iinfo(value.dtype).max)
-    elif isinstance(value, float):
-        yield "nan", math.nan
-        yield "negative", -1.0
-    elif type(value) is int:
-        yield "negative", -1
-        yield "huge", 10**30
-    elif isinstance(value, dict | list | tuple):
-        yield "empty", type(value)()
-
-
-# Settings of optimizers that say only how a step is computed.
-EXECUTION = ("foreach", "fused", "capturable", "differentiable")
-
-
-def is_harmless(place, change):
-    """Return whether a file with the change can be resumed: it lacks what it may lack, or could be another run's."""
-    if (change == "gone" and str(place[-1]).endswith(ADDED_LATER)) or place[-1] in EXECUTION:
-        return True
-    if place[0] == "state" and "step" not in place:  # of an optimizer, some of whose weights had no gradient yet
-        return change in ("gone", "empty") and len(place) < 3
-    if place[0] == "param_groups" and len(place) == 3 and place[-1] not in ("lr", "weight_decay"):
-        return change == "gone"
-    if change in ("negative", "huge") or (
-        place[0] == "coming" and change in ("inf", "nan")
-    ):  # numbers of the right form
-        return True
-    if place[0] == "root" and len(place) > 1:  # counters, and what the next action replaces
-        return change in ("gone", "inf", "nan")
-    optional = {
-        "held",
-        "scalars",
-        "own",
-        "ranges",
-        "config_dirs",
-        "ended",
-        "option_names",
-        "last_score",
-        "rows",
-        "env",
-        "frames",
-        "cpu_s",
-        "wall_s",
-    }
-    return bool({*place} & {*optional, "episode", "steps", "presses", "pending", "has_gauss"}) or change == "empty"
-
-
-def assert_all_refused(opener, step=1):
-    opener.resume()
-    before = opener.all_of_agent()
-    accepted = []
-    cases = [
-        (name, place, change, value)
-        for name, state in opener.states.items()
-        for place in leaves(state)
-        if "config" not in place and not any(str(part).endswith("_extra_state") for part in place)
-        for change, value in mutations(get(state, place))
-    ]
-    for name, place, change, value in cases[::step]:
-        try:
-            opener.resume(**{name: put(opener.states[name], place, value)})
-        except ConfigError as error:
-            assert "\n" not in str(error), (name, place, change)
-            assert len(str(error)) < 600, (name, place, change)
-            assert same(opener.all_of_agent(), before), (name, place, change)
-        else:
-            accepted.append((name, place, change))
-            assert is_harmless(place, change), (name, place, change)
-            opener.resume()
-    return accepted
+    """Yield values of other types and shapes."""
+    yield "text"
+    yield torch.cat([value.reshape(-1), value.new_zeros(1)])
+    yield value.unsqueeze(0)
+    yield value.to(torch.complex64 if value.dtype != torch.bool else torch.int64)
 
 
 @pytest.fixture(scope="module")
@@ -204,23 +102,19 @@ def opener(tmp_path_factory):
     return Opener([*TINY, *BOTH], tmp_path_factory.mktemp("run") / "both")
 
 
-def test_other_contents_are_refused_in_one_line_and_change_nothing(opener):
-    assert_all_refused(opener, step=97)
-
-
-KINDS = [
-    ["low=qpamdp", "high=linucb"],
-    ["low=pets", "high=exp3"],
-    ["low=hyar", "high=option_critic", "high.warmup_steps=16"],
-]
-OTHERS = [[f"low={low}", "high=ucb"] for low in TRAINED]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("words", [BOTH, *KINDS, *OTHERS], ids="-".join)
-def test_other_contents_of_every_learner_are_refused(words, tmp_path):
-    short = SHORT.get(words[0].removeprefix("low="), [])
-    assert_all_refused(Opener([*TINY, *words, *short], tmp_path / "run"), step=5)
+def test_other_types_and_shapes_are_refused_in_one_line_and_change_nothing(opener):
+    before = opener.all_of_agent()
+    cases = [
+        (name, place, other)
+        for name in before
+        for place, value in tensors(opener.states[name])
+        for other in mutations(value)
+    ]
+    for name, place, other in cases[::23]:
+        with pytest.raises(ConfigError) as error:
+            opener.resume(**{name: put(opener.states[name], place, other)})
+        assert "\n" not in str(error.value) and len(str(error.value)) < 600, (name, place)
+        assert same(opener.all_of_agent(), before), (name, place)
 
 
 def test_weights_in_half_precision_are_read(opener):

@@ -189,7 +189,7 @@ def step_rows(critic: OptionCritic) -> TensorDict:
         keys.OPTION_ENDED: torch.tensor([[True], [False], [False]]),
     }
     rows = TensorDict({keys.OBSERVATION: state[:3], keys.OPTION: torch.tensor([0, 1, 1]), "next": after}, [3])
-    return critic.replay_rows(rows)["buffer"]
+    return critic.rows(rows)
 
 
 @pytest.mark.parametrize("decides", [True, False])

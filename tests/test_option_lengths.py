@@ -31,7 +31,6 @@ from hpamdp.policies.high_level.actor import ALLOWED, LOG_PROB, WEIGHT, Actor
 from hpamdp.policies.high_level.meta_critic import MetaCritic
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.run.assemble import assemble
-from hpamdp.run.collection.single import SingleCollection
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.train import run
 from hpamdp.specs import PAMDPSpecs
@@ -325,19 +324,6 @@ def test_a_run_that_chooses_lengths_resumes_to_the_last_bit(high, low, tmp_path,
 def test_workers_choose_lengths_and_resume_to_the_last_bit(ahead, quick_workers, tmp_path, monkeypatch):
     given = [*words_of("meta_critic", "hppo"), *RESUMED, "collector=multi", f"collector.ahead={str(ahead).lower()}"]
     stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
-
-
-def test_a_checkpoint_with_another_length_is_refused():
-    config = make_config(words_of("meta_critic", "random"))
-    parts = assemble(config)
-    collection = SingleCollection(config, parts)
-    collection.next()
-    state = collection.state()
-    collection.set_state(state)
-    state["root"][keys.OPTION_LENGTH][0] = 3
-    with pytest.raises(ValueError, match=r"root: option_length holds \[.*3.*\], but must be of \[1, 2, 4\]"):
-        collection.set_state(state)
-    collection.close()
 
 
 def test_an_agent_holds_options_for_the_chosen_steps_where_python_asks_step_by_step(tmp_path):

@@ -77,7 +77,7 @@ def test_the_targets_of_the_meta_critic_are_those_of_semi_mdp_q_learning():
         for layer in critic.target_critics.layers:
             layer.bias.normal_()
     decisions = mid_episode(critic)
-    rows = critic.replay_rows(decisions)["buffer"]
+    rows = critic.rows(decisions)
     torch.testing.assert_close(rows["discount"], torch.tensor([0.9**3, 0.0, 0.0]))
     torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.2, 0.3]]))
     q = critic.critics(rows["state"])[0].detach()
@@ -90,7 +90,7 @@ def test_the_targets_of_the_meta_critic_are_those_of_semi_mdp_q_learning():
 
 def test_only_the_chosen_option_has_a_target():
     critic = make(MetaCritic, num_members=1)
-    rows = critic.replay_rows(mid_episode(critic).set(keys.OPTION, torch.ones(3, dtype=torch.long)))["buffer"]
+    rows = critic.rows(mid_episode(critic).set(keys.OPTION, torch.ones(3, dtype=torch.long)))
     critic.update_critics(rows)
     gradient = critic.critics.layers[-1].bias.grad[0, 0]
     assert gradient[0] == 0.0 and gradient[1] != 0.0

@@ -568,24 +568,6 @@ class HierarchicalAgent(nn.Module):
         owners |= {f"exploration{i}": exploration for i, exploration in enumerate(self._explorations())}
         return {f"{owner}_{name}": part for owner, module in owners.items() for name, part in module.stateful().items()}
 
-    @torch.no_grad()
-    def replay_rows(self, name: str, steps: TensorDictBase) -> TensorDictBase | None:
-        """Return the rows `[N]` that a replay buffer would store of some steps; None if its owner declares none.
-
-        Args:
-            name: the buffer's name in `stateful`.
-            steps: steps of the environments `[N]`, with the entries that the policy writes.
-        """
-        batch = steps.unsqueeze(-1)
-        if self.next_options is not None:
-            batch = self.next_options.with_ends(batch)
-        owner, _, part = name.partition("_")
-        if owner == "selector":
-            assert self.selector is not None
-            return self.selector.replay_rows(self._seen_by_selector(batch)).get(part)
-        views = {f"learner{i}": view for i, view in enumerate(self._views(batch))}
-        return views[owner].learner.replay_rows(views[owner].batch).get(part) if owner in views else None
-
     def exported(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to act greedily; None if a part cannot be exported.
 

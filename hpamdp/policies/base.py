@@ -201,7 +201,7 @@ class Level:
         """Return what a checkpoint must hold besides parameters and buffers, by name.
 
         Each value is an optimizer, a TorchRL `ReplayBuffer`, or has a `state_dict` of tensors, numbers and text, with
-        constant names and shapes. If one is a replay buffer, override `replay_rows`, too.
+        constant names and shapes.
         """
         return {}
 
@@ -211,14 +211,6 @@ class Level:
         By default the optimizers in `stateful` decide. Override it for learning without an optimizer.
         """
         return have_stepped(self.stateful())
-
-    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return the rows `[N]` that each replay buffer of `stateful` would store of a collected batch `[*B, T]`.
-
-        The rows of a checkpoint must have the same names, shapes and dtypes. If a buffer has no entry here, its saved
-        rows are not compared.
-        """
-        return {}
 
     def exported(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to act greedily; None if it cannot be exported.

@@ -11,17 +11,15 @@ full capacity. It also moves the old file away before the new one is in place.
 from __future__ import annotations
 
 import os
-import random
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
-from pydantic import Field, FiniteFloat
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import ReplayBuffer
@@ -35,15 +33,11 @@ from hpamdp.policies.base import Learner, added_later
 from hpamdp.policies.shared.on_policy import WAITING
 from hpamdp.run import state_file
 from hpamdp.run.state_checks import (
-    Count,
     Progress,
-    SavedPart,
     buffers_sized_by_data,
     check_form,
-    check_generator,
     check_like,
     check_names,
-    check_values,
     checked,
     checked_optimizer,
 )
@@ -51,7 +45,6 @@ from hpamdp.run_files import CHECKPOINT_NAME as FILE_NAME
 from hpamdp.run_files import OLD_NAMES, POLICY_NAME, is_saved_agent
 
 FORMAT = 3
-_CUDA_STATE_BYTES = 16
 # Parts of a run that a checkpoint holds beside the agent.
 STATES = ("collection", "recorder", "callbacks")
 _OLD = "a zip archive; if it is a checkpoint of version 0.3, experiments/convert_checkpoints.py converts it"
@@ -111,13 +104,13 @@ class Saved:
         file: the checkpoint.
         progress: the JSON values of `save`.
         states: the states of the other parts of the run, by name, as for `save`.
-        generators: the states of the random generators, for `set_generators`; None without training.
+        generators: the states of the random generators, for `set_generators`; empty without training.
     """
 
     file: Path
     progress: dict[str, Any]
     states: dict[str, dict[str, Any]]
-    generators: Generators | None
+    generators: dict[str, Any]
 
     def set_statistics(self, env: PAMDPEnv) -> None:
         """Make an environment scale its observations as in the saved run.
@@ -233,18 +226,16 @@ def load(
     device: torch.device,
     *,
     with_training: bool,
-    steps: TensorDictBase | None = None,
 ) -> Saved:
     """Fill the agent from a checkpoint, and its optimizers and replay if training continues.
 
-    Nothing is changed before the whole file has been read and checked. `set_generators` restores the random generators.
+    Nothing is changed before the whole file has been read. `set_generators` restores the random generators.
 
     Args:
         file: the checkpoint.
         agent: the agent to fill.
         device: the agent's device.
         with_training: whether training continues.
-        steps: see `HierarchicalAgent.replay_rows`; required with training.
 
     Raises:
         ConfigError: the checkpoint is damaged or of another agent.
@@ -264,14 +255,14 @@ def load(
         for name in opened.names & stateful.keys():
             saved = opened.part(name, device)
             if name in buffers:
-                assert steps is not None
-                loaded[name] = _state_for_replay(name, stateful[name], saved, agent.replay_rows(name, steps))
+                num = min(saved["write_count"], stateful[name]._storage.max_size)
+                loaded[name] = {"rows": TensorDict(saved["rows"], [num]), "write_count": saved["write_count"]}
             else:
                 loaded[name] = _state_for_other(name, stateful[name], saved)
     names = STATES if with_training else STATES[:1]
     with _explained(_damage_of(file)):
         states = {name: _by_name(opened.part(name, device)) for name in names if name in opened.names}
-        generators = Generators.of(opened.part("rng")) if with_training else None
+        generators = _by_name(opened.part("rng")) if with_training else {}
     agent.load_state_dict({**agent.state_dict(), **networks})
     for name, part in stateful.items():
         if name not in loaded:
@@ -355,8 +346,8 @@ def _state_for(module: nn.Module, saved: Any, file: Path, *, may_lack: str = "")
             lacks them, too.
 
     Raises:
-        ValueError: the state is of another module, or holds invalid numbers.
-        ConfigError: the state holds NaN or inf.
+        ValueError: the state is of another module.
+        ConfigError: the state holds NaN or inf, as that of a run that diverged.
     """
     saved, later, any_size = _by_name(saved), added_later(module), buffers_sized_by_data(module)
     own = {
@@ -365,18 +356,14 @@ def _state_for(module: nn.Module, saved: Any, file: Path, *, may_lack: str = "")
         if key in saved or not (key in later or (may_lack and key.startswith(may_lack)))
     }
     state = dict(check_names(saved, own))
-    first: dict[int, Tensor] = {}  # shared weights occur several times
     for key, value in own.items():
         if not isinstance(value, Tensor):
             continue
         check_form(key, state[key], value, any_size=id(value) in any_size)
         tensor = state[key] = state[key].to(value.dtype)
-        try:
-            check_values(key, tensor, value)
-        except ValueError as error:
-            raise ConfigError(f"{file}: {error}; take an earlier checkpoint") from error
-        if not torch.equal(first.setdefault(id(value), tensor), tensor):
-            raise ValueError(f"{key} differs from another name of the same weights")
+        for what, is_wrong in (("NaN", torch.isnan), ("inf", torch.isinf)):
+            if is_wrong(tensor).any() and not is_wrong(value).any():
+                raise ConfigError(f"{file}: {key} holds {what}; take an earlier checkpoint")
     return state
 
 
@@ -384,7 +371,7 @@ def _state_for_other(name: str, part: Any, saved: Any) -> dict[str, Any]:
     """Return a state dict for a part of `stateful` other than a replay buffer.
 
     Raises:
-        ValueError: the state is of another part, or holds invalid numbers.
+        ValueError: the state is of another part.
     """
     if isinstance(part, torch.optim.Optimizer):
         return checked_optimizer(name, saved, part)
@@ -392,35 +379,10 @@ def _state_for_other(name: str, part: Any, saved: Any) -> dict[str, Any]:
     return _by_name(saved)
 
 
-class _ReplayState(SavedPart):
-    rows: dict[str, Any]
-    write_count: Count
-
-
 def _replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
     """Return the filled rows of a buffer, and how many rows have been written to it."""
     rows = buffer[:].to_dict() if len(buffer) else {}
     return {"rows": rows, "write_count": buffer._writer.state_dict()["_write_count"]}
-
-
-def _state_for_replay(name: str, buffer: ReplayBuffer, saved: Any, example: TensorDictBase | None) -> dict[str, Any]:
-    """Return the arguments with which `_fill` fills a replay buffer.
-
-    Args:
-        name: name of the buffer.
-        buffer: the buffer.
-        saved: the saved contents.
-        example: rows as the buffer holds them; None if its owner does not override `replay_rows`.
-
-    Raises:
-        ValueError: the contents are of another buffer.
-    """
-    state = checked(_ReplayState, saved)
-    num = min(state.write_count, buffer._storage.max_size)
-    rows = TensorDict(state.rows, [num])
-    if num and example is not None:
-        check_like(f"{name}.rows", rows.to_dict(), example.to_dict(), any_rows=True)
-    return {"rows": rows, "write_count": state.write_count}
 
 
 def _fill(buffer: ReplayBuffer, rows: TensorDict, write_count: int) -> None:
@@ -431,40 +393,9 @@ def _fill(buffer: ReplayBuffer, rows: TensorDict, write_count: int) -> None:
     buffer._writer.load_state_dict({"_cursor": cursor, "_write_count": write_count})
 
 
-Word = Annotated[int, Field(ge=0, lt=2**32)]
-PythonState = tuple[Literal[3], Annotated[tuple[Word, ...], Field(min_length=625, max_length=625)], FiniteFloat | None]
-NumpyState = tuple[Literal["MT19937"], Tensor, Annotated[int, Field(ge=0, le=624)], Literal[0, 1], FiniteFloat]
-
-
-class Generators(SavedPart):
-    """The states of the random generators of a process."""
-
-    python: PythonState
-    numpy: NumpyState
-    torch_cpu: Tensor
-    torch_cuda: list[Tensor] | None = None
-    torch_xpu: list[Tensor] | None = None
-    torch_mps: Tensor | None = None
-
-    @classmethod
-    def of(cls, saved: Any) -> Generators:
-        """Return the states, after a trial on generators that are used for nothing else.
-
-        Raises:
-            ValueError: a value is no state of a generator.
-        """
-        states = checked(cls, saved)
-        check_form("numpy", states.numpy[1], torch.empty(624, dtype=torch.int64))
-        random.Random().setstate(states.python)
-        check_generator(states.torch_cpu)
-        for state in states.torch_cuda or []:
-            check_form("torch_cuda", state, torch.empty(_CUDA_STATE_BYTES, dtype=torch.uint8))
-        return states
-
-
-def set_generators(generators: Generators) -> None:
+def set_generators(generators: Mapping[str, Any]) -> None:
     """Restore the random generators. Warn about missing devices and modules, and leave out their generators."""
-    states = {name: state for name, state in generators if state is not None}
+    states = dict(generators)
     for name in ("torch_cuda", "torch_xpu", "torch_mps"):
         module = name.removeprefix("torch_")
         if name in states and not getattr(torch, module).is_available():

@@ -24,7 +24,7 @@ from hpamdp.policies.base import Learner
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.loggers import EarlierRun, LenientLogger, Logger
-from hpamdp.run.state_checks import SavedPart, check_like, check_values, checked
+from hpamdp.run.state_checks import SavedPart, check_like, checked
 from hpamdp.run.summary import (
     EVALUATED_FRAMES,
     ONE_ACTION,
@@ -133,16 +133,12 @@ class Recorder:
         """Continue from a `state`.
 
         Raises:
-            ValueError: the state is of another environment, or holds invalid numbers.
+            ValueError: the state is of another environment.
         """
         saved = checked(_State, state)
         own = self._results(self.parts.env.fake_tensordict()).to_dict()
         for ended in saved.ended:
             check_like("ended", ended, own, any_rows=True)
-            if len({len(column) for column in ended.values()}) > 1:
-                raise ValueError("ended: columns of different lengths")
-            for name, column in ended.items():
-                check_values(f"ended.{name}", column, own[name])
         self._ended = [TensorDict(ended).auto_batch_size_(1) for ended in saved.ended]
         self._scalars = saved.scalars
         self._option_scores = saved.held

@@ -1,31 +1,22 @@
-"""Compare the contents of a checkpoint with a run before the run changes."""
+"""Compare names, types and shapes in a checkpoint with a run before the run changes.
+
+The values themselves are those that a run wrote, since the file's checksums are right.
+"""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeFloat, NonNegativeInt, ValidationError
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType
 
-from hpamdp import keys
-from hpamdp.acting import acting
-from hpamdp.messages import first_line
 from hpamdp.policies.shared.sized_by_data import SizedByData
 
-# A float holds all whole numbers up to this one exactly.
-_LARGEST_COUNT = 2**53
-Count = Annotated[int, Field(ge=0, le=_LARGEST_COUNT)]
-Amount = Annotated[FiniteFloat, Field(ge=0.0)]
 # Settings of an optimizer that training changes, and settings that choose between equivalent implementations.
 _SCHEDULED, _IMPLEMENTATION = ("lr", "weight_decay"), ("foreach", "fused", "capturable", "differentiable")
-_MOST_SCHEDULED = 1e6
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -44,12 +35,12 @@ class Progress(SavedPart):
     option_names: list[str]
     ranges: dict[str, list[float]] = Field(default_factory=dict)
     config_dirs: list[str] | None = None
-    frames: Count
-    wall_s: Amount
-    cpu_s: Amount
+    frames: NonNegativeInt
+    wall_s: NonNegativeFloat
+    cpu_s: NonNegativeFloat
     last_score: FiniteFloat | None
     evaluation_due: bool = False
-    eval_cpu_s: Amount = 0.0
+    eval_cpu_s: NonNegativeFloat = 0.0
 
 
 class _OptimizerState(SavedPart):
@@ -93,24 +84,6 @@ def check_form(where: str, saved: object, own: Tensor, *, any_size: bool = False
 
 def _form(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
-
-
-def check_values(where: str, value: Tensor, own: Tensor) -> None:
-    """Refuse NaN and inf, unless `own` has them, integers below both -1 and all of `own`, and integers above 2^53.
-
-    Raises:
-        ValueError: a number is invalid.
-    """
-    if value.is_floating_point():
-        if value.isnan().any() and not own.isnan().any():
-            raise ValueError(f"{where} holds NaN")
-        if value.isinf().any() and not own.isinf().any():
-            raise ValueError(f"{where} holds inf")
-    elif value.dtype != torch.bool and value.numel():
-        least = min(-1, int(own.min())) if own.numel() else -1
-        if not least <= int(value.min()) <= int(value.max()) <= _LARGEST_COUNT:
-            found = f"{int(value.min())} to {int(value.max())}"
-            raise ValueError(f"{where} holds {found}, but must be from {least} to {_LARGEST_COUNT}")
 
 
 def check_like(where: str, saved: Any, own: Any, *, any_rows: bool = False) -> None:
@@ -188,7 +161,7 @@ def checked_optimizer(where: str, saved: Any, optimizer: torch.optim.Optimizer) 
         optimizer: the optimizer.
 
     Raises:
-        ValueError: the state is of another optimizer, or holds invalid numbers.
+        ValueError: the state is of another optimizer.
     """
     own = _state_after_a_step(optimizer)
     state, groups = checked(_OptimizerState, saved), own["param_groups"]
@@ -198,7 +171,7 @@ def checked_optimizer(where: str, saved: Any, optimizer: torch.optim.Optimizer) 
         for name, value in group.items():
             found: Any = saved_group.get(name)
             if name in _SCHEDULED:
-                fits = type(found) in (int, float) and 0.0 <= found <= _MOST_SCHEDULED
+                fits = type(found) in (int, float)
                 group[name] = found
             else:
                 fits = found == value or name not in saved_group or name in _IMPLEMENTATION
@@ -206,34 +179,4 @@ def checked_optimizer(where: str, saved: Any, optimizer: torch.optim.Optimizer) 
                 raise ValueError(f"{where}.{name} is {found!r:.40}, but this run has {value!r}")
     for number, moments in state.state.items():
         check_like(f"{where}.{number}", moments, own["state"].get(number, {}))
-        for name, value in moments.items():
-            check_values(f"{where}.{number}.{name}", value, torch.zeros((), dtype=torch.float32))
     return {"state": state.state, "param_groups": groups}
-
-
-def check_generator(state: Tensor) -> None:
-    """Refuse a tensor that is not a state of torch's CPU generator.
-
-    Raises:
-        ValueError: the tensor is refused.
-    """
-    try:
-        torch.Generator().set_state(state.cpu())
-    except (TypeError, RuntimeError) as error:
-        raise ValueError(f"a random generator's state is wrong: {first_line(error)}") from error
-
-
-@torch.no_grad()
-def example_steps(env: EnvBase, policy: TensorDictModuleBase) -> TensorDictBase:
-    """Return steps `[N]` of a run as an example. Only their names, shapes and dtypes matter."""
-    steps = env.fake_tensordict()
-    for name in (keys.ACTION_MASK, keys.OPTION_MASK):
-        for mask in (steps.get(name, None), steps.get(("next", name), None)):
-            if mask is not None:
-                mask.fill_(True)
-    before = {name: buffer.clone() for name, buffer in policy.named_buffers()}
-    with acting(ExplorationType.DETERMINISTIC), torch.random.fork_rng():
-        steps = policy(steps)
-    for name, buffer in policy.named_buffers():
-        buffer.copy_(before[name])
-    return steps

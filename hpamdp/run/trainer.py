@@ -27,7 +27,7 @@ from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, metrics_of,
 from hpamdp.run.collection.base import Collection
 from hpamdp.run.folder import mark_unfinished, moved_aside
 from hpamdp.run.recorder import Recorder
-from hpamdp.run.state_checks import check_numbers, example_steps
+from hpamdp.run.state_checks import check_numbers
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
 from hpamdp.run.summary import KEPT_FRAMES, KEPT_SCORE
 from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME
@@ -100,9 +100,7 @@ class Trainer:
     def restore(self, source: Path) -> None:
         """Load the agent from a checkpoint, and the state of its run if training continues."""
         is_training = self.config.run.mode != "eval"
-        agent, env = self.parts.agent, self.parts.env
-        steps = example_steps(env, self.parts.policy) if is_training else None
-        saved = checkpoint.load(source, agent, self.parts.device, with_training=is_training, steps=steps)
+        saved = checkpoint.load(source, self.parts.agent, self.parts.device, with_training=is_training)
         progress = saved.progress
         self.frames = progress["frames"]
         self.wall_s = progress["wall_s"]
@@ -113,7 +111,7 @@ class Trainer:
             self._last_evaluation = f"score {self.last_score:.2f}"
         self.is_evaluation_due = progress.get("evaluation_due", False)
         if not is_training:
-            saved.set_statistics(env)
+            saved.set_statistics(self.parts.env)
             return
         self.resumed_from = source.parent
         # An evaluation that is due writes the row of these frames again.
@@ -272,7 +270,6 @@ class Trainer:
             collection.set_state(state)
         except (ValueError, RuntimeError, KeyError) as error:
             raise ConfigError(f"{self._saved.file}: {first_line(error)}") from error
-        assert generators is not None
         checkpoint.set_generators(generators)
 
     def _loop(self, collection: Collection, request: StopRequest) -> None:

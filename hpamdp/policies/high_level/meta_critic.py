@@ -75,14 +75,6 @@ class MetaCritic(RemembersDecisions):
         """Return the optimizer and the replay buffer."""
         return {"critics": self.optimizer, "buffer": self.buffer}
 
-    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return the rows that the buffer would store if every step of a batch `[*B, T]` ended an option."""
-        rows = self._rows(batch)
-        if self.links is not None:
-            rows["begins"] = self.begins(batch)
-            rows["previous"] = torch.zeros_like(rows["option"])
-        return {"buffer": packed_states(rows.flatten(), self.specs)}
-
     def exported(self) -> dict[str, Any] | None:
         """Return the critics, unless they see features: see `hpamdp.policies.shared.exported_policy`."""
         return exported_ensemble(self.critics) if self.perception.is_plain else None
@@ -132,7 +124,7 @@ class MetaCritic(RemembersDecisions):
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Store finished decisions `[N]` and, after the warm-up, make the updates that are due."""
-        return self._learn(self._rows(decisions))
+        return self._learn(self.rows(decisions))
 
     def learn_from_options(self, steps: TensorDictBase) -> dict[str, float]:
         """Do as `learn` does. With a recurrent memory, sequences need the decisions of each environment."""
@@ -141,7 +133,7 @@ class MetaCritic(RemembersDecisions):
             return super().learn_from_options(steps)
         begins = self.begins(steps)
         previous = self.links(begins, is_end, self.buffer.write_count)
-        rows = self._rows(steps[is_end])
+        rows = self.rows(steps[is_end])
         rows["begins"], rows["previous"] = begins[is_end], previous[is_end]
         return self._learn(rows)
 
@@ -157,7 +149,7 @@ class MetaCritic(RemembersDecisions):
 
     def add_demonstrations(self, decisions: TensorDictBase) -> None:
         """Store the decisions. They do not count for the warm-up or the decay of epsilon."""
-        self.buffer.extend(packed_states(self._rows(decisions), self.specs))
+        self.buffer.extend(packed_states(self.rows(decisions), self.specs))
 
     def update(self, num_updates: int) -> dict[str, float]:
         """Make updates from the stored decisions."""
@@ -171,7 +163,7 @@ class MetaCritic(RemembersDecisions):
         num_past = self.options.burn_in + self.options.sequence_length
         return unpacked_states(sample_with_past(self.buffer, size, num_past), self.specs)
 
-    def _rows(self, decisions: TensorDictBase) -> TensorDict:
+    def rows(self, decisions: TensorDictBase) -> TensorDict:
         """Return what is stored of decisions `[*B]`; states are features if `stores_features`, else observations."""
         after = decisions.get("next")
         rows = {

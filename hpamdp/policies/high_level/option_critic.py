@@ -86,10 +86,6 @@ class OptionCritic(RemembersDecisions):
         """Return the optimizers and the replay buffer."""
         return {**self.optimizers, "buffer": self.buffer}
 
-    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return the rows that the buffer would store of a batch `[*B, T]`."""
-        return {"buffer": self._rows(batch).flatten()}
-
     @property
     def epsilon(self) -> float:
         """Probability of a random option."""
@@ -129,7 +125,7 @@ class OptionCritic(RemembersDecisions):
 
     def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
         """Store the steps `[*B, T]` and, after the warm-up, make the updates that are due."""
-        rows = self._rows(batch).flatten()
+        rows = self.rows(batch).flatten()
         self.buffer.extend(rows)
         before = int(self.num_steps)
         now = before + len(rows)
@@ -146,7 +142,7 @@ class OptionCritic(RemembersDecisions):
         scalars = {name: torch.stack(values).mean().item() for name, values in history.items()}
         return {**scalars, "epsilon": self.epsilon}
 
-    def _rows(self, batch: TensorDictBase) -> TensorDict:
+    def rows(self, batch: TensorDictBase) -> TensorDict:
         """Return what is stored of a batch `[*B, T]`; states are features, `discount` is 0 where an episode ends."""
         after = batch.get("next")
         done = after.get(keys.DONE).squeeze(-1)

@@ -255,11 +255,6 @@ class ReplayLearner(Learner):
             rows["previous"] = self.links(begins, mask, self.buffer.write_count)
         return rows
 
-    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return the rows that the buffer would store of a batch `[*B, T]`."""
-        with self._storing_only(batch, torch.ones(batch.shape, dtype=torch.bool, device=self.frames.device)):
-            return {"buffer": self.buffer[:]}
-
     @contextmanager
     def _storing_only(self, batch: TensorDictBase, mask: Tensor) -> Iterator[None]:
         """Let the buffer hold only the transitions in `mask` of a batch `[*B, T]` while the block runs."""

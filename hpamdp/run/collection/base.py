@@ -8,13 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
-from hpamdp import keys
 from hpamdp.cards import CollectorCard
 from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.state_checks import SavedPart, check_generator, check_like, checked, example_steps
+from hpamdp.run.state_checks import SavedPart, check_like, checked
 
 
 class CollectionState(SavedPart):
@@ -37,7 +36,7 @@ def checked_state(saved: Any, parts: AssembledRun) -> CollectionState:
     """Check and return the state of a collection.
 
     Raises:
-        ValueError: the state is of another run, or holds invalid numbers.
+        ValueError: the state is of another run, or holds numbers that its environments do not take.
     """
     state, env = checked(CollectionState, saved), parts.env
     if state.env:
@@ -54,34 +53,7 @@ def checked_state(saved: Any, parts: AssembledRun) -> CollectionState:
         env.check_env_state(state.env)
         if env.keeps_episodes and state.root is None:
             raise ValueError("root is missing, from which the episodes in env continue")
-    for generator in state.generators:
-        check_generator(generator)
-    for name, steps in (("root", state.root), ("coming", state.coming)):
-        if steps is not None:
-            _check_steps(name, steps, example_steps(env, parts.policy), parts)
     return state
-
-
-def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, parts: AssembledRun) -> None:
-    """Refuse saved steps that cannot be steps `[N, *]` of the run.
-
-    Raises:
-        ValueError: an entry is wrong; the message names the first one.
-    """
-    if where == "coming":
-        next_steps = saved.get("next")
-        done = next_steps.get(keys.DONE) if isinstance(next_steps, Mapping) else None
-        if not isinstance(done, Tensor) or done.ndim != example.ndim + 2 or not done.numel():
-            raise ValueError(f"{where} is no batch")
-        example = example.unsqueeze(1).expand(len(example), done.shape[1])
-    else:
-        example = example.exclude("next")
-        if not {*parts.policy.out_keys} & {*TensorDict(saved).keys(include_nested=True)}:  # before the first step
-            example = example.exclude(*parts.policy.out_keys).filter_empty_()
-    own = example.to_dict()
-    if "collector" in saved:  # TorchRL's numbers of trajectories
-        own["collector"] = {"traj_ids": example.get(keys.DONE).squeeze(-1).long()}
-    check_like(where, saved, own)
 
 
 def random_seeds(seed: int, first_env: int, frames: int, restart: int = 0) -> tuple[int, int]:
