@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import importlib
 import os
 import sys
 import uuid
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import NoReturn
@@ -29,7 +27,6 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import explained, not_understood
 from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError
-from hpamdp.limits import limit_in
 from hpamdp.messages import (
     FAILED,
     INTERRUPTED,
@@ -56,8 +53,6 @@ _COMMANDS = {
 }
 # Errors that Hydra raises for a wrong command line or yaml file.
 _BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError)
-# Errors that no other setting can avoid: a full disk, limits of the process, a medium that is read only.
-_OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EROFS)
 
 
 def main() -> None:
@@ -81,8 +76,7 @@ def _main() -> None:
     warnings.filterwarnings("ignore", message="provider=hydra.searchpath")
     try:
         if sys.argv[1:2] and sys.argv[1] in _COMMANDS:
-            with _limits_explained():
-                sys.exit(_run_command(sys.argv[1], sys.argv[2:]))
+            sys.exit(_run_command(sys.argv[1], sys.argv[2:]))
         conf = conf_dir()
         line = parse(sys.argv[1:], conf)
         if line.flags["help"]:
@@ -101,26 +95,6 @@ def _main() -> None:
         sys.exit(FAILED)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-
-
-_NEEDS = {"files": "more open files, see ulimit -n", "memory": "more memory, see ulimit -v"}
-
-
-@contextmanager
-def _limits_explained() -> Iterator[None]:
-    """Exit with 1 and one line if the process runs out of files or memory, in whatever library."""
-    try:
-        yield
-    except ConfigError:
-        raise
-    except Exception as error:
-        cause: BaseException | None = error
-        while cause is not None:
-            limit = limit_in(cause)
-            if limit in _NEEDS:
-                _exit_with(f"{first_line(cause) or type(cause).__name__}: the program needs {_NEEDS[limit]}", FAILED)
-            cause = cause.__cause__ or cause.__context__
-        raise
 
 
 def _run_command(name: str, words: list[str]) -> int:
@@ -153,8 +127,7 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
     def job(cfg: DictConfig) -> float | None:
         nonlocal has_started
         has_started = True
-        with _limits_explained():
-            return _run_job(cfg, start)
+        return _run_job(cfg, start)
 
     protect_children()
     try:
@@ -168,8 +141,7 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
             raise ConfigError(f"hydra/launcher=submitit_slurm: {error}") from error
         # Once a job has started, such errors are not about the command line.
         if not has_started and isinstance(error, _BEFORE_A_JOB) and not isinstance(error, ConfigError):
-            is_mistake = not isinstance(error, OSError) or error.errno not in _OF_THE_MACHINE
-            _exit_with(explained(error, line, conf), MISTAKE if is_mistake else FAILED)
+            _exit_with(explained(error, line, conf))
         raise
     finally:
         unprotect_children()

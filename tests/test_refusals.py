@@ -15,7 +15,6 @@ from hpamdp.config.components import GROUPS, card_named
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
 from hpamdp.limits import is_about_memory
-from hpamdp.run import capacity
 from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.compatibility import check_effects_on, facts_of, settings_without_effect
@@ -32,8 +31,6 @@ REFUSED = [
     ("low=qpamdp collector=multi collector.ahead=true", "low=qpamdp learns from steps of its current policy"),
     # More than there is memory for.
     ("num_envs=1000000000", "num_envs=1000000000: must be less than or equal to 10000000 (conf/config.yaml"),
-    ("low=pdqn low.hidden_dims=[1000000,1000000]", "low.hidden_dims=[1000000, 1000000], low.buffer_size=500000:"),
-    ("low.buffer_size=10000000000", "low.buffer_size=10000000000: takes at least "),
     # Numbers out of all proportion.
     ("low=hppo low.lr=1e30", "low.lr=1e+30: must be above 0 and at most 1 (HPPO)"),
     ("exploration=held exploration.epsilon_final=0.5", "exploration: epsilon_final=0.5: must be at most epsilon=0.05"),
@@ -109,15 +106,6 @@ def test_a_project_name_that_wandb_refuses_is_reported_in_one_line(tmp_path):
     assert "\n" not in str(raised.value)
 
 
-def test_the_size_of_a_replay_buffer_is_compared_with_the_memory(monkeypatch):
-    config = read(config_of("low.buffer_size=1000000 low.warmup_steps=32"))
-    assemble(config)
-    monkeypatch.setattr(capacity, "total_memory", lambda device: 100_000_000)
-    line = r"^low.buffer_size=1000000: takes at least 0\.\d GB of memory, and there are 0\.1 GB$"
-    with pytest.raises(ConfigError, match=line):
-        assemble(config)
-
-
 @pytest.mark.parametrize(
     "error",
     [MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9")],
@@ -129,7 +117,7 @@ def test_memory_that_does_not_suffice_during_training_is_told_in_one_line(error,
     monkeypatch.setattr("hpamdp.run.trainer.Trainer.train", train)
     reason = rf" \({re.escape(str(error))}\)" if str(error) else ""
     with pytest.raises(
-        ConfigError, match=rf"^num_envs=4, .*eval\.layouts=4, .*: the run takes more memory than there is{reason}$"
+        ConfigError, match=rf"^num_envs=4, .*eval\.layouts=4.*: the run takes more memory than there is{reason}$"
     ):
         run(config_of("low=random"), tmp_path)
 

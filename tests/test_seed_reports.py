@@ -286,16 +286,6 @@ def test_a_run_whose_summary_contradicts_its_config_or_itself_is_left_out(tmp_pa
     ]
 
 
-def test_the_texts_of_a_table_are_no_formulas_and_have_no_control_characters(tmp_path):
-    names = ["=SUM(A1)", "+1", "-1", "@a", "a\x1b[31m\nb", "c"]
-    for seed, name in enumerate(names):
-        leave_run(tmp_path / "runs" / name, seed=seed, scores=(-float(seed),))
-    hpamdp.report(tmp_path / "runs", to=tmp_path / "runs")
-    rows = read_table(tmp_path / "runs")
-    assert {row["folder"] for row in rows} == {"'=SUM(A1)", "'+1", "'-1", "'@a", r"a\x1b[31m\nb", "c"}
-    assert "-5.0" in {row["eval/score"] for row in rows}, "numbers stay"
-
-
 # The command.
 
 

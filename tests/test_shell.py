@@ -223,28 +223,6 @@ def test_a_limit_of_the_size_of_files_is_a_full_disk(tmp_path, monkeypatch):
     assert (tmp_path / "out/checkpoint.safetensors").read_text() == "the one before"
 
 
-@pytest.mark.parametrize(
-    ("error", "line"),
-    [
-        (
-            ImportError("lib.so: cannot open shared object file: Too many open files"),
-            "more open files, see ulimit -n\n",
-        ),
-        (MemoryError(), "MemoryError: the program needs more memory, see ulimit -v\n"),
-    ],
-)
-def test_a_limit_of_the_process_is_reported_in_one_line_wherever_a_library_finds_it(command, monkeypatch, error, line):
-    def run(*_, **__):
-        try:
-            raise error
-        finally:
-            raise RuntimeError("what was learned could not be saved")  # as `Trainer.train` may
-
-    monkeypatch.setattr(train, "run", run)
-    code, _, err = command()
-    assert code == 1 and err.endswith(line) and err.count("\n") == 1
-
-
 def test_the_printed_command_continues_the_run_when_pasted(command, tmp_path, monkeypatch):
     folder = "my runs/lr=0.1,seed=[1] it's $5"
     small = ["high=fixed", "low=random", "num_envs=2", "steps_per_batch=2", "eval.layouts=2", "film=false"]

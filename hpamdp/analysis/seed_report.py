@@ -40,7 +40,6 @@ Compare runs by their means over seeds.
 DEFAULT_METRIC = "eval/score"
 TABLE_NAME, FIGURE_NAME = "report.csv", "report.png"
 _BEGINNING = b"configuration,folder,seed,state,"  # of a table
-_FORMULA = ("=", "+", "-", "@")  # how a formula of a spreadsheet begins
 # If more than _MANY configurations have one seed each, as the trials of a search do, only the highest are shown.
 _MANY, _MOST_TRIALS = 20, 10
 _LEAST_FOR_INTERVAL = 5  # seeds
@@ -150,11 +149,11 @@ class Report:
     def _run_rows(self, folder: Path) -> list[dict[str, Any]]:
         return [
             {
-                "configuration": _as_cell(each.name),
-                "folder": _as_cell(os.path.relpath(run.folder, folder)),
+                "configuration": each.name,
+                "folder": os.path.relpath(run.folder, folder),
                 "seed": run.seed,
                 "state": run.state,
-                _as_cell(self.metric): run.value,
+                self.metric: run.value,
                 **{name: run.effort(name) for name in ("frames", "wall_s", "cpu_s")},
             }
             for each in self.configurations
@@ -195,15 +194,6 @@ def _is_of_a_report(path: Path) -> bool:
     except OSError:
         return False
     return beginning.startswith(_BEGINNING) if path.name == TABLE_NAME else SOFTWARE.encode() in beginning
-
-
-def _as_cell(text: str) -> str:
-    """Return a text for a table, with escapes for control characters.
-
-    An apostrophe comes first if a spreadsheet would take the text for a formula.
-    """
-    shown = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
-    return f"'{shown}" if shown.startswith(_FORMULA) else shown
 
 
 def _row(configuration: Configuration) -> dict[str, Any]:

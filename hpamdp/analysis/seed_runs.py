@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import json
+import math
 import os
 import re
 from collections import defaultdict
@@ -16,13 +16,12 @@ import numpy as np
 
 from hpamdp.complaints import as_json
 from hpamdp.env.facts import NAMING_SETTINGS
-from hpamdp.messages import one_line, reason_of, warn
-from hpamdp.metrics_file import EVALUATION, read_curve
+from hpamdp.messages import one_line, warn
+from hpamdp.metrics_file import EVALUATION, FRAMES, read_rows
 from hpamdp.run_files import (
     CONFIG_NAME,
     DIVERGED_NAME,
     ERROR_NAME,
-    MAX_TEXT_BYTES,
     METRICS_NAME,
     SUMMARY_NAME,
     TENSORBOARD_NAME,
@@ -166,7 +165,8 @@ def _read(folder: Path, metric: str) -> SeedRun | None:
     if fault is not None:
         warn(one_line(f"{folder}: {fault}, left out"))
         return None
-    columns, points = _read_points(folder / METRICS_NAME, metric)
+    rows = read_rows(folder / METRICS_NAME)  # none in the folder of an evaluation
+    points = np.array(sorted((row[FRAMES], row.get(metric, math.nan)) for row in rows if FRAMES in row)).reshape(-1, 2)
     if summary.get(FINISHED):
         state = FINISHED
     else:
@@ -176,22 +176,9 @@ def _read(folder: Path, metric: str) -> SeedRun | None:
     curve = points[(np.abs(points) <= _LARGEST).all(1)]
     measured = {f"{EVALUATION}{name}" for name in summary.keys() - _NO_METRICS if finite(summary[name]) is not None}
     settings = {name: json.dumps(value, default=str, skipkeys=True) for name, value in flat_settings(config).items()}
-    return SeedRun(folder, state, settings, value, curve, summary, frozenset({*columns, *measured}))
-
-
-def _read_points(path: Path, metric: str) -> tuple[list[str], np.ndarray]:
-    """Return the names of the columns and the rows of frames and value, by frames; a missing value is NaN."""
-    columns: list[str] = []
-    points: list[tuple[float, float]] = []
-    try:
-        columns, points = read_curve(path, metric, MAX_TEXT_BYTES)
-    except FileNotFoundError:  # as in the folder of an evaluation
-        pass
-    except (OSError, csv.Error) as error:
-        warn(f"{one_line(path)}: {reason_of(error)}; its curve is left out")
-    rows = np.array(points, dtype=float).reshape(-1, 2)
-    rows = rows[np.abs(rows[:, 0]) <= _LARGEST]
-    return columns, rows[np.argsort(rows[:, 0], kind="stable")]
+    return SeedRun(
+        folder, state, settings, value, curve, summary, frozenset({*measured, *(name for row in rows for name in row)})
+    )
 
 
 def _final(summary: Mapping[str, Any], points: np.ndarray, metric: str) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -26,7 +25,7 @@ from hpamdp.config.schema import RESUME_AUTO, Config, RunConfig
 from hpamdp.env.errors import closed_on_error
 from hpamdp.env.facts import NAMING_SETTINGS
 from hpamdp.messages import as_code, reason_of, say, warn
-from hpamdp.metrics_file import read_rows, what_is_lost
+from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import Callback
 from hpamdp.run.capacity import memory_errors_explained
@@ -103,7 +102,6 @@ def train(
     if goes_on:
         settings = {**settings, "resume": None}
     with _torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
-        stack.enter_context(_warned_if_concurrent())
         with own_hydra(), composed(*_given(problem, settings, config_dirs)) as cfg:
             words = job_overrides()
             check_no_sweep(cfg, words)
@@ -172,8 +170,8 @@ def _given(
     words = [*searching(config_dirs), *problem.words, *choices]
     if settings.get("resume") is not None:
         resumed, trust = str(settings["resume"]), ["trust=true"] if settings.get("trust") is True else []
-        _check_shared_names(checkpoint.find(resumed, "resume"), words)
         words = [*saved_words(resumed, "resume", [*words, *trust]), *words]
+        _check_shared_names(checkpoint.find(resumed, "resume"), words)
         if not problem.words and not problem.objects:
             _check_problem(checkpoint.find(resumed, "resume"), [*settings, *dict(problem.settings)], "resume")
     return words, problem.with_settings(own)
@@ -199,22 +197,6 @@ def _checked_callbacks(given: Any) -> list[Callback]:
         raise ConfigError(f"callbacks={as_code(given)}: must be a list of objects of subclasses of hpamdp.Callback")
     check_callbacks(callbacks)
     return [*callbacks]
-
-
-_running = threading.Lock()  # held while a training of this process runs
-
-
-@contextmanager
-def _warned_if_concurrent() -> Iterator[None]:
-    """Warn if another training runs in this process."""
-    is_first = _running.acquire(blocking=False)
-    if not is_first:
-        warn("another training runs in this process; they share torch's random numbers, so no seed repeats them")
-    try:
-        yield
-    finally:
-        if is_first:
-            _running.release()
 
 
 @contextmanager
@@ -321,13 +303,7 @@ def _loaded(file: Path, words: Sequence[str], settings: Sequence[tuple[str, Any]
     with _torch_restored(), problems_explained():
         loaded = load_agent(str(file), words, settings, objects, where="agent")
     with closed_on_error(loaded.env):
-        metrics = file.parent / METRICS_NAME
-        rows, run = read_rows(metrics), loaded.config.run
-        batch = run.num_envs * run.steps_per_batch
-        lost = what_is_lost(rows, metrics, loaded.progress.get("frames", 0), run.log_every, batch)
-        if lost and os.path.lexists(metrics):  # a saved file may have been moved without it
-            warn(f"{lost}, and history lacks them")
-        return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, rows)
+        return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, read_rows(file.parent / METRICS_NAME))
 
 
 def _finished_agent(config: Config, folder: Path, problem: Problem, config_dirs: Sequence[str | Path]) -> Agent:

@@ -18,9 +18,7 @@ from typing import Any, TypeAlias, get_type_hints
 from pydantic import BaseModel, ConfigDict, PydanticUserError, create_model
 
 from hpamdp import cards
-from hpamdp.complaints import as_json
 from hpamdp.config.errors import ConfigError, validated
-from hpamdp.limits import is_about_memory
 from hpamdp.messages import first_line
 from hpamdp.settings import SettingError, Settings
 
@@ -133,7 +131,7 @@ class Component:
             context: objects that the program supplies. The constructor gets those among its arguments.
 
         Raises:
-            ConfigError: the constructor raises a `SettingError`, or memory does not suffice.
+            ConfigError: the constructor raises a `SettingError`.
         """
         cls = self.cls
         if cls is None:
@@ -146,21 +144,10 @@ class Component:
         except SettingError as error:
             what, name = first_line(error), self.class_name
             raise ConfigError(f"{self.group}: {what}" if name in what else f"{self.group}: {what} ({name})") from error
-        except Exception as error:
-            if not is_about_memory(error):
-                raise
-            num_envs = f"num_envs={context['num_envs']}, " if "num_envs" in supplied else ""
-            raise ConfigError(f"{num_envs}{self.largest_sizes()}: takes more memory than there is") from error
 
     def build_for_entry(self, entry: Any) -> Any:
         """Build an encoder for an entry of the observation; as `build`."""
         return self.build(entry=entry)
-
-    def largest_sizes(self) -> str:
-        """Return the settings that may have made this component too large, as text."""
-        sizes = {name: value for name, value in self.settings.items() if _is_size(value)}
-        largest = sorted(sizes, key=lambda name: _size(sizes[name]))[-2:]
-        return ", ".join(f"{self.group}.{name}={as_json(sizes[name])}" for name in reversed(largest)) or str(self)
 
 
 def component(
@@ -375,12 +362,3 @@ def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
 def file_of(group: str, name: str) -> str:
     """Return the path of a choice's yaml file for messages."""
     return f"conf/{group}/{name}.yaml"
-
-
-def _is_size(value: Any) -> bool:
-    numbers = value if isinstance(value, list | tuple) else [value]
-    return bool(numbers) and all(isinstance(number, int) and not isinstance(number, bool) for number in numbers)
-
-
-def _size(value: Any) -> int:
-    return max(value) if isinstance(value, list | tuple) else value

@@ -93,7 +93,6 @@ def _assemble(config: Config, env: PAMDPEnv, device: torch.device) -> AssembledR
     run = config.run
     check_built(config, env)
     specs = PAMDPSpecs.from_env(env)
-    capacity.check_buffers(config, specs, learners_of(config, specs), device)
     agent = make_agent(config, specs, device)
     if run.mode != "eval":
         set_up_updates(config, agent)

@@ -18,8 +18,7 @@ from hpamdp import keys
 from hpamdp.analysis import figures, film
 from hpamdp.config.schema import Config
 from hpamdp.files import replacing
-from hpamdp.messages import warn
-from hpamdp.metrics_file import CPU_SECONDS, FRAMES, WALL_SECONDS, Metrics, rows_up_to, what_is_lost
+from hpamdp.metrics_file import CPU_SECONDS, FRAMES, WALL_SECONDS, Metrics, rows_up_to
 from hpamdp.policies.base import Learner
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
@@ -87,21 +86,10 @@ class Recorder:
         random = random_agent(parts.agent.specs, parts.device, parts.agent.option_lengths)
         self._random_scores = parts.evaluation.measure(parts.evaluation.run(random.policy))
 
-    def resume_from(self, folder: Path, frames: int, log_every: int) -> None:
-        """Start the metrics with the rows of the run in `folder`, up to `frames`; warn if some are lost.
-
-        Args:
-            folder: the folder of the resumed run.
-            frames: frames of its checkpoint.
-            log_every: largest distance of two of its rows, beside the length of a batch; 0 if unknown.
-        """
-        source = folder / METRICS_NAME
-        self.metrics = Metrics(self.metrics.path, rows_up_to(frames, source))
+    def resume_from(self, folder: Path, frames: int) -> None:
+        """Start the metrics with the rows of the run in `folder`, up to `frames`."""
+        self.metrics = Metrics(self.metrics.path, rows_up_to(frames, folder / METRICS_NAME))
         self._resumed_from = folder
-        batch = self.config.run.num_envs * self.config.run.steps_per_batch
-        lost = what_is_lost(self.metrics.rows(), source, frames, log_every, batch)
-        if lost:
-            warn(f"{lost}; the run goes on, and its next rows begin after {FRAMES}={frames}")
 
     def start(self) -> None:
         """Start the logger, if the run has a folder. It takes over the rows of a resumed run.

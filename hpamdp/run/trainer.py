@@ -116,9 +116,7 @@ class Trainer:
         self.resumed_from = source.parent
         # An evaluation that is due writes the row of these frames again.
         frames = self.frames - 1 if self.is_evaluation_due else self.frames
-        both = self.config.run.log_every, progress["config"].get("log_every")
-        log_every = max(both) if all(type(every) is int and every > 0 for every in both) else 0
-        self.recorder.resume_from(source.parent, frames, log_every)
+        self.recorder.resume_from(source.parent, frames)
         try:
             self.recorder.set_state(saved.states["recorder"])
             self._restore_callbacks(saved.states["callbacks"])
