@@ -8,12 +8,9 @@ from __future__ import annotations
 import errno
 import glob
 import os
-import re
 import secrets
-import socket
 import stat
 import time
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -27,7 +24,7 @@ _KINDS = {
     stat.S_IFLNK: "is a link",
 }
 
-_ABANDONED_S = 3600.0  # after which nobody still writes to a file; on other hosts, no process can be asked
+_ABANDONED_S = 3600.0  # after which nobody still writes to a file
 
 
 @contextmanager
@@ -37,8 +34,7 @@ def replacing(path: Path) -> Iterator[Path]:
     The new file has the same ending, is flushed to the disk, and is renamed in one step. If the block fails, or is
     killed, `path` stays as it was. If `path` is a link, the link is replaced, not the file that it leads to.
 
-    Files that a killed process left beside `path` are removed. If that process ran on another host, they are removed
-    after an hour.
+    Files that a killed process left beside `path` are removed after an hour.
 
     Raises:
         OSError: the disk is full, or `path` is a folder, a pipe, a socket or a device. Or the folder around it is gone
@@ -51,9 +47,9 @@ def replacing(path: Path) -> Iterator[Path]:
     start = f".{path.name[:40]}."
     for leftover in path.parent.glob(f"{glob.escape(start)}*.partial{glob.escape(path.suffix)}"):
         with suppress(OSError):
-            if _is_abandoned(leftover, start):
+            if time.time() - leftover.stat().st_mtime > _ABANDONED_S:
                 leftover.unlink()
-    partial = path.with_name(f"{start}{_host()}-{os.getpid()}-{secrets.token_hex(8)}.partial{path.suffix}")
+    partial = path.with_name(f"{start}{secrets.token_hex(8)}.partial{path.suffix}")
     try:
         os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
         try:
@@ -72,23 +68,6 @@ def replacing(path: Path) -> Iterator[Path]:
         os.fsync(folder)
     finally:
         os.close(folder)
-
-
-def _host() -> str:
-    return f"{zlib.crc32(socket.gethostname().encode()):08x}"
-
-
-def _is_abandoned(partial: Path, start: str) -> bool:
-    """Return whether nobody writes to a file of `replacing`, whose name begins with `start`."""
-    writer = re.match(rf"{_host()}-(\d+)-", partial.name.removeprefix(start))
-    if writer is not None:
-        try:
-            os.kill(int(writer.group(1)), 0)  # asks, and sends nothing
-        except (ProcessLookupError, OverflowError):
-            return True
-        except PermissionError:  # it runs as another user
-            pass
-    return time.time() - partial.stat().st_mtime > _ABANDONED_S
 
 
 def remove_link(path: Path) -> None:
