@@ -2,10 +2,10 @@
 
 from .api.agent import Agent as Agent
 from .api.judging import judge as judge
+from .api.loading import load as load
 from .api.making import make as make
 from .api.making import make_gymnasium as make_gymnasium
 from .api.reporting import report as report
-from .api.training import load as load
 from .api.training import train as train
 from .api.tuning import tune as tune
 from .config.errors import ConfigError as ConfigError

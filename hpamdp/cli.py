@@ -23,16 +23,15 @@ from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.config.command_line import CommandLine, completed, parse, saved_run
 from hpamdp.config.compose import conf_dir, job_overrides, read
-from hpamdp.config.errors import ConfigError
+from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.hydra_errors import explained, not_understood
 from hpamdp.config.schema import RESUME_AUTO, Config
-from hpamdp.env.errors import EnvironmentFaultError, ProblemError
+from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.messages import (
     FAILED,
     INTERRUPTED,
     MISTAKE,
     exit_code,
-    first_line,
     one_line,
     reason_of,
     say,
@@ -104,10 +103,8 @@ def _run_command(name: str, words: list[str]) -> int:
 
     parser = _Parser(prog=f"{program()} {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
     try:
-        with exits_explained():
+        with exits_explained(), problems_explained():
             return command.main(words, parser)
-    except ProblemError as error:
-        raise ConfigError(f"env: {first_line(error)}") from error
     except ProgramExitError as error:
         _exit_with(str(error), FAILED)
 

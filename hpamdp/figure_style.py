@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes  # takes a third of a second, which a loaded agent need not wait for
 
 # Colours of Okabe and Ito and of Tol, which colour-blind people can tell apart. Each has one meaning in all figures.
 AGENT, INK, FAINT = "#0072B2", "#2b2b2b", "#8c8c8c"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from hpamdp.complaints import complaints
+from hpamdp.messages import ProblemError, first_line
 
 # The class or the file that defines a value, and where the value was set if that is known.
 Where: TypeAlias = Callable[[str | None], str]
@@ -18,6 +20,19 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 class ConfigError(ValueError):
     """Raised for a user's mistake; the message is one line."""
+
+
+@contextmanager
+def problems_explained() -> Iterator[None]:
+    """Turn an error about the problem into the user's mistake that it is.
+
+    Raises:
+        ConfigError: the block raised a `ProblemError`.
+    """
+    try:
+        yield
+    except ProblemError as error:
+        raise ConfigError(f"env: {first_line(error)}") from error
 
 
 class MissingChoiceError(ConfigError):

@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from omegaconf import DictConfig
+
 from hpamdp.complaints import as_json
 from hpamdp.config.components import GROUPS, TARGET, PlaceOf
-from hpamdp.config.compose import check, choosing, compose, is_name, plain_groups
+from hpamdp.config.compose import check, choosing, chosen_names, compose, is_name, plain_groups
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import AgentConfig, Config
 from hpamdp.renamed import with_new_names
@@ -33,6 +35,7 @@ def read_saved(
     given: Mapping[str, Any] | None = None,
     names: Mapping[str, str] | None = None,
     *,
+    composed: DictConfig | None = None,
     trust: bool = False,
     file: object = "the saved run",
     place_of: PlaceOf | None = None,
@@ -44,6 +47,8 @@ def read_saved(
         given: values by their names on the command line, such as `low.lr`. The name of a group stands for all its
             settings and its class.
         names: the names of the groups in `given`.
+        composed: a config with today's yaml files of the saved choices. If it has other choices, or is None, the files
+            are composed once more, which takes a quarter of a second.
         trust: whether the saved config may set the `guarded_settings` of a class.
         file: the file of the config.
         place_of: returns where a setting in `given` was set, for errors; None if that is not known.
@@ -56,7 +61,8 @@ def read_saved(
     saved = upgraded(saved)
     groups = [group for group in GROUPS if group not in given]
     choices = {group: saved[_CHOICES][group] for group in groups}
-    composed = compose([choosing(group, name) for group, name in choices.items()])
+    if composed is None or not choices.items() <= dict(chosen_names(composed)).items():
+        composed = compose([choosing(group, name) for group, name in choices.items()])
     today = plain_groups(composed, saved, groups, may_lack=True)
     values = {name: value for name, value in saved.items() if name not in (*GROUPS, _CHOICES)}
     for group in groups:

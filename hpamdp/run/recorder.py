@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.analysis import figures, film
+from hpamdp.analysis import film
 from hpamdp.config.schema import Config
 from hpamdp.files import replacing
 from hpamdp.metrics_file import CPU_SECONDS, FRAMES, WALL_SECONDS, Metrics, rows_up_to
@@ -271,6 +271,8 @@ class Recorder:
             np.savez_compressed(partial, **arrays)
         with replacing(folder / SUMMARY_NAME) as partial:
             partial.write_text(json.dumps(self.summary, indent=2) + "\n")
+        from hpamdp.analysis import figures  # takes a third of a second, which a loaded agent need not wait for
+
         images = figures.draw_all(folder, type(self.parts.evaluation.problem), self.summary, played)
         filmed = self._film(folder)
         self._pass_on(lambda logger: logger.images(images))

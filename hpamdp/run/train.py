@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
 
 from hpamdp.cards import CallbackCard, outside_card
-from hpamdp.config.errors import ConfigError
+from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.saved import needs_trust
 from hpamdp.config.schema import Config, RunConfig
-from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError, fault_of
-from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, first_line, say, warn
+from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble, choose_selector, facts_about
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, raised_by
@@ -72,19 +70,6 @@ def run(
     except ProgramExitError as error:
         tell(str(error))
         return FAILED
-
-
-@contextmanager
-def problems_explained() -> Iterator[None]:
-    """Turn an error about the problem into the user's mistake that it is.
-
-    Raises:
-        ConfigError: the block raised a `ProblemError`.
-    """
-    try:
-        yield
-    except ProblemError as error:
-        raise ConfigError(f"env: {first_line(error)}") from error
 
 
 def begin(
