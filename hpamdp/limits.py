@@ -7,14 +7,13 @@ import os
 import resource
 from typing import Literal
 
-Limit = Literal["files", "processes", "space", "memory"]
+Limit = Literal["files", "processes", "space"]
 _CODES: dict[int, Limit] = {
     errno.EMFILE: "files",
     errno.ENFILE: "files",
     errno.EAGAIN: "processes",
     errno.ENOSPC: "space",
     errno.EDQUOT: "space",
-    errno.ENOMEM: "memory",
 }
 # Messages of libraries about these limits, in errors without a number.
 _SIGNS: dict[str, Limit] = {
@@ -23,8 +22,6 @@ _SIGNS: dict[str, Limit] = {
     "can't start new thread": "processes",
     "Resource temporarily unavailable": "processes",
     "No space left on device": "space",
-    "annot allocate memory": "memory",
-    "failed to map segment": "memory",
 }
 # Messages of torch about a tensor that is larger than memory, or has more bytes than torch can count.
 _OF_TENSORS = (
@@ -44,8 +41,6 @@ _SHARED_MEMORY = "/dev/shm"  # where Linux keeps it
 
 def limit_in(error: BaseException) -> Limit | None:
     """Return the limit that an error is about; None if it is about no limit."""
-    if isinstance(error, MemoryError):
-        return "memory"
     code = getattr(error, "errno", None)
     if code in _CODES:
         return _CODES[code]

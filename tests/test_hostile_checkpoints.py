@@ -11,7 +11,6 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.single import SingleCollection
-from hpamdp.run.players import load_agent
 from hpamdp.run.state_file import write
 from hpamdp.run.train import run
 from hpamdp.run.trainer import DivergedError, Trainer
@@ -140,17 +139,6 @@ def test_learners_are_taken_over_as_a_whole_or_not_at_all(opener):
         checkpoint.load_learners(opener.file, opener.parts.agent, opener.parts.device)
     assert "\n" not in str(error.value)
     assert same(opener.all_of_agent(), before)
-
-
-@pytest.mark.parametrize("entry", ["frames", "wall_s", "last_score", "config", "option_names"])
-@pytest.mark.parametrize("value", ["text", [1], True])
-def test_a_policy_with_other_progress_is_refused(entry, value, opener, tmp_path):
-    saved = parts_of(opener.folder / "policy.safetensors")
-    saved["progress"][entry] = value
-    write(tmp_path / "policy.safetensors", saved)
-    with pytest.raises(ConfigError, match="damaged, or not a checkpoint") as error:
-        load_agent(str(tmp_path / "policy.safetensors"), [])
-    assert "\n" not in str(error.value)
 
 
 def test_weights_that_overflowed_are_not_saved(opener):

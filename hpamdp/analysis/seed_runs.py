@@ -38,7 +38,6 @@ _EFFORT = {"frames", "wall_s", "cpu_s", "eval_cpu_s", "compile_cpu_s", "evaluate
 _NO_METRICS = {"episodes", "finished", _SEED} | _EFFORT  # numbers of a summary
 _LARGEST = 1e100  # of a number in a statistic or a figure, so that their arithmetic does not overflow
 _LONGEST = 40  # letters of a value in a name
-_MOST_FOLDERS = 100_000  # a link may lead to the whole disk
 
 
 @dataclass(frozen=True)
@@ -301,9 +300,6 @@ def run_folders(folder: Path, seen: set[str], marks: Collection[str] = (SUMMARY_
             continue
         folders[:] = [name for name in folders if name not in (TENSORBOARD_NAME, WANDB_NAME) and name[0] != "."]
         seen.add(real)
-        if len(seen) > _MOST_FOLDERS:
-            warn(f"{folder}: has more than {_MOST_FOLDERS:,} folders, the others are left out")
-            return
         if not {*marks}.isdisjoint(files):
             yield Path(path)
         for name in files:

@@ -278,7 +278,7 @@ class Agent:
             if other.env.cls is own.cls and other.env.name == own.name:
                 left_out = {*SOURCE_SETTINGS, *(name.removeprefix("env.") for name, _ in given)}
                 kept = {name: value for name, value in own.settings.items() if name not in left_out}
-                other = other.with_problem(other.env.with_settings({**other.env.settings, **kept}))
+                other = replace(other, env=other.env.with_settings({**other.env.settings, **kept}))
         return self._fitting(other.env)
 
     def _fitting(self, env: Component) -> Config:
@@ -287,7 +287,7 @@ class Agent:
         Raises:
             ConfigError: the problem has other sizes.
         """
-        config = self._config.with_problem(env)
+        config = replace(self._config, env=env)
         with closing(make_env(config, 1, self._env.device, config.run.seed)) as built:
             specs = PAMDPSpecs.from_env(built)
         if specs != self.specs:

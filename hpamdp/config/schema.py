@@ -243,10 +243,6 @@ class Config:
         """Return the config with other, checked values of the run."""
         return replace(self, run=self.run.model_copy(update=values))
 
-    def with_problem(self, env: Component) -> Config:
-        """Return the config at another problem."""
-        return replace(self, env=env)
-
     def with_objects(self, objects: Mapping[str, Any] | None) -> Config:
         """Return the config with arguments for the problem's constructor that no file can hold."""
         return replace(self, env=replace(self.env, objects=objects)) if objects else self

@@ -33,12 +33,10 @@ from hpamdp.policies.base import Learner, added_later
 from hpamdp.policies.shared.on_policy import WAITING
 from hpamdp.run import state_file
 from hpamdp.run.state_checks import (
-    Progress,
     buffers_sized_by_data,
     check_form,
     check_like,
     check_names,
-    checked,
     checked_optimizer,
 )
 from hpamdp.run_files import CHECKPOINT_NAME as FILE_NAME
@@ -326,7 +324,7 @@ class _Opened:
             number = self._file.read("format")
             if number != FORMAT:
                 raise ValueError(f"format {number}, but this version reads {FORMAT}")
-            self.progress = checked(Progress, self._file.read("progress")).model_dump(exclude_unset=True)
+            self.progress = _by_name(self._file.read("progress"))
         self.names = {*self._file.names} - {"format", "progress"}
 
     def part(self, name: str, device: torch.device | None = None) -> Any:

@@ -7,53 +7,31 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 from tensordict import TensorDictBase
-from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from hpamdp.cards import CollectorCard
-from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.state_checks import SavedPart, check_like, checked
+from hpamdp.run.state_checks import check_like
 
 
-class CollectionState(SavedPart):
-    """State of a collection, as `Collection.state` returns it.
-
-    Attributes:
-        env: the environments' `env_state`, first dimension `num_envs`.
-        root: the steps `[num_envs]` from which the next ones are made, if `env` holds the current episodes.
-        generators: states of the worker processes' random generators.
-        coming: the batch that was collected ahead, if there is one.
-    """
-
-    env: dict[str, Tensor]
-    root: dict[str, Any] | None = None
-    generators: list[Tensor] = Field(default_factory=list)
-    coming: dict[str, Any] | None = None
-
-
-def checked_state(saved: Any, parts: AssembledRun) -> CollectionState:
-    """Check and return the state of a collection.
+def check_state(state: Mapping[str, Any], env: TransformedEnv) -> None:
+    """Check that the `env` of a collection's state is one of these environments.
 
     Raises:
-        ValueError: the state is of another run, or holds numbers that its environments do not take.
+        ValueError: the state is of other environments, or holds numbers that they do not take.
     """
-    state, env = checked(CollectionState, saved), parts.env
-    if state.env:
-        own = env.env_state()
-        if env.keeps_episodes:
-            num_envs = env.batch_size.numel()
-            sizes = {len(column) if column.ndim else 0 for column in state.env.values()} - {num_envs}
-            if sizes:
-                raise ValueError(
-                    f"num_envs={num_envs}: the state is of {sizes.pop()} environments; leave num_envs out when you "
-                    "resume"
-                )
-        check_like("env", state.env, own)
-        env.check_env_state(state.env)
-        if env.keeps_episodes and state.root is None:
-            raise ValueError("root is missing, from which the episodes in env continue")
-    return state
+    columns = state["env"]
+    if not columns:
+        return
+    if env.keeps_episodes:
+        num_envs = env.batch_size.numel()
+        sizes = {len(column) if column.ndim else 0 for column in columns.values()} - {num_envs}
+        if sizes:
+            raise ValueError(
+                f"num_envs={num_envs}: the state is of {sizes.pop()} environments; leave num_envs out when you resume"
+            )
+    check_like("env", columns, env.env_state())
+    env.check_env_state(columns)
 
 
 def random_seeds(seed: int, first_env: int, frames: int, restart: int = 0) -> tuple[int, int]:

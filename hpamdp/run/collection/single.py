@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType
 from hpamdp.acting import acting
 from hpamdp.config.schema import Config
 from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.collection.base import Collection, checked_state, random_seeds
+from hpamdp.run.collection.base import Collection, check_state, random_seeds
 from hpamdp.run.collection.options import CARDS
 
 
@@ -79,14 +79,14 @@ class SingleCollection(Collection):
         Raises:
             ValueError: the state is of another run, for example with another number of environments.
         """
-        saved = checked_state(state, self._parts)
-        if saved.env:  # otherwise the collector continues the episodes that it has just begun
-            self.env.set_env_state(saved.env)
+        check_state(state, self.env)
+        if state["env"]:  # otherwise the collector continues the episodes that it has just begun
+            self.env.set_env_state(state["env"])
             if not self.env.keeps_episodes:  # the saved statistics scale their first observations, too
                 self._collector._carrier.update(self.env.reset())
         root = self._collector._carrier
-        if saved.root is not None and self.env.keeps_episodes:
-            root.update(TensorDict(saved.root, batch_size=root.batch_size))
+        if "root" in state and self.env.keeps_episodes:
+            root.update(TensorDict(state["root"], batch_size=root.batch_size))
         elif self.env.keeps_episodes and self._fresh_seed is not None:
             self.env.set_seed(self._fresh_seed, static_seed=True)
             root.update(self.env.reset())

@@ -23,7 +23,7 @@ from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.limits import limit_of
 from hpamdp.messages import first_line
 from hpamdp.run.assemble import AssembledRun
-from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state, random_seeds
+from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, check_state, random_seeds
 from hpamdp.run.collection.options import WorkerOptions
 from hpamdp.run.collection.worker import EnvShard, RemoteError, pack_state
 from hpamdp.search_path import protect_children, unprotect_children
@@ -276,33 +276,34 @@ class WorkerCollection(Collection):
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state` of any collection. Exploration is the same only with the same number of workers."""
-        saved = checked_state(state, self._parts)
+        check_state(state, self._parts.env)
         self._state = dict(state)
-        if saved.env and not self._keeps_episodes:
-            self._problem.set_env_state(saved.env)
+        env, root, generators = state["env"], state.get("root"), state.get("generators", ())
+        if env and not self._keeps_episodes:
+            self._problem.set_env_state(env)
 
         def send(number: int) -> None:
             first = number * self._size
             own = slice(first, first + self._size)
 
             def send_to(worker: Any) -> None:
-                if saved.env and self._keeps_episodes:
-                    call_worker(worker, "env.set_env_state", _rows(saved.env)[own].cpu().to_dict())
-                elif saved.env:
-                    call_worker(worker, "begin_episodes", saved.env)
+                if env and self._keeps_episodes:
+                    call_worker(worker, "env.set_env_state", _rows(env)[own].cpu().to_dict())
+                elif env:
+                    call_worker(worker, "begin_episodes", env)
                 elif self._keeps_episodes and self._frames > 0:  # not the run's first episodes again
                     call_worker(worker, "begin_seeded", random_seeds(self._config.run.seed, first, self._frames)[1])
-                if saved.root is not None and self._keeps_episodes:
-                    call_worker(worker, "_carrier.update", _rows(saved.root)[own].cpu().to_dict())
-                if len(saved.generators) == len(self.workers):
-                    call_worker(worker, "policy.set_generator_state", saved.generators[number])
+                if root is not None and self._keeps_episodes:
+                    call_worker(worker, "_carrier.update", _rows(root)[own].cpu().to_dict())
+                if len(generators) == len(self.workers):
+                    call_worker(worker, "policy.set_generator_state", generators[number])
 
             self._on(number, send_to)
 
         self._on_all(send)
-        if saved.coming is not None:
-            shape = saved.coming["next"][keys.DONE].shape
-            coming = TensorDict(saved.coming, batch_size=shape[:-1])
+        if "coming" in state:
+            shape = state["coming"]["next"][keys.DONE].shape
+            coming = TensorDict(state["coming"], batch_size=shape[:-1])
             self._coming = [_done(rows) for rows in coming.split(self._size)]
 
     def close(self) -> None:
