@@ -2,27 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import resource
-from typing import Literal
 
-Limit = Literal["files", "processes", "space"]
-_CODES: dict[int, Limit] = {
-    errno.EMFILE: "files",
-    errno.ENFILE: "files",
-    errno.EAGAIN: "processes",
-    errno.ENOSPC: "space",
-    errno.EDQUOT: "space",
-}
-# Messages of libraries about these limits, in errors without a number.
-_SIGNS: dict[str, Limit] = {
-    "Too many open files": "files",
-    "received 0 items of ancdata": "files",
-    "can't start new thread": "processes",
-    "Resource temporarily unavailable": "processes",
-    "No space left on device": "space",
-}
+# Messages of the system and of libraries about limits.
+_OF_FILES = ("Too many open files", "received 0 items of ancdata")
+_OF_PROCESSES = ("can't start new thread", "Resource temporarily unavailable")
+_OF_SPACE = ("No space left on device", "Disk quota exceeded")
 # Messages of torch about a tensor that is larger than memory, or has more bytes than torch can count.
 _OF_TENSORS = (
     "allocate memory",
@@ -39,15 +25,6 @@ _OF_TENSORS = (
 _SHARED_MEMORY = "/dev/shm"  # where Linux keeps it
 
 
-def limit_in(error: BaseException) -> Limit | None:
-    """Return the limit that an error is about; None if it is about no limit."""
-    code = getattr(error, "errno", None)
-    if code in _CODES:
-        return _CODES[code]
-    text = str(error) if isinstance(error, OSError | RuntimeError | ImportError) else ""
-    return next((limit for sign, limit in _SIGNS.items() if sign in text), None)
-
-
 def is_about_memory(error: BaseException) -> bool:
     """Return whether an error is about too little memory for a tensor."""
     if isinstance(error, MemoryError):
@@ -58,12 +35,12 @@ def is_about_memory(error: BaseException) -> bool:
 
 def limit_of(error: BaseException) -> str | None:
     """Return the limit that an error is about and how to raise it, as text; None if it is about no such limit."""
-    limit = limit_in(error)
-    if limit == "files":
+    text = str(error) if isinstance(error, OSError | RuntimeError | ImportError) else ""
+    if any(sign in text for sign in _OF_FILES):
         return f"too many open files (ulimit -n is {_soft(resource.RLIMIT_NOFILE)}; raise it, or use fewer workers)"
-    if limit == "processes":
+    if any(sign in text for sign in _OF_PROCESSES):
         return f"too many processes (ulimit -u is {_soft(resource.RLIMIT_NPROC)}; raise it, or use fewer workers)"
-    return full_shared_memory() if limit == "space" else None
+    return full_shared_memory() if any(sign in text for sign in _OF_SPACE) else None
 
 
 def full_shared_memory() -> str:
