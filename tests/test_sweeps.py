@@ -327,42 +327,6 @@ def test_a_missing_launcher_or_sweeper_is_told_with_its_extra(command, word, pac
     assert err.endswith(f"not installed; pip install 'hpamdp[{extra}]'\n")
 
 
-@needs("hydra-optuna-sweeper")
-def test_a_search_with_a_storage_goes_on_when_it_is_started_again(command, monkeypatch, tmp_path):
-    if not version("sqlalchemy").startswith("1."):
-        pytest.skip("Optuna 2 needs SQLAlchemy 1 for a storage")
-    tried = []
-
-    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn, **_):
-        tried.append((folder.name, cfg.low.clip, stopped_at is not None))
-        (folder / "config.yaml").write_text(choose_selector(read(cfg)).to_yaml())
-        (folder / "checkpoint.safetensors").touch()
-        if len(tried) == 3:
-            return messages.INTERRUPTED
-        if len(tried) == 5:
-            raise ZeroDivisionError("a bug")
-        summary = {"score": cfg.low.clip, "frames": cfg.total_frames, "finished": True}
-        (folder / "summary.json").write_text(json.dumps(summary))
-
-    monkeypatch.setattr(train, "run", run)
-    words = ["search=hppo", "hydra.sweep.dir=sweep", "hydra.sweeper.storage=sqlite:///trials.db"]
-    words += ["hydra.sweeper.n_trials=6", "hydra.sweeper.n_jobs=1"]
-    assert command(*words)[0] == 130  # stopped in the third trial
-    assert command(*words)[0] == 1  # the fifth one fails
-    assert command(*words)[0] == 0
-    # The stopped trial and the failed one go on in their folders, which have the numbers of the new trials.
-    assert [name for name, _, _ in tried] == ["0", "1", "2", "3", "4", "5", "6", "7"]
-    stopped, failed = tried[2], tried[4]
-    assert tried[3][1:] == (stopped[1], True) and (failed[1], True) in [trial[1:] for trial in tried[5:]]
-    assert len({clip for _, clip, _ in tried}) == 6, "no other trial is proposed twice"
-    code, out, err = command(*words)
-    assert (code, err) == (0, "") and "has all of its trials" in out and len(tried) == 8
-    best = OmegaConf.load(tmp_path / "sweep/optimization_results.yaml").best_value
-    assert best == max(clip for _, clip, _ in tried)
-    code, _, err = command(*words[:2], "hydra.sweeper.storage=nosuch:///trials.db")
-    assert code == 2 and err.startswith("hydra.sweeper.storage=nosuch:///trials.db: ") and err.count("\n") == 1
-
-
 def values_of(word: str) -> list:
     """Return the ends, or the choices, of what a search may give a value."""
     override = OverridesParser.create().parse_overrides([word])[0]

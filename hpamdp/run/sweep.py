@@ -27,7 +27,6 @@ from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.files import replacing
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, MISTAKE, one_line, reason_of, say, warn
 from hpamdp.run.folder import has_foreign_error, is_about_folder, locked, remove_error, write_error
-from hpamdp.run.search import first_job_of_search, has_numbered_folders
 from hpamdp.run.stopping import exits_explained, pass_on_signal
 from hpamdp.run_files import ERROR_NAME, saved_summary
 from hpamdp.shell import path_setting
@@ -59,19 +58,9 @@ class SweepFolderCallback(Callback):
         _check_effects(config, _OF_RUNS, "has no effect on a sweep; give hydra.sweep.dir")
         _check_fixed(config, "hydra.sweep.dir")
         SweepFolderCallback.path = Path(os.path.abspath(config.hydra.sweep.dir))
-        try:
-            _check_sweep_dir(SweepFolderCallback.path)
-            first_job = first_job_of_search(config)
-        except ConfigError as error:
-            warn(str(error))
+        if os.path.realpath(SweepFolderCallback.path) == os.path.realpath(os.curdir):
+            warn("hydra.sweep.dir: the working directory; give a folder of its own, or leave hydra.sweep.dir out")
             sys.exit(MISTAKE)
-        if first_job is None:
-            say(
-                f"{SweepFolderCallback.path}: this search has all of its trials; set hydra.sweeper.n_trials to add some"
-            )
-            sys.exit(0)
-        if first_job and has_numbered_folders(config):  # the words of the sweep are words of its jobs, too
-            config.hydra.overrides.hydra.append(f"+hydra.sweep.first_job={first_job}")
 
 
 def _check_effects(config: DictConfig, settings: tuple[str, ...], effect: str) -> None:
@@ -90,36 +79,12 @@ def _check_fixed(config: DictConfig, name: str) -> None:
         sys.exit(MISTAKE)
 
 
-def _check_sweep_dir(folder: Path) -> None:
-    """Refuse the working directory.
-
-    Raises:
-        ConfigError: the folder is refused.
-    """
-    if os.path.realpath(folder) == os.path.realpath(os.curdir):
-        raise ConfigError(
-            "hydra.sweep.dir: the working directory; give a folder of the sweep's own, or leave hydra.sweep.dir out"
-        )
-
-
 def _check_output_subdir(config: DictConfig) -> None:
     """Exit if Hydra is set to write its own files, because it would write before the run's folder is checked."""
     given = config.hydra.output_subdir
     if given is not None:
         warn(f"hydra.output_subdir={given}: must be null; config.yaml in a run's folder has every value of the run")
         sys.exit(MISTAKE)
-
-
-def _job_folder() -> tuple[Path, int]:
-    """Return the current job's folder and number, which a search counts on from its earlier starts."""
-    hydra: Any = HydraConfig.get()
-    folder, first_job = Path(hydra.runtime.output_dir), hydra.sweep.get("first_job")
-    if first_job is None:
-        return folder, hydra.job.num
-    with suppress(OSError):
-        folder.rmdir()  # Hydra made it; it stays if it is not empty
-    number = hydra.job.num + first_job
-    return folder.with_name(str(number)), number
 
 
 @dataclass
@@ -177,10 +142,9 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     Raises:
         SystemExit: the user stopped it.
     """
-    folder, number = _job_folder()
     hydra = HydraConfig.get()
-    overrides = job_overrides()
-    job = Job(number, " ".join(overrides), str(folder))
+    folder, overrides = Path(hydra.runtime.output_dir), job_overrides()
+    job = Job(hydra.job.num, " ".join(overrides), str(folder))
     records = Records(Path(hydra.runtime.cwd, hydra.sweep.dir), start)
     if hydra.runtime.choices["hydra/launcher"] != "basic":
         os.environ.setdefault("TQDM_DISABLE", "1")  # the bars of jobs side by side overwrite each other
