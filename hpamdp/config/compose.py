@@ -13,7 +13,7 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.complaints import as_json, no_such
@@ -286,9 +286,10 @@ def job_overrides() -> list[str]:
     return words_in(HydraConfig.get().overrides.task)
 
 
-def words_in(node: ListConfig) -> list[str]:
+def words_in(node: Any) -> list[str]:
     """Return the words that a part of Hydra's config lists, without resolving `${` in them."""
-    return [str(word) for word in OmegaConf.to_container(node, resolve=False)]
+    words: Any = OmegaConf.to_container(node, resolve=False)
+    return [str(word) for word in words]
 
 
 def names_of(group: str) -> tuple[str, ...]:
