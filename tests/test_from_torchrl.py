@@ -6,7 +6,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
-from torchrl.envs import Compose, EnvBase, MultiAction, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    FrameSkipTransform,
+    MultiAction,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.envs.transforms import MacroPrimitiveTransform
 from torchrl.envs.utils import step_mdp
 
@@ -157,6 +165,12 @@ def test_macro_actions_of_torchrl_are_a_choice_with_a_target():
     observation, reward, *_ = env.step({"action_mode": 1, "action_target": np.array([0.4, 0.0], np.float32)})
     assert set(env.action_space) == {"action_mode", "action_target"}
     assert reward == pytest.approx(0.1 + 0.3 + 0.6 + 1.0) and observation["place"] == pytest.approx([1.0, 0.0])
+
+
+@pytest.mark.parametrize("transform", [FrameSkipTransform(2), MultiAction(stack_rewards=False)])
+def test_transforms_that_lose_the_end_of_an_episode_are_refused(transform):
+    with pytest.raises(SettingError, match=r"(end of an episode|episode's last step); "):
+        FromTorchRL(TransformedEnv(limited(), transform))
 
 
 def test_a_batch_is_refused_in_a_line():

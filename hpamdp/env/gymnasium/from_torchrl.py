@@ -12,7 +12,7 @@ import torch
 from gymnasium import spaces
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec, Unbounded
-from torchrl.envs import EnvBase, StepCounter, TransformedEnv
+from torchrl.envs import EnvBase, FrameSkipTransform, MultiAction, StepCounter, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from hpamdp.settings import SettingError
@@ -35,7 +35,8 @@ class FromTorchRL(gymnasium.Env):
         own_time_limit: that of its `StepCounter` transforms, the lowest one; None if there is none.
 
     Raises:
-        SettingError: it steps several environments at once, or a spec has no such space.
+        SettingError: it steps several environments at once, a spec has no such space, or a transform loses what happens
+            at the end of an episode.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own declaration)
@@ -46,6 +47,7 @@ class FromTorchRL(gymnasium.Env):
             raise SettingError(
                 f"steps {num_envs} environments at once; give a single one, of which num_envs makes copies"
             )
+        _refuse_lost_ends(env)
         self._env = env
         self._specs = {key: env.full_action_spec[key] for key in env.action_keys}
         parts = {_name(key): _space(key, spec, env.batch_dims) for key, spec in self._specs.items()}
@@ -53,7 +55,9 @@ class FromTorchRL(gymnasium.Env):
         self._observed = list(env.observation_keys)
         observed = {_name(key): _space(key, env.full_observation_spec[key], env.batch_dims) for key in self._observed}
         self.observation_space: spaces.Dict = spaces.Dict(observed)
-        self.own_time_limit = _time_limit(env)
+        counters = [each for each in _transforms(env) if isinstance(each, StepCounter)]
+        limits = [each.max_steps for each in counters if each.max_steps is not None]
+        self.own_time_limit = min(limits, default=None)
         self._random_state: torch.Tensor | None = None
         self._state: TensorDictBase | None = None
 
@@ -144,11 +148,19 @@ def _space(key: NestedKey, spec: TensorSpec, batch_dims: int) -> spaces.Space:
     return spaces.Box(0, 255, shape, np.uint8) if is_picture else spaces.Box(-np.inf, np.inf, shape, np.float32)
 
 
-def _time_limit(env: EnvBase) -> int | None:
-    """Return the lowest number of steps of the environment's `StepCounter` transforms, if it has any."""
-    limits = []
+def _transforms(env: EnvBase) -> Iterator[torch.nn.Module]:
+    """Yield all transforms of an environment, from the outermost on."""
     while isinstance(env, TransformedEnv):
-        counters = [each for each in env.transform.modules() if isinstance(each, StepCounter)]
-        limits += [each.max_steps for each in counters if each.max_steps is not None]
+        yield from env.transform.modules()
         env = env.base_env
-    return min(limits, default=None)
+
+
+def _refuse_lost_ends(env: EnvBase) -> None:
+    """Refuse transforms that, in TorchRL 0.14.1, lose what happens at the end of an episode."""
+    for each in _transforms(env):
+        if isinstance(each, FrameSkipTransform) and each.frame_skip > 1:
+            raise SettingError(
+                "FrameSkipTransform steps through the end of an episode; repeat actions in the environment"
+            )
+        if isinstance(each, MultiAction) and not each.stack_rewards:
+            raise SettingError("MultiAction loses the reward of an episode's last step; set stack_rewards=True")
