@@ -6,7 +6,7 @@ Nothing here needs torch, which takes seconds to import and microseconds for eac
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -30,50 +30,17 @@ class After(NamedTuple):
     truncations: np.ndarray
 
 
-class NumpyEnv(Protocol):
-    """A batched environment with NumPy in and out, for one environment or many."""
-
-    is_reset: bool
-    action_space: spaces.Space
-    observation_space: spaces.Space
-    final_infos: tuple[str, ...]  # infos that exist only once an episode is over
-
-    @property
-    def state(self) -> Any:
-        """The columns of the state, a named tuple of tensors or arrays `[N]` that stay as they are."""
-
-    def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
-        """Start new episodes, in the rows of `mask` or in all, and return the observations `[N, observation_dim]`."""
-
-    def step(self, action: Any, *, restarts: bool = False) -> After:
-        """Return what follows an action in every environment.
-
-        With `restarts`, environments whose episode was over start a new one instead, whatever their action is.
-        """
-
-    @property
-    def is_over(self) -> np.ndarray:
-        """Which episodes are over, bool `[N]`."""
-
-    def infos(self) -> dict[str, np.ndarray]:
-        """Return the infos, `[N]` each."""
-
-    def info(self) -> dict[str, Any]:
-        """Return the infos of the first environment as Python's numbers."""
-        values = self.infos()
-        if not self.is_over[0]:
-            for name in self.final_infos:
-                del values[name]
-        return {name: value.item(0) for name, value in values.items()}
-
-
-class NumpyRows(NumpyEnv):
-    """Environments with NumPy in and out.
+class NumpyRows:
+    """A batched environment with NumPy in and out, for one environment or many.
 
     Args:
         rows: `KernelRows`, or an object with its methods, which moves the environments.
         batch: `()` for one environment, `(N,)` for many.
     """
+
+    action_space: spaces.Space
+    observation_space: spaces.Space
+    final_infos: tuple[str, ...]  # infos that exist only once an episode is over
 
     def __init__(self, rows: Any, batch: tuple[int, ...]) -> None:
         self.is_reset = False
@@ -94,7 +61,10 @@ class NumpyRows(NumpyEnv):
         return results.observations[0]
 
     def step(self, action: Any, *, restarts: bool = False) -> After:
-        """Return what follows an action in every environment."""
+        """Return what follows an action in every environment.
+
+        With `restarts`, environments whose episode was over start a new one instead, whatever their action is.
+        """
         if not self.is_reset:
             raise gymnasium.error.ResetNeeded("step: call reset first")
         leaves = self._leaves(action)
@@ -107,6 +77,19 @@ class NumpyRows(NumpyEnv):
     def is_over(self) -> np.ndarray:
         """Which episodes are over, bool `[N]`."""
         return self.rows.integers[OUTCOME_ROW] != 0
+
+    @property
+    def state(self) -> Any:
+        """The columns of the state, a named tuple of tensors or arrays `[N]` that stay as they are."""
+        raise NotImplementedError
+
+    def infos(self) -> dict[str, np.ndarray]:
+        """Return the infos, `[N]` each."""
+        raise NotImplementedError
+
+    def info(self) -> dict[str, Any]:
+        """Return the infos of the first environment as Python's numbers."""
+        raise NotImplementedError
 
     def _start_columns(self, options: Mapping[str, Any]) -> Mapping[int, np.ndarray]:
         """Check the options of a reset and return the columns of the state that they set, by their places."""
@@ -140,7 +123,7 @@ class GymnasiumAdapter(gymnasium.Env):
     own_time_limit: int  # steps after which the environment itself ends an episode
     training_begins_elsewhere: bool = False
 
-    def __init__(self, problem: NumpyEnv, render_mode: RenderMode) -> None:
+    def __init__(self, problem: NumpyRows, render_mode: RenderMode) -> None:
         check_render_mode(type(self).__name__, render_mode)
         self._problem = problem
         self.action_space = problem.action_space
@@ -204,7 +187,7 @@ class GymnasiumVectorAdapter(VectorEnv):
         ValueError: an argument, an action or a reset option is invalid; the state is unchanged.
     """
 
-    def __init__(self, problem: NumpyEnv, num_envs: int, autoreset_mode: AutoresetMode | str) -> None:
+    def __init__(self, problem: NumpyRows, num_envs: int, autoreset_mode: AutoresetMode | str) -> None:
         self._problem = problem
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)

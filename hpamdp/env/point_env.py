@@ -10,7 +10,8 @@ import numpy as np
 from torch import Tensor
 
 from hpamdp.env import point_pictures
-from hpamdp.env.batched_env import GOING_ON, SUCCESS, BatchedEnv, EpisodeColumns
+from hpamdp.env.batched_env import BatchedEnv, EpisodeColumns
+from hpamdp.env.canvas import FAINT, PAPER
 from hpamdp.env.point_agent import Located
 
 
@@ -41,21 +42,17 @@ class PointEnv(BatchedEnv[PointEpisode], Generic[PointEpisode]):
     def draw(self, track: Sequence[PointEpisode]) -> np.ndarray:
         """Return a picture of the agent's path to the target, uint8 `[480, 480, 3]`."""
         last = track[-1]
-        outcome = int(last.outcome)
-        return point_pictures.draw(
-            point_pictures.Scene(
-                path=[(float(state.x), float(state.y)) for state in track],
-                target=(float(last.target_x), float(last.target_y)),
-                radius=self.target_radius,
-                outcome=self.outcomes[outcome],
-                is_over=outcome != GOING_ON,
-                is_success=outcome == SUCCESS,
-                steps=int(last.steps),
-                note=self.picture_note(last),
-                heading=self.heading(last),
-                has_walls=self.has_walls,
-            )
+        picture = point_pictures.draw(
+            [(float(state.x), float(state.y)) for state in track],
+            (float(last.target_x), float(last.target_y)),
+            self.target_radius,
+            outcome=int(last.outcome),
+            heading=self.heading(last),
+            has_walls=self.has_walls,
         )
+        picture.caption(int(last.steps), int(last.outcome), self.outcomes)
+        picture.write((PAPER - 18.0, 22.0), self.picture_note(last), FAINT, anchor="rm")
+        return np.array(picture.image)
 
     @abstractmethod
     def picture_note(self, state: PointEpisode) -> str:

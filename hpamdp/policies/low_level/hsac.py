@@ -54,9 +54,8 @@ from hpamdp.policies.low_level.hsac_options import CARDS, HSACOptions
 from hpamdp.policies.masks import masked_logits, random_discrete, zero_fixed
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.gradients import adam
-from hpamdp.policies.shared.hybrid_actor import HybridActor
+from hpamdp.policies.shared.hybrid_actor import DistributionActor, HybridActor
 from hpamdp.policies.shared.hybrid_distribution import (
-    Draw,
     HybridDistribution,
     gaussian_log_density,
     log_slope_of_tanh,
@@ -78,7 +77,7 @@ from hpamdp.specs import PAMDPSpecs
 _LARGEST_EXECUTED = 1.0 - 1e-6
 
 
-class HSACActor(nn.Module):
+class HSACActor(DistributionActor):
     """One network for the logits of the discrete actions and the Gaussians of their parameters, before squashing."""
 
     owner: Tensor
@@ -106,20 +105,6 @@ class HSACActor(nn.Module):
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
         log_probs = masked_logits(logits, mask).log_softmax(-1)
         return HybridDistribution(log_probs, mean, log_scale, self.owner, self.components)
-
-    def act(
-        self, draw: Draw, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
-    ) -> tuple[Tensor, Tensor, HybridDistribution]:
-        """Return an action and the distribution that it comes from, as `HybridActor.act` does."""
-        distribution: HybridDistribution = self(observation, mask)
-        return *draw(distribution), distribution
-
-    def most_probable(
-        self, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Return the most probable discrete actions and their mean raw parameters, as in `HybridActor`."""
-        distribution: HybridDistribution = self(observation, mask)
-        return distribution.mode()
 
 
 class HSACPolicy(TensorDictModuleBase):

@@ -26,7 +26,33 @@ from hpamdp.specs import PAMDPSpecs
 RAW = "raw_parameters"
 
 
-class HybridActor(nn.Module):
+class DistributionActor(nn.Module):
+    """An actor whose `forward` returns a `HybridDistribution`, given observations and a mask."""
+
+    def act(
+        self, draw: Draw, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> tuple[Tensor, Tensor, HybridDistribution]:
+        """Return discrete actions, raw parameters `[*B, num_parameters]` and the distribution that they come from.
+
+        Args:
+            draw: maps a distribution to discrete actions and raw parameters.
+            observation: of the states, `[*B, observation_dim]`.
+            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`. If None, all.
+            pair_mask: whether the column's discrete action may follow the row's, bool `[*B, num_discrete,
+                num_discrete]`. If None, all pairs. Only an `AutoregressiveActor` takes it.
+        """
+        distribution: HybridDistribution = self(observation, mask)
+        return *draw(distribution), distribution
+
+    def most_probable(
+        self, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the most probable discrete actions and their mean raw parameters; arguments as for `act`."""
+        discrete, raw, _ = self.act(HybridDistribution.mode, observation, mask, pair_mask)
+        return discrete, raw
+
+
+class HybridActor(DistributionActor):
     """A discrete head and a parameter head on shared hidden layers, nearly uniform and centred at initialisation.
 
     Given the state, the components of an action are independent.
@@ -139,28 +165,6 @@ class HybridActor(nn.Module):
             pair_mask: the discrete actions that go together, bool `[*B, num_discrete, num_discrete]`.
         """
         return self(observation, mask)
-
-    def act(
-        self, draw: Draw, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
-    ) -> tuple[Tensor, Tensor, HybridDistribution]:
-        """Return discrete actions, raw parameters `[*B, num_parameters]` and the distribution that they come from.
-
-        Args:
-            draw: maps a distribution to discrete actions and raw parameters.
-            observation: of the states, `[*B, observation_dim]`.
-            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`. If None, all.
-            pair_mask: whether the column's discrete action may follow the row's, bool `[*B, num_discrete,
-                num_discrete]`. If None, all pairs. Only an `AutoregressiveActor` takes it.
-        """
-        distribution: HybridDistribution = self(observation, mask)
-        return *draw(distribution), distribution
-
-    def most_probable(
-        self, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Return the most probable discrete actions and their mean raw parameters; arguments as for `act`."""
-        discrete, raw, _ = self.act(HybridDistribution.mode, observation, mask, pair_mask)
-        return discrete, raw
 
     def set_min_scale(self, min_scale: float) -> None:
         """Set the smallest standard deviation."""
