@@ -458,8 +458,8 @@ def test_a_limit_of_the_machine_is_reported_with_its_cure(error, words, tmp_path
         assert words in str(raised.value) and "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("address", ["ray://127.0.0.1:1"])
-def test_a_cluster_that_does_not_answer_is_reported_in_one_line(address):
+def test_a_cluster_that_does_not_answer_is_reported_in_one_line():
+    address = "ray://127.0.0.1:1"
     with pytest.raises(CollectionError, match=f"^collector.address={address}: does not answer") as raised:
         check_answers(address)
     assert "\n" not in str(raised.value)

@@ -163,13 +163,6 @@ def test_decisions_of_a_data_set_use_up_no_exploration_of_a_run_that_goes_on_wit
         assert parts.agent.selector.num_decisions == 0 and parts.agent.selector.pending.tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("high", ["exp3", "actor"])
-def test_selectors_of_their_own_choices_alone_are_refused_offline_in_one_line(high, path):
-    with pytest.raises(ConfigError) as refusal:
-        assemble(make_config(overrides(path, "iql", high)))
-    assert str(refusal.value) == f"high={high}: learns from its own choices only; use mode=train, or another high"
-
-
 @pytest.mark.parametrize("high", [pytest.param("exp3", marks=pytest.mark.slow), "actor"])
 def test_selectors_of_their_own_choices_alone_train_beside_a_data_set(high, path, tmp_path):
     words = [f"data.path={path}", "data=human", "data.checksum=null", "low=pdqn", f"high={high}", "eval.layouts=4"]
@@ -258,12 +251,11 @@ def test_impossible_configs_are_refused_in_one_line(given, line):
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize(("low", "shared"), [("pets", True), ("bc", False)])
-def test_metrics_show_the_losses_on_people_who_are_held_out(low, shared, path, tmp_path):
-    given = [*overrides(path, low), "data.held_out=[1]", "offline.updates=60", "offline.eval_every=20"]
+def test_metrics_show_the_losses_on_people_who_are_held_out(path, tmp_path):
+    given = [*overrides(path, "bc"), "data.held_out=[1]", "offline.updates=60", "offline.eval_every=20"]
     assert run(compose_config(given), tmp_path, given) == 0
     rows = [row for row in read_rows(tmp_path / "metrics.csv") if row["frames"] > 0]
-    name = "low/held_out_loss" if shared else "low/congruent/held_out_loss"
+    name = "low/congruent/held_out_loss"
     assert len(rows) == 3 and rows[-1][name] < rows[0][name]
     resumed = ["mode=offline", f"resume={tmp_path}", "offline.updates=80"]
     assert run(compose_config(resumed), tmp_path / "resumed", resumed) == 0
@@ -391,7 +383,7 @@ def test_behaviour_cloning_finds_the_mean_parameter_of_the_data():
     assert parameter == pytest.approx(0.55, abs=0.05)
 
 
-@pytest.mark.parametrize(("num_updates", "fraction"), [(1, 1.0), (6, 0.5), (11, 0.0), (12, 0.0)])
+@pytest.mark.parametrize(("num_updates", "fraction"), [(1, 1.0), (6, 0.5), (12, 0.0)])
 def test_the_policys_learning_rate_of_iql_falls_along_a_cosine_if_told_so(num_updates, fraction):
     learner = IQL(SPECS, **{**IQL_OPTIONS, "actor_lr_updates": 10})
     batch = one_step_batch()

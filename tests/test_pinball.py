@@ -208,8 +208,8 @@ def test_a_run_does_not_continue_on_a_map_that_was_edited_since(tmp_path):
     assert run(compose_config(resume), folder, resume) == 0
 
 
-@pytest.mark.parametrize("grouping", [["high=uniform", "env.grouping=default"]])
-def test_an_evaluation_on_a_map_that_was_edited_since_says_so(grouping, tmp_path, capfd):
+def test_an_evaluation_on_a_map_that_was_edited_since_says_so(tmp_path, capfd):
+    grouping = ["high=uniform", "env.grouping=default"]
     file, folder = written(tmp_path, TABLE), tmp_path / "run"
     words = ["env=pinball", *grouping, "low=hppo", "low.minibatch_size=16", f"env.map={file}", *SMALL]
     words += ["total_frames=64", "env.max_steps=20", "film=false"]
@@ -226,8 +226,8 @@ def test_an_evaluation_on_a_map_that_was_edited_since_says_so(grouping, tmp_path
         assert (line in capfd.readouterr().err) == is_other
 
 
-@pytest.mark.parametrize("env_part", [{"map_checksum": torch.zeros(2, 3)}])
-def test_a_saved_agent_whose_checksum_is_damaged_is_refused_in_one_line(env_part, tmp_path):
+def test_a_saved_agent_whose_checksum_is_damaged_is_refused_in_one_line(tmp_path):
+    env_part = {"map_checksum": torch.zeros(2, 3)}
     file, folder = written(tmp_path, TABLE), tmp_path / "run"
     words = ["env=pinball", "high=none", "low=random", f"env.map={file}", *SMALL, "total_frames=64"]
     assert run(compose_config(words), folder, words) == 0

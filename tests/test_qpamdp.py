@@ -70,9 +70,7 @@ def ready(specs: PAMDPSpecs = SPECS, **changes) -> QPAMDP:
     return learner
 
 
-@pytest.mark.parametrize(
-    ("num_inputs", "order", "max_coupled"), [(1, 3, 1), (3, 2, 1), (3, 2, 2), (3, 2, 3), (2, 4, 9)]
-)
+@pytest.mark.parametrize(("num_inputs", "order", "max_coupled"), [(1, 3, 1), (3, 2, 2), (2, 4, 9)])
 def test_the_fourier_basis_has_every_term_of_few_enough_inputs(num_inputs, order, max_coupled):
     rows = fourier_coefficients(num_inputs, order, max_coupled).long().tolist()
     everything = itertools.product(range(order + 1), repeat=num_inputs)

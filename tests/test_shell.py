@@ -133,8 +133,8 @@ def test_help_that_cannot_be_written_costs_one_line_at_most(tmp_path, words):
     os.close(writer)
 
 
-@pytest.mark.parametrize("encoding", ["ascii"])
-def test_letters_that_a_terminal_cannot_show_are_replaced(tmp_path, monkeypatch, encoding):
+def test_letters_that_a_terminal_cannot_show_are_replaced(tmp_path, monkeypatch):
+    encoding = "ascii"
     out, err = tmp_path / "out.txt", tmp_path / "err.txt"
 
     def run(cfg, folder, *_, **__):
