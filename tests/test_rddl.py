@@ -167,6 +167,16 @@ def test_steps_of_the_batched_environment_are_those_of_the_gymnasium_form():
 
 
 @needs_simulator
+def test_the_initial_parameters_are_the_default_values_within_the_bounds():
+    env = RDDLEnv(1, domain="SupplyChain_or", **SHIPS)
+    weight, bias = env.initial_parameters()
+    assert weight.shape == (4, len(env.observation_names)) and not weight.any()
+    assert bias.tolist() == [-1.0] * 4  # all defaults are 0, and the least shipment to w1 is 5
+    assert RDDLEnv(1, domain="Sudoku_arcade").initial_parameters() is None
+    assert RDDLEnv(1, domain="Elevators").initial_parameters() is None
+
+
+@needs_simulator
 def test_files_of_ones_own_are_read_and_watched(tmp_path):
     from rddlrepository.core.manager import RDDLRepoManager
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import zlib
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from hpamdp import keys
 from hpamdp.env.gymnasium.environment import SimulatorEnv
 from hpamdp.env.rddl.options import CARDS, RDDLOptions, RDDLRules
 from hpamdp.env.rddl.problem import RDDLProblem
@@ -29,6 +31,16 @@ class RDDLEnv(SimulatorEnv):
     def _prepare(self) -> None:
         self.discrete_names = self._copies.call("discrete_names")[0]
         self.observation_names = self._copies.call("observation_names")[0]
+
+    def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
+        """Return the default values of numbers that are always set, or the nearest within their bounds."""
+        low, high = (np.array(each) for each in (self.ranges()["parameter_low"], self.ranges()["parameter_high"]))
+        defaults = self._copies.call("default_numbers")[0]
+        if not defaults:
+            return None
+        numbers = np.array(defaults).clip(low, high)
+        unit = torch.tensor(2.0 * (numbers - low) / (high - low) - 1.0, dtype=torch.float32)
+        return torch.zeros(len(unit), self.observation_spec[keys.OBSERVATION].shape[-1], dtype=torch.float32), unit
 
     def file_checksums(self) -> dict[str, Tensor]:
         """Return the checksum of files of one's own, int64 `[1]`; nothing for a problem of rddlrepository."""

@@ -158,6 +158,11 @@ class RDDLProblem(gymnasium.Env):
         names = [_name(fluent, value) for fluent in fluents for value in range(len(fluent.values))]
         return (*names, *(["numbers"] if any(not fluent.values for fluent in fluents) else []))
 
+    def default_numbers(self) -> list[float]:
+        """Return the default values of the numbers that are always set, in the order of the parameters."""
+        fluents = () if self._num_choices else self._by_name.values()
+        return [float(fluent.default) for fluent in fluents if not fluent.values]
+
     def observation_names(self) -> tuple[str, ...]:
         """Return the names of the entries of the observation."""
         return tuple(
