@@ -87,6 +87,7 @@ def test_a_space_has_the_grammar_of_sweeps_or_lists():
         ({"space": {}}, "nothing to search"),
         ({"low": "hpo"}, r"low=hpo: no such search space; did you mean hppo\?"),
         ({"trials": 0}, "trials=0: must be a whole number of at least 1"),
+        ({"callbacks": []}, "^callbacks: trials have none of their own; leave it out$"),
     ],
 )
 @needs_optuna

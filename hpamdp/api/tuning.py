@@ -92,9 +92,10 @@ def tune(
 ) -> Tuned:
     """Search for the settings with the highest score at the end of a training.
 
-    Optuna's tree-structured Parzen estimator proposes the settings of each trial. A trial ends early if its score is
-    below the median of the earlier ones after as many steps. Trial number i trains with the seed `seed` + i, and all
-    evaluations have `eval.seed=seed`. So the episodes are not those of a usual evaluation, whose seed is 0.
+    Optuna's tree-structured Parzen estimator proposes the settings of each trial. After five trials, a trial ends
+    early if its best score so far is below the median score of the earlier ones after as many steps. Trial number i
+    trains with the seed `seed` + i, and all evaluations have `eval.seed=seed`. So the episodes are not those of a usual
+    evaluation, whose seed is 0.
 
     Ctrl-C ends the search, and the best settings so far are returned.
 
@@ -136,6 +137,11 @@ class _Objective:
     fixed: Mapping[str, Any]
     space: Space
     seed: int
+
+    def __post_init__(self) -> None:
+        for name in ("callbacks", "folder", "progress"):
+            if name in {*self.fixed, *self.space}:
+                raise ConfigError(f"{name}: trials have none of their own; leave it out")
 
     @property
     def definition(self) -> str:
