@@ -22,6 +22,7 @@ from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.recorder import Recorder
+from hpamdp.run.stopping import stop_on_signals
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=32", "steps_per_batch=4", "eval.layouts=20", "total_frames=1024", "eval.every=512"]
@@ -158,6 +159,26 @@ def test_ctrl_c_ends_an_evaluation_at_once_and_resuming_repeats_it(tmp_path, mon
     assert run(compose_config(more), tmp_path / "resumed", more) == 0
     rows = [[(row["frames"], row["eval/score"]) for row in rows_of(tmp_path / name)] for name in ("whole", "resumed")]
     assert rows[0] == rows[1]
+
+
+def test_a_signal_in_the_batch_before_an_evaluation_leaves_it_to_the_resumed_run():
+    with stop_on_signals() as request:
+        os.kill(os.getpid(), signal.SIGUSR1)
+        with pytest.raises(KeyboardInterrupt), request.taken_at_once():
+            pytest.fail("the evaluation began")
+
+
+def test_an_evaluation_that_is_cut_off_leaves_the_film_of_the_one_before(monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    parts = assemble(make_config([*SMALL, "low=random", "high=none", "env.controller=congruent"]))
+    parts.evaluation.run_agent(parts.agent)
+    before = parts.evaluation.states
+    monkeypatch.setattr(parts.evaluation, "run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        parts.evaluation.run_agent(parts.agent)
+    assert parts.evaluation.states is before
 
 
 def test_a_second_ctrl_c_within_an_update_tells_the_last_evaluation(tmp_path, monkeypatch):

@@ -134,17 +134,17 @@ class Evaluation:
         The further episodes give `option_scores` `[N, num_options]`, the scores of the agent's learners with each
         option.
         """
-        self.states = []
-        played = self.run(agent.policy, self.states)
+        states: list[dict[str, Tensor]] = []
+        played = self.run(agent.policy, states)
         only = None if self._only_action is None or agent.specs.num_discrete < 2 else self._only_action.tolist()
-        self.one_action = (
-            []
-            if only is None
-            else [f"the agent took discrete action {only[0] if len(only) == 1 else only} at every step"]
-        )
         if agent.selector is not None:
             each = [self.run(agent.policy_of(i))["score"] for i in range(agent.specs.num_options)]
             played["option_scores"] = np.stack(each, -1)
+        # Only now, because a signal may have ended the evaluation: the film and the line belong to a whole one.
+        self.states, self.one_action = states, []
+        if only is not None:
+            shown = only[0] if len(only) == 1 else only
+            self.one_action = [f"the agent took discrete action {shown} at every step of the evaluation"]
         return played
 
     def _film(self, states: list[dict[str, Tensor]] | None) -> None:

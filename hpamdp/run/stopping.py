@@ -30,7 +30,13 @@ class StopRequest:
 
     @contextmanager
     def taken_at_once(self) -> Iterator[None]:
-        """Let the first signal interrupt the block, which can be repeated, such as an evaluation."""
+        """Let the first signal interrupt the block, which can be repeated, such as an evaluation.
+
+        Raises:
+            KeyboardInterrupt: a signal has come, before or in the block.
+        """
+        if self.signal is not None:
+            raise KeyboardInterrupt
         self._is_urgent = True
         try:
             yield
