@@ -195,13 +195,15 @@ class Recorder:
         return row
 
     def finish(self, frames: int, wall_s: float, cpu_s: float, ending: Mapping[str, Any], *, is_finished: bool) -> str:
-        """Evaluate, write the summary and the figures, close the logger, and return the closing table as text.
+        """Write the summary and the figures, close the logger, and return the closing table as text.
+
+        If training was interrupted, the figures are those of the last evaluation, otherwise of the agent as it is.
 
         Args:
             frames: frames of training.
             wall_s: wall time of training; with `mode=eval`, the time of the evaluation replaces it.
             cpu_s: CPU time of training; likewise.
-            ending: entries of the summary about the end of training: `stopped_by`, `kept_frames`, `kept_score`.
+            ending: entries of the summary about training: `compile_cpu_s`, `stopped_by`, `kept_frames`, `kept_score`.
             is_finished: whether training reached its end.
         """
         if self.config.run.mode == "eval":
