@@ -182,7 +182,8 @@ class ParameterTree:
         if isinstance(space, spaces.Tuple | spaces.Dict | spaces.OneOf):
             names = list(space.spaces) if isinstance(space, spaces.Dict) else None
             number = self._read(spaces.Discrete(len(space.spaces)))[0] if isinstance(space, spaces.OneOf) else None
-            parts = [self._read(part) for part in (space.spaces if names is None else space.spaces.values())]
+            of_parts: Any = space.spaces
+            parts = [self._read(part) for part in (of_parts if names is None else of_parts.values())]
             build = _build_parts([part[0] for part in parts], names, number)
             return build, _fill_parts([part[1] for part in parts], names)
         low, high, is_free = bounds_of(space)

@@ -109,7 +109,8 @@ class ReplayLearner(Learner):
 
     def read_options(self, options: Any, settings: Mapping[str, Any]) -> ReplayOptions:
         """Return the settings that the constructor was given, as `Settings.of` does."""
-        return self.Options.of(options, settings)
+        own: Any = self.Options.of(options, settings)
+        return own
 
     @abstractmethod
     def make_networks(self, specs: PAMDPSpecs) -> None:
