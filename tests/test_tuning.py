@@ -19,10 +19,10 @@ needs_optuna = pytest.mark.skipif(find_spec("optuna") is None, reason="needs hpa
 class Run:
     """Stands for a training of 400 steps with an evaluation every 100, whose score depends on `low.lr` alone."""
 
-    def __init__(self, monkeypatch, *, stop_at: int | None = None, diverge_at: int | None = None) -> None:
+    def __init__(self, monkeypatch, *, stop_at: int | None = None, errors: dict[int, Exception] | None = None) -> None:
         self.given: list[dict] = []
         self.lengths: list[int] = []
-        self.stop_at, self.diverge_at = stop_at, diverge_at
+        self.stop_at, self.errors = stop_at, errors or {}
         monkeypatch.setattr(tuning, "train", self)
 
     def __call__(self, env, *, callbacks, progress, **settings):
@@ -30,8 +30,8 @@ class Run:
         number = len(self.given)
         self.given.append({"env": env, **settings})
         self.frames, self.is_stopped, self.is_evaluation_due = 0, False, number == self.stop_at
-        if number == self.diverge_at:
-            raise DivergedError("NaN")
+        if number in self.errors:
+            raise self.errors[number]
         while not self.is_over():
             report.on_evaluation(self, {"eval/score": -abs(settings["low.lr"] - 0.003) * 1000 + self.frames / 1000})
             self.frames += 100
@@ -107,16 +107,18 @@ SPACE = {"low.lr": "tag(log, interval(1e-4, 1e-1))"}
 
 @needs_optuna
 def test_the_best_settings_come_back_and_each_trial_has_a_seed_of_its_own(monkeypatch, capsys):
-    run = Run(monkeypatch, diverge_at=3)
+    errors = {3: DivergedError("low/critic is NaN"), 4: hpamdp.ConfigError("low.lr does not fit")}
+    run = Run(monkeypatch, errors=errors)
     best = hpamdp.tune("platform", low="hppo", trials=12, space=SPACE, total_frames=400)
     assert [each["seed"] for each in run.given] == [1_000_000 + number for number in range(12)]
     assert {each["eval.seed"] for each in run.given} == {1_000_000}
     assert {each["total_frames"] for each in run.given} == {400}
-    rates = [each["low.lr"] for number, each in enumerate(run.given) if number != 3]
+    rates = [each["low.lr"] for number, each in enumerate(run.given) if number not in errors]
     assert best.settings["low.lr"] == min(rates, key=lambda rate: abs(rate - 0.003)) and best.trials == 12
     out = capsys.readouterr().out
     assert out.endswith(f"Best score {best.score:.3f} in 12 trials, with the settings\n{best.words}\n")
-    assert out.count("pruned") > 1 and min(run.lengths) < 400 == max(run.lengths)
+    assert "Trial 3: low/critic is NaN" in out and "Trial 4: low.lr does not fit" in out
+    assert out.count("pruned") >= 1 and min(run.lengths) < 400 == max(run.lengths)
 
 
 @needs_optuna

@@ -13,7 +13,7 @@ from hpamdp.api.arguments import path_argument
 from hpamdp.api.training import train
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.search_space import Range, Space, parsed_space, space_of_learner, split_words
-from hpamdp.messages import as_code, reason_of, say
+from hpamdp.messages import INTERRUPTED, as_code, one_line, reason_of, say
 from hpamdp.run.callbacks import Callback
 from hpamdp.run.players import whole_number
 from hpamdp.run.trainer import DivergedError
@@ -36,6 +36,7 @@ Words with several values are the space, all others are fixed. The same command 
 TRIALS_NAME = "trials.log"
 _SEED = 1_000_000
 _DEFINITION = "definition"  # entry of a study: what is searched
+_WHY = "why"  # entry of a trial that was refused or has diverged
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ def tune(
         given = {*settings, *(f"low.{each}" for each in own)}
         space = space_of_learner(str(getattr(name, "__name__", name)), [*given])
     found = parsed_space(space)
-    return _search(_Objective(env, {"low": low, **settings}, found, seed), trials, folder, tells=progress)
+    return _search(_Objective(env, {"low": low, **settings}, found, seed), trials, folder, progress=progress)[0]
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,8 @@ class _Objective:
         """Return the score at the end of the training.
 
         Raises:
-            TrialPruned: the training ended early, or diverged.
+            TrialPruned: the training ended early, diverged, or was refused.
+            ConfigError: the first training was refused.
             KeyboardInterrupt: the user stopped it.
         """
         from optuna import TrialPruned
@@ -161,7 +163,10 @@ class _Objective:
         report, seeds = _Report(trial), {"seed": self.seed + trial.number, "eval.seed": self.seed}
         try:
             train(self.env, callbacks=[report], progress=False, **{**seeds, **self.fixed, **values})
-        except DivergedError as error:
+        except (ConfigError, DivergedError) as error:
+            if isinstance(error, ConfigError) and trial.number == 0:
+                raise
+            trial.set_user_attr(_WHY, one_line(error))
             raise TrialPruned from error
         if report.is_pruned:
             raise TrialPruned
@@ -170,8 +175,12 @@ class _Objective:
         return report.score
 
 
-def _search(objective: _Objective, trials: int, folder: Any, *, tells: bool) -> Tuned:
-    """Make trials until there are as many as asked, and return the best one's settings; see `tune`."""
+def _search(objective: _Objective, trials: int, folder: Any, *, progress: bool) -> tuple[Tuned, bool]:
+    """Make trials until there are as many as asked, see `tune`.
+
+    Returns:
+        The best one's settings, and whether there are as many trials as asked.
+    """
     try:
         import optuna
     except ImportError as error:
@@ -188,20 +197,20 @@ def _search(objective: _Objective, trials: int, folder: Any, *, tells: bool) -> 
         return len(study.get_trials(deepcopy=False, states=states))
 
     def tell(study: Study, trial: Any) -> None:
-        end = f"score {trial.value:.3f}" if trial.state == complete else "pruned"
+        end = f"score {trial.value:.3f}" if trial.state == complete else trial.user_attrs.get(_WHY, "pruned")
         say(f"Trial {trial.number}: {end}, {_words(trial.params)}")
 
     try:
         while num(complete, pruned) < trials:
-            study.optimize(objective, n_trials=1, callbacks=[tell] if tells else [])
+            study.optimize(objective, n_trials=1, callbacks=[tell] if progress else [])
     except KeyboardInterrupt:
         say(f"Stopped with {trials - num(complete, pruned)} trials to go")
     if not num(complete):
         raise ConfigError("tune: no trial came to its end")
     best = Tuned(study.best_params, study.best_value, _words(study.best_params), num(complete, pruned))
-    if tells:
+    if progress:
         say(f"Best score {best.score:.3f} in {best.trials} trials, with the settings\n{best.words}")
-    return best
+    return best, best.trials >= trials
 
 
 def _study(folder: Any, objective: _Objective) -> Study:
@@ -272,5 +281,5 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     settings.setdefault("low", "hppo")
     if not space:
         space = parsed_space(space_of_learner(settings["low"], [*settings]))
-    _search(_Objective(env, settings, space, options.seed), options.trials, options.to, tells=True)
-    return 0
+    _, is_finished = _search(_Objective(env, settings, space, options.seed), options.trials, options.to, progress=True)
+    return 0 if is_finished else INTERRUPTED
