@@ -99,7 +99,7 @@ def test_an_agent_is_loaded_without_further_compositions(name, monkeypatch):
     compose = hydra.compose
     monkeypatch.setattr(hydra, "compose", lambda *args, **kw: composing.append(args) or compose(*args, **kw))
     hpamdp.load(name)
-    assert len(composing) == 2
+    assert len(composing) == 1
 
 
 def test_networks_alone_are_scored_but_not_resumed():

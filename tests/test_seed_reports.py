@@ -302,3 +302,13 @@ def test_a_mistake_costs_one_line(command, tmp_path, words, mistake):
     leave_run(tmp_path / "run")
     code, _, err = command("report", *words)
     assert code == 2 and err.startswith(mistake) and err.count("\n") == 1
+
+
+def test_the_texts_of_a_table_are_no_formulas_and_have_no_control_characters(tmp_path):
+    names = ["=SUM(A1)", "+1", "-1", "@a", "a\x1b[31m\nb", "c"]
+    for seed, name in enumerate(names):
+        leave_run(tmp_path / "runs" / name, seed=seed, scores=(-float(seed),))
+    hpamdp.report(tmp_path / "runs", to=tmp_path / "runs")
+    rows = read_table(tmp_path / "runs")
+    assert {row["folder"] for row in rows} == {"'=SUM(A1)", "'+1", "'-1", "'@a", r"a\x1b[31m\nb", "c"}
+    assert "-5.0" in {row["eval/score"] for row in rows}, "numbers stay"

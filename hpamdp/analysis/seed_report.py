@@ -30,6 +30,7 @@ from hpamdp.files import regular_size, replacing
 from hpamdp.messages import duration, file_and_reason, one_line, say
 from hpamdp.metrics_file import EVALUATION
 
+_FORMULA = ("=", "+", "-", "@")  # how a formula of a spreadsheet begins
 _DESCRIPTION = """\
 Compare runs by their means over seeds.
 
@@ -149,16 +150,25 @@ class Report:
     def _run_rows(self, folder: Path) -> list[dict[str, Any]]:
         return [
             {
-                "configuration": each.name,
-                "folder": os.path.relpath(run.folder, folder),
+                "configuration": _as_cell(each.name),
+                "folder": _as_cell(os.path.relpath(run.folder, folder)),
                 "seed": run.seed,
                 "state": run.state,
-                self.metric: run.value,
+                _as_cell(self.metric): run.value,
                 **{name: run.effort(name) for name in ("frames", "wall_s", "cpu_s")},
             }
             for each in self.configurations
             for run in each.runs
         ]
+
+
+def _as_cell(text: str) -> str:
+    """Return a text for a table, with escapes for control characters.
+
+    An apostrophe comes first if a spreadsheet would take the text for a formula.
+    """
+    shown = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+    return f"'{shown}" if shown.startswith(_FORMULA) else shown
 
 
 def report_on(folders: Iterable[Path | str], metric: str = DEFAULT_METRIC) -> Report:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -87,7 +88,7 @@ def train(
     _check_what_needs_runs(settings, output_dir)
     if goes_on:
         settings = {**settings, "resume": None}
-    with torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
+    with _warned_if_concurrent(), torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
         with own_hydra(), composed(*_given(problem, settings, config_dirs)) as cfg:
             words = job_overrides()
             check_no_sweep(cfg, words)
@@ -183,6 +184,22 @@ def _checked_callbacks(given: Any) -> list[Callback]:
         raise ConfigError(f"callbacks={as_code(given)}: must be a list of objects of subclasses of hpamdp.Callback")
     check_callbacks(callbacks)
     return [*callbacks]
+
+
+_running = threading.Lock()  # held while a training of this process runs
+
+
+@contextmanager
+def _warned_if_concurrent() -> Iterator[None]:
+    """Warn if another training runs in this process."""
+    is_first = _running.acquire(blocking=False)
+    if not is_first:
+        warn("another training runs in this process; they share torch's random numbers, so no seed repeats them")
+    try:
+        yield
+    finally:
+        if is_first:
+            _running.release()
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from hpamdp import keys
 from hpamdp.analysis import film
 from hpamdp.config.schema import Config
 from hpamdp.files import replacing
+from hpamdp.messages import warn
 from hpamdp.metrics_file import CPU_SECONDS, FRAMES, WALL_SECONDS, Metrics, rows_up_to
 from hpamdp.policies.base import Learner
 from hpamdp.policies.random_agent import random_agent
@@ -77,8 +78,12 @@ class Recorder:
         self._random_scores = parts.evaluation.measure(parts.evaluation.run(random.policy))
 
     def resume_from(self, folder: Path, frames: int) -> None:
-        """Start the metrics with the rows of the run in `folder`, up to `frames`."""
-        self.metrics = Metrics(self.metrics.path, rows_up_to(frames, folder / METRICS_NAME))
+        """Start the metrics with the rows of the run in `folder`, up to `frames`; warn if there are none."""
+        source = folder / METRICS_NAME
+        rows = rows_up_to(frames, source)
+        if not rows and frames > 0:
+            warn(f"{source}: is missing or damaged; the run goes on without the rows up to {FRAMES}={frames}")
+        self.metrics = Metrics(self.metrics.path, rows)
         self._resumed_from = folder
 
     def start(self) -> None:
