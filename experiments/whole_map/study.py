@@ -98,14 +98,14 @@ def table(rows: Rows) -> str:
 
 
 def choosing(rows: Rows) -> str:
-    """Return a line for each cell of choosing selectors with two seeds or more: score, and score over one boat."""
+    """Return a line for each cell of choosing selectors with three seeds or more: score, and score over one boat."""
     lines = [
         "| selector | learner | presses | n | score | below the ceiling | over one boat | oracle's | weighted | "
         "regret | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for (high, low, frames), runs in groups(rows, "high", "low", "frames").items():
-        if high == "none" or len(runs) < 2:
+        if high == "none" or len(runs) < 3:
             continue
         alone = single(rows, low)
         columns = ("score", "ceiling", "agreement", "weighted", "regret", "cpu_s")
