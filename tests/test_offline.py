@@ -63,7 +63,7 @@ def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, pat
 def test_a_run_that_fails_in_its_first_evaluation_keeps_its_data_set(path, tmp_path, monkeypatch):
     given = overrides(path, "iql")
     with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
-        patched.setattr(Trainer, "_evaluate", lambda self, bar: 1 / 0)
+        patched.setattr(Trainer, "_evaluate", lambda self, bar, request: 1 / 0)
         run(compose_config(given), tmp_path / "first", given)
     resumed = ["mode=offline", f"resume={tmp_path / 'first'}"]
     assert run(compose_config(resumed), tmp_path / "second", resumed) == 0
@@ -77,7 +77,7 @@ def test_a_run_that_fails_at_its_start_adds_its_data_set_once(path, tmp_path, mo
     words = ["data=human", "data.checksum=null", f"data.path={path}", "high=linucb", "low=pdqn", "low.warmup_steps=8"]
     words += ["num_envs=4", "steps_per_batch=4", "total_frames=16", "eval.layouts=4", "eval.every=0", "film=false"]
     with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
-        patched.setattr(Trainer, "_evaluate", lambda self, bar: 1 / 0)
+        patched.setattr(Trainer, "_evaluate", lambda self, bar, request: 1 / 0)
         run(compose_config(words), tmp_path, words)
     trainer = begin(make_config(words), checkpoint.find(tmp_path, "resume"), tmp_path)  # as `resume=auto` does
     assert trainer.frames == 0
