@@ -77,6 +77,16 @@ def flag(name: str, value: Any) -> None:
         raise ConfigError(f"{name}={as_code(value)}: must be True or False")
 
 
+def count(name: str, value: Any) -> None:
+    """Refuse an argument that is no whole number of at least 1.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ConfigError(f"{name}={as_code(value)}: must be a whole number of at least 1")
+
+
 def choices_and_settings(given: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, Any]]]:
     """Return the words for the choices among arguments such as `low="hppo"` and `seed=1`, and the other arguments.
 

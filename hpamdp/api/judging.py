@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from hpamdp.api.arguments import path_argument
-from hpamdp.config.errors import ConfigError
-from hpamdp.messages import as_code
+from hpamdp.api.arguments import count, path_argument
 from hpamdp.run.judge import DEFAULT_EPISODES, judged
 
 
@@ -38,7 +36,6 @@ def judge(*agents: str | Path, data: str, episodes: int = DEFAULT_EPISODES, **se
         >>> import hpamdp
         >>> rows = hpamdp.judge("outputs/a", "outputs/b", data="human")  # doctest: +SKIP
     """
-    if isinstance(episodes, bool) or not isinstance(episodes, int) or episodes < 1:
-        raise ConfigError(f"episodes={as_code(episodes)}: must be a whole number of at least 1")
+    count("episodes", episodes)
     paths = [str(path_argument("agents", agent)) for agent in agents]
     return judged(paths, [f"data={data}"], list(settings.items()), episodes=episodes)

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hpamdp.api.arguments import path_argument
+from hpamdp.api.arguments import count, path_argument
 from hpamdp.api.training import train
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.search_space import Range, Space, parsed_space, space_of_learner, split_words
-from hpamdp.messages import INTERRUPTED, as_code, one_line, reason_of, say
+from hpamdp.messages import INTERRUPTED, one_line, reason_of, say
 from hpamdp.run.callbacks import Callback
 from hpamdp.run.players import whole_number
 from hpamdp.run.trainer import DivergedError
@@ -185,8 +185,7 @@ def _search(objective: _Objective, trials: int, folder: Any, *, progress: bool) 
         import optuna
     except ImportError as error:
         raise ConfigError("Optuna is not installed; pip install 'hpamdp[tune]'") from error
-    if isinstance(trials, bool) or not isinstance(trials, int) or trials < 1:
-        raise ConfigError(f"trials={as_code(trials)}: must be a whole number of at least 1")
+    count("trials", trials)
     if not objective.space:
         raise ConfigError("tune: nothing to search; every setting of the space is given")
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # it would warn of an error that is raised, with a traceback

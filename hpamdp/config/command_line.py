@@ -102,12 +102,12 @@ class CommandLine:
 
     def with_replaced(self, words: Mapping[str, str]) -> CommandLine:
         """Return the command line with other words for the settings of these names."""
-        overrides = {each.key_or_group: each for each in _parsed([*words.values()])}
+        overrides = {each.key_or_group: each for each in parsed_words([*words.values()])}
         return replace(self, overrides=tuple(overrides.get(each.key_or_group, each) for each in self.overrides))
 
     def with_words(self, words: Sequence[str]) -> CommandLine:
         """Return the command line with more words in front of its settings."""
-        return replace(self, overrides=(*_parsed(words), *self.overrides))
+        return replace(self, overrides=(*parsed_words(words), *self.overrides))
 
 
 def parse(argv: Sequence[str], conf: Path) -> CommandLine:
@@ -124,7 +124,7 @@ def parse(argv: Sequence[str], conf: Path) -> CommandLine:
     arguments = vars(_parser().parse_args(argv))
     words = arguments.pop("overrides")
     flags = {name: arguments[name.replace("-", "_")] for name in _FLAGS}
-    line = CommandLine(flags, _parsed(words))
+    line = CommandLine(flags, parsed_words(words))
     _check_groups(line, conf)
     return _with_completed_folders(line)
 
@@ -142,7 +142,7 @@ def _with_completed_folders(line: CommandLine) -> CommandLine:
     if folder is not None:
         paths = [folder_path(folder, "--config-dir"), *paths]
     others = [override for override in line.overrides if override is not given]
-    return CommandLine({**line.flags, "config-dir": None}, (*_parsed([search_word(paths)]), *others))
+    return CommandLine({**line.flags, "config-dir": None}, (*parsed_words([search_word(paths)]), *others))
 
 
 def folder_path(folder: str | Path, where: str) -> str:
@@ -187,7 +187,12 @@ def _refuse(message: str) -> NoReturn:
     raise ConfigError(f"{message}; see --help")
 
 
-def _parsed(words: Sequence[str]) -> tuple[Override, ...]:
+def parsed_words(words: Sequence[str]) -> tuple[Override, ...]:
+    """Return words as Hydra's grammar reads them.
+
+    Raises:
+        OverrideParseException: a word is not in the grammar.
+    """
     return tuple(OverridesParser.create().parse_overrides(list(words)))
 
 

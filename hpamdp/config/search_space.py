@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import yaml
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, QuotedString
-from hydra.errors import HydraException
+from hydra.errors import OverrideParseException
 
 from hpamdp.complaints import no_such
+from hpamdp.config.command_line import parsed_words
 from hpamdp.config.compose import conf_dir, names_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import not_understood
@@ -70,13 +70,11 @@ def split_words(words: Sequence[str]) -> tuple[dict[str, Any], Space]:
     return settings, {_name(each): _values(each) for each in overrides if each.is_sweep_override()}
 
 
-def _parsed(words: Sequence[str]) -> list[Override]:
-    overrides = []
-    for word in words:
-        try:
-            overrides += OverridesParser.create().parse_overrides([word])
-        except HydraException as error:
-            raise ConfigError(not_understood(word)) from error
+def _parsed(words: Sequence[str]) -> tuple[Override, ...]:
+    try:
+        overrides = parsed_words(words)
+    except OverrideParseException as error:
+        raise ConfigError(not_understood(error.override)) from error
     deleted = next((each for each in overrides if each.is_delete()), None)
     if deleted is not None:
         raise ConfigError(f"{deleted.input_line}: a search gives settings values; leave it out")
