@@ -78,7 +78,7 @@ class Recorder:
         self._random_scores = parts.evaluation.measure(parts.evaluation.run(random.policy))
 
     def resume_from(self, folder: Path, frames: int) -> None:
-        """Start the metrics with the rows of the run in `folder`, up to `frames`; warn if there are none."""
+        """Start the metrics with the rows of the run in `folder`, up to `frames`; warn if it has no such row."""
         source = folder / METRICS_NAME
         rows = rows_up_to(frames, source)
         if not rows and frames > 0:
@@ -148,12 +148,12 @@ class Recorder:
         if self._action_counts is None:
             return {}
         sizes = self.parts.agent.specs.components.sizes
-        parts = enumerate(self._action_counts.split(list(sizes)))
-        shares = {(place, i): share for place, part in parts for i, share in enumerate((part / part.sum()).tolist())}
-        self._action_counts = None
+        counts, self._action_counts = self._action_counts.split(list(sizes)), None
+        prefixes = ["train/action_"] if len(sizes) == 1 else [f"train/action_{place}_" for place in range(len(sizes))]
         return {
-            f"train/action_{i}" if len(sizes) == 1 else f"train/action_{place}_{i}": share
-            for (place, i), share in shares.items()
+            f"{prefix}{i}": share
+            for prefix, own in zip(prefixes, counts, strict=True)
+            for i, share in enumerate((own / own.sum()).tolist())
         }
 
     def _results(self, steps: TensorDictBase) -> TensorDictBase:

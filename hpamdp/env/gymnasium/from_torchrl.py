@@ -95,13 +95,8 @@ class FromTorchRL(gymnasium.Env):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("step: call reset first")
         for key, spec in self._specs.items():
-            value = torch.as_tensor(np.asarray(action[_name(key)] if len(self._specs) > 1 else action))
-            if isinstance(spec, OneHot) and not isinstance(spec, MultiOneHot):
-                value = torch.nn.functional.one_hot(value.long(), spec.shape[-1])
-            elif isinstance(spec, MultiOneHot):
-                hot = zip(value.long(), spec.nvec, strict=True)
-                value = torch.cat([torch.nn.functional.one_hot(each, int(num)) for each, num in hot])
-            self._state.set(key, value.to(spec.device or "cpu", spec.dtype).reshape(spec.shape))
+            value = np.asarray(action[_name(key)] if len(self._specs) > 1 else action)
+            self._state.set(key, spec.encode(value).reshape(spec.shape))
         with self._own_random_numbers():
             stepped = self._env.step(self._state)["next"]
         self._state = step_mdp(self._state)

@@ -34,7 +34,7 @@ class RDDLEnv(SimulatorEnv):
 
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
         """Return the default values of numbers that are always set, or the nearest within their bounds."""
-        low, high = (np.array(each) for each in (self.ranges()["parameter_low"], self.ranges()["parameter_high"]))
+        low, high = self._copies.actions.own_low, self._copies.actions.own_high
         defaults = self._copies.call("default_numbers")[0]
         if not defaults:
             return None
