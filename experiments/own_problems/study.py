@@ -52,7 +52,7 @@ def way_at(run: Rows, cpu_s: float) -> float:
 
 
 def seconds_to(run: Rows, level: float) -> float:
-    """Return the CPU seconds of the first score of at least `level`; infinity if there is none."""
+    """Return the CPU seconds of the first score of at least `level`; infinity if no score is that high."""
     first = first_at(run, "way", level)
     return float("inf") if first is None else first["cpu_s"]
 

@@ -229,7 +229,7 @@ def check_saved_options(config: Config, env: PAMDPEnv, source: Path | None) -> N
 
 
 def warn_of_other_ranges(agent: str, before: Mapping[str, Sequence[float]], env: PAMDPEnv) -> None:
-    """Warn if the numbers of an environment mean something else than those that an agent has learned with.
+    """Warn if an agent has learned with other bounds, scales or entries than an environment has.
 
     Args:
         agent: what the line calls the agent.

@@ -25,7 +25,7 @@ class RDDLRules(Settings):
     files: Annotated[list[str], Pair] | None = None
     """Instead of `domain` and `instance`, two files of your own, as in [domain.rddl,instance.rddl]."""
     bounds: dict[str, Annotated[list[float], Pair]] | None = None
-    """Lowest and highest values of action fluents, as in {ship:[0,100]}, for those that the domain leaves unbounded.
+    """Lowest and highest values of action fluents that the domain leaves unbounded, as in {ship:[0,100]}.
 
     A name stands for all fluents of this name, or for one of them, as in {ship___w1:[0,50]}. Where the domain has
     bounds, too, the narrower ones count.

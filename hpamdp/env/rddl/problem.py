@@ -245,7 +245,7 @@ class RDDLProblem(gymnasium.Env):
 
 
 def _space_of_number(low: float, high: float, *, is_whole: bool) -> spaces.Space | float | None:
-    """Return the space of the numbers between two bounds; the number itself if there is one, None if there is none."""
+    """Return the space of the numbers between two bounds; a single number itself, None if no number lies there."""
     if is_whole:
         low, high = float(math.ceil(low)), float(math.floor(high))
     if low >= high:
