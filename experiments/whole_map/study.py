@@ -120,8 +120,12 @@ def choosing(rows: Rows) -> str:
 
 
 def draw(curves: Rows, path: Path) -> None:
-    """Draw the score, and the practice of one controller, over a run: a column for each learner that has curves."""
-    lows = [low for low in LEARNERS if len({row["step"] for row in curves if row["low"] == low}) > 3]
+    """Draw the score, and the practice of one controller, over a run: a column for each learner that has curves.
+
+    Runs with three evaluations or fewer, such as those with `eval.every=0`, have none.
+    """
+    curves = [row for run in groups(curves, *CELL, "seed").values() if len(run) > 3 for row in run]
+    lows = [low for low in LEARNERS if any(row["low"] == low for row in curves)]
     figure = Figure(figsize=(2.7 * len(lows), 4.6), layout="constrained")
     axes = figure.subplots(2, len(lows), sharey="row", squeeze=False)
     for place, low in enumerate(lows):
