@@ -21,7 +21,7 @@ yaml file names the class and holds the values that differ from these defaults. 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -43,6 +43,7 @@ PositiveFraction = Annotated[float, Field(gt=0.0, le=1.0)]
 # Environments, steps or episodes that are in memory at once.
 NumAtOnce = Annotated[PositiveInt, Field(le=10_000_000)]
 Expectile = Annotated[float, Field(ge=0.5, lt=1.0)]  # 0.5 is the mean
+ScheduleShape = Literal["linear", "cosine", "constant"]
 
 
 def _check_rate(rate: float) -> float:

@@ -302,8 +302,16 @@ def test_further_passes_of_the_critic_leave_the_actors_alone():
         assert torch.equal(parameter, more.actor.get_parameter(name)), name
 
 
-def test_learning_rate_and_scale_are_annealed_over_the_steps_of_the_whole_run():
-    learner = make(anneal_steps=200, minibatch_size=2)
+@pytest.mark.parametrize(
+    ("shape", "expected"),
+    [
+        ("linear", [3e-3, 1.65e-3, 3e-4, 3e-4]),
+        ("cosine", [3e-3, 1.65e-3, 3e-4, 3e-4]),
+        ("constant", [3e-3, 3e-3, 3e-3, 3e-3]),
+    ],
+)
+def test_learning_rate_and_scale_are_annealed_over_the_steps_of_the_whole_run(shape, expected):
+    learner = make(anneal_steps=200, minibatch_size=2, lr_schedule=shape)
     td = random_rows(learner, 50, 2)
     mask = everything(td)
     mask[1:] = False
@@ -312,7 +320,7 @@ def test_learning_rate_and_scale_are_annealed_over_the_steps_of_the_whole_run():
         learner.learn(td, mask)
         rates.append(learner.optimizer.param_groups[0]["lr"])
         scales.append(learner.actor.log_min_scale.exp().item())
-    assert rates == pytest.approx([3e-3, 1.65e-3, 3e-4, 3e-4])
+    assert rates == pytest.approx(expected)
     assert scales == pytest.approx([0.05, 0.0005**0.5, 0.01, 0.01])
 
 

@@ -283,13 +283,18 @@ def test_a_problem_without_parameters_is_refused():
         make(PAMDPSpecs(4, (), (0, 0), (), ()))
 
 
-def test_the_learning_rates_fall_to_their_final_fraction():
-    learner = make(lr_final_fraction=0.1, lr_steps=1000, codec_lr=2e-3, actor_lr=1e-3, critic_lr=3e-3)
+@pytest.mark.parametrize(
+    ("shape", "fractions"),
+    [("linear", (1.0, 0.775, 0.1, 0.1)), ("cosine", (1.0, 0.868198, 0.1, 0.1)), ("constant", (1.0, 1.0, 1.0, 1.0))],
+)
+def test_the_learning_rates_fall_to_their_final_fraction(shape, fractions):
+    rates_at_first = {"codec_lr": 2e-3, "actor_lr": 1e-3, "critic_lr": 3e-3}
+    learner = make(lr_final_fraction=0.1, lr_steps=1000, lr_schedule=shape, **rates_at_first)
     rates = []
-    for frames in (0, 500, 1000, 5000):
+    for frames in (0, 250, 1000, 5000):
         learner.on_progress(frames)
         rates.append([learner.optimizers[name].param_groups[0]["lr"] for name in ("codec", "actor", "critics")])
-    assert rates == [pytest.approx([f * 2e-3, f * 1e-3, f * 3e-3]) for f in (1.0, 0.55, 0.1, 0.1)]
+    assert rates == [pytest.approx([f * 2e-3, f * 1e-3, f * 3e-3]) for f in fractions]
 
 
 def random_rows(learner: HyAR, num: int, *, is_done: bool = True) -> TensorDict:

@@ -30,7 +30,7 @@ from hpamdp.policies.base import Learner
 from hpamdp.policies.exploration.base import Exploration, Explored
 from hpamdp.policies.exploration.options import CARDS, HeldOptions
 from hpamdp.policies.masks import random_discrete
-from hpamdp.policies.shared.exploration import linear_schedule
+from hpamdp.policies.shared.exploration import schedule
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -170,7 +170,7 @@ class Held(Exploration):
         options = self.options
         self.frames += mask.sum()
         if options.epsilon_final is not None and options.epsilon > 0.0:
-            fraction = linear_schedule(int(self.frames), options.epsilon_steps, options.epsilon_final / options.epsilon)
+            fraction = schedule(int(self.frames), options.epsilon_steps, options.epsilon_final / options.epsilon)
             self.policy.epsilon.fill_(options.epsilon * fraction)
         if not mask.any():
             return Explored(None, {})

@@ -30,7 +30,7 @@ from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
 from hpamdp.policies.high_level.options import CARDS, MetaCriticOptions
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.exploration import linear_schedule
+from hpamdp.policies.shared.exploration import schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.replay import first_multiple, packed_states, unpacked_states
@@ -87,7 +87,7 @@ class MetaCritic(RemembersDecisions):
             return 1.0
         if self.options.exploration == "ucb":
             return 0.0
-        return linear_schedule(decisions_after_warmup, self.options.epsilon_decisions, self.options.epsilon_final)
+        return schedule(decisions_after_warmup, self.options.epsilon_decisions, self.options.epsilon_final)
 
     @torch.no_grad()
     def select(self, td: TensorDictBase) -> Tensor:

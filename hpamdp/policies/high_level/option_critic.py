@@ -37,7 +37,7 @@ from hpamdp.acting import is_greedy
 from hpamdp.devices import checked_device
 from hpamdp.policies.high_level.options import CARDS, OptionCriticOptions
 from hpamdp.policies.masks import masked_values, random_choice
-from hpamdp.policies.shared.exploration import linear_schedule
+from hpamdp.policies.shared.exploration import schedule
 from hpamdp.policies.shared.networks import mlp, polyak_update
 from hpamdp.policies.shared.replay import first_multiple
 from hpamdp.policies.shared.selector_memory import RemembersDecisions
@@ -92,7 +92,7 @@ class OptionCritic(RemembersDecisions):
         steps_after_warmup = int(self.num_steps) - self.options.warmup_steps
         if steps_after_warmup < 0:
             return 1.0
-        return linear_schedule(steps_after_warmup, self.options.epsilon_steps, self.options.epsilon_final)
+        return schedule(steps_after_warmup, self.options.epsilon_steps, self.options.epsilon_final)
 
     @torch.no_grad()
     def select(self, td: TensorDictBase) -> Tensor:

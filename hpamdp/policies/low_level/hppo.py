@@ -40,6 +40,7 @@ from hpamdp.policies.base import Learner, States, step_discounts
 from hpamdp.policies.low_level.hppo_options import CARDS, HPPOOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.credit import CreditCritic
+from hpamdp.policies.shared.exploration import schedule_progress
 from hpamdp.policies.shared.exported_policy import exported_actor
 from hpamdp.policies.shared.hybrid_actor import RAW, HybridActor, HybridPolicy, hidden_layers
 from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
@@ -130,7 +131,7 @@ class HPPO(OnPolicy, Learner):
         if self.credit_critic is not None:
             rows["advantage"] = rows["advantage"].unsqueeze(-1) - rows[BASELINE]
         rows["advantage"] = normalised(rows["advantage"], rows.get(OWN, None), least=options.least_deviation)
-        rate = options.lr + progress * (options.lr_final - options.lr)
+        rate = options.lr + schedule_progress(progress, options.lr_schedule) * (options.lr_final - options.lr)
         for group, first_rate in zip(self.optimizer.param_groups, self.first_rates, strict=True):
             group["lr"] = rate * (first_rate / options.lr)
         # A tensor, because compiled code would be compiled again for each new number.

@@ -9,7 +9,7 @@ from typing_extensions import Self
 
 from hpamdp.cards import ActionFeature, LearnerCard
 from hpamdp.policies.shared.options import Credit, HeadOptions, InitialParameters, MemoryOptions, OnPolicyOptions
-from hpamdp.settings import Fraction, LearningRate, Schedule, Widths
+from hpamdp.settings import Fraction, LearningRate, Schedule, ScheduleShape, Widths
 
 
 class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
@@ -57,7 +57,9 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     lr: LearningRate = 1e-3
     """Learning rate of actors and critic at the start."""
     lr_final: Fraction = 1e-4
-    """Learning rate after `anneal_steps`; it falls linearly from `lr` to this value."""
+    """Learning rate after `anneal_steps`; it falls from `lr` to this value."""
+    lr_schedule: ScheduleShape = "linear"
+    """How the learning rate falls: along a line or a cosine, or not at all."""
     critic_lr: LearningRate | None = None
     """Learning rate of the critic at the start. It falls by the same factor as `lr`. If null, it is `lr`."""
     critic_epochs: Annotated[int, Field(ge=0, le=1000)] = 0

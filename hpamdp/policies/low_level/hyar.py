@@ -62,7 +62,7 @@ from hpamdp.policies.low_level.hyar_codec import HybridCodec
 from hpamdp.policies.low_level.hyar_options import CARDS, HyAROptions
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.actor_search import even_normal, in_pieces, searching_actor_loss, with_variations
-from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
+from hpamdp.policies.shared.exploration import schedule, with_exploring_noise
 from hpamdp.policies.shared.gradients import adam, set_learning_rates
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
@@ -505,12 +505,12 @@ class HyAR(ReplayLearner):
     def on_progress(self, steps: int) -> None:
         """Lower the probability of random actions, the noise and the learning rates."""
         options = self.options
-        self.policy.epsilon.fill_(linear_schedule(steps, options.epsilon_steps, options.epsilon_final))
+        self.policy.epsilon.fill_(schedule(steps, options.epsilon_steps, options.epsilon_final))
         if options.noise_initial is not None:
             final = options.parameter_noise / options.noise_initial
-            part = linear_schedule(int(self.episodes), options.noise_episodes, final)
+            part = schedule(int(self.episodes), options.noise_episodes, final)
             self.policy.noise.fill_(options.noise_initial * part)
-        fraction = linear_schedule(steps, options.lr_steps, options.lr_final_fraction)
+        fraction = schedule(steps, options.lr_steps, options.lr_final_fraction, options.lr_schedule)
         set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
     def fit_latent_range(self) -> None:

@@ -38,7 +38,7 @@ from torch.nn import functional as F
 from hpamdp.policies.base import States
 from hpamdp.policies.low_level.iql_options import CARDS, IQLOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
-from hpamdp.policies.shared.exploration import cosine_schedule
+from hpamdp.policies.shared.exploration import schedule
 from hpamdp.policies.shared.gradients import adam, expectile_loss, set_learning_rates
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, JointCritics, mlp, polyak_update
@@ -90,7 +90,7 @@ class IQL(ReplayLearner):
         scalars = self.gradient_step("critics", self.critic_loss, sample) | of_value | {"q": q.mean()}
         polyak_update(self.target_critics, self.critics, self.options.tau)
         if self.options.actor_lr_updates > 0:
-            fraction = cosine_schedule(int(self.actor_updates), self.options.actor_lr_updates)
+            fraction = schedule(int(self.actor_updates), self.options.actor_lr_updates, 0.0, "cosine")
             set_learning_rates(self.optimizers, {"actor": self.options.actor_lr}, fraction)
             self.actor_updates += 1
         return scalars | self.gradient_step("actor", self.actor_loss, sample, self.allowed(sample), q)

@@ -42,7 +42,7 @@ from hpamdp.components import Components
 from hpamdp.policies.base import States
 from hpamdp.policies.low_level.paddpg_options import CARDS, PADDPGOptions
 from hpamdp.policies.masks import masked_values, zero_fixed
-from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
+from hpamdp.policies.shared.exploration import schedule, with_exploring_noise
 from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
@@ -210,7 +210,7 @@ class PADDPG(ReplayLearner):
 
     def on_progress(self, steps: int) -> None:
         """Lower the probability of random actions."""
-        self.policy.epsilon.fill_(linear_schedule(steps, self.options.epsilon_steps, self.options.epsilon_final))
+        self.policy.epsilon.fill_(schedule(steps, self.options.epsilon_steps, self.options.epsilon_final))
 
 
 def q_values(critics: EnsembleMLP, state: Tensor, output: Tensor) -> Tensor:

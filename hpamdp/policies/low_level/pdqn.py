@@ -55,7 +55,7 @@ from hpamdp.policies.base import States, option_ends, step_discounts
 from hpamdp.policies.low_level.pdqn_options import CARDS, PDQNOptions
 from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete, zero_fixed
 from hpamdp.policies.shared.actor_search import even_normal, in_pieces, searching_actor_loss, with_variations
-from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
+from hpamdp.policies.shared.exploration import schedule, with_exploring_noise
 from hpamdp.policies.shared.gradients import adam, set_learning_rates
 from hpamdp.policies.shared.networks import (
     HybridCritics,
@@ -341,7 +341,7 @@ class PDQN(ReplayLearner):
         self.episodes += (batch["next", keys.DONE].squeeze(-1) & mask).sum()
         options = self.options
         if options.epsilon_episodes is not None:
-            fallen = linear_schedule(int(self.episodes), options.epsilon_episodes, options.epsilon_final)
+            fallen = schedule(int(self.episodes), options.epsilon_episodes, options.epsilon_final)
             self.policy.epsilon.fill_(fallen)
         return super().learn(batch, mask)
 
@@ -349,8 +349,8 @@ class PDQN(ReplayLearner):
         """Lower the probability of random actions, and the learning rates."""
         options = self.options
         if options.epsilon_episodes is None:
-            self.policy.epsilon.fill_(linear_schedule(steps, options.epsilon_steps, options.epsilon_final))
-        fraction = linear_schedule(steps, options.lr_steps, options.lr_final_fraction)
+            self.policy.epsilon.fill_(schedule(steps, options.epsilon_steps, options.epsilon_final))
+        fraction = schedule(steps, options.lr_steps, options.lr_final_fraction, options.lr_schedule)
         set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
     def num_updates(self, steps: int) -> int:

@@ -1,4 +1,4 @@
-"""How replay learners explore: noise on the parameters, and random actions in the place of some."""
+"""Noise on exploring parameters, and schedules of what falls during training."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ import math
 import torch
 from torch import Tensor
 
+from hpamdp.settings import ScheduleShape
+
 
 def with_exploring_noise(unit_actions: Tensor, deviation: float | Tensor) -> Tensor:
     """Return parameters in [-1, 1], of any shape, with Gaussian noise of this standard deviation."""
     return (unit_actions + deviation * torch.randn_like(unit_actions)).clamp(-1.0, 1.0)
 
 
-def linear_schedule(time: int, over: int, final: float) -> float:
-    """Return a fraction that falls linearly from 1 to `final` within a time `over`, both in the same unit.
-
-    If `over` is 0, it has fallen at once.
-    """
-    return 1.0 + (final - 1.0) * (min(1.0, time / over) if over > 0 else 1.0)
+def schedule(time: int, over: int, final: float, shape: ScheduleShape = "linear") -> float:
+    """Return a fraction that falls from 1 to `final` within a time `over`, both in the same unit."""
+    progress = schedule_progress(time / over if over > 0 else 1.0, shape)
+    return 1.0 + (final - 1.0) * progress
 
 
-def cosine_schedule(time: int, over: int) -> float:
-    """Return a fraction that falls from 1 to 0 along half a cosine within a time `over`, both in the same unit."""
-    return 0.5 * (1.0 + math.cos(math.pi * min(1.0, time / max(1, over))))
+def schedule_progress(time: float, shape: ScheduleShape) -> float:
+    """Return how far a schedule has come, from 0 to 1, after a fraction `time` of its length; 0 if it is constant."""
+    time = min(1.0, time)
+    return {"linear": time, "cosine": 0.5 * (1.0 - math.cos(math.pi * time)), "constant": 0.0}[shape]

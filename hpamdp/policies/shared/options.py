@@ -18,6 +18,7 @@ from hpamdp.settings import (
     OwnSteps,
     PositiveFraction,
     Schedule,
+    ScheduleShape,
     Settings,
     Widths,
 )
@@ -234,6 +235,8 @@ class SearchingActorOptions(EpsilonOptions, ActorCriticOptions):
     """Critic updates for each update of the actor."""
     lr_final_fraction: Annotated[PositiveFraction, OwnSteps()] = 1.0
     """Fraction of the learning rates that is left after `lr_steps`; 1 keeps them constant."""
+    lr_schedule: ScheduleShape = "linear"
+    """How the learning rates fall: along a line or a cosine, or not at all."""
     lr_steps: Annotated[NonNegativeInt, OwnSteps(), Schedule()] = 100_000
     """The learner's own steps, after its warm-up, within which the learning rates fall.
 
@@ -254,6 +257,12 @@ class SearchingActorOptions(EpsilonOptions, ActorCriticOptions):
     """Variations of the actor's actions from which the greedy policy takes the one with the highest value."""
     greedy_noise: Annotated[NonNegativeFloat, OnlyWith("greedy_samples")] = 0.3
     """Standard deviation of these variations, in units where the bounds are [-1, 1]."""
+
+    @model_validator(mode="after")
+    def _check_schedule(self) -> Self:
+        if self.lr_schedule == "cosine" and self.lr_final_fraction == 1.0:
+            raise ValueError("lr_schedule=cosine: needs lr_final_fraction below 1")
+        return self
 
 
 class EndValueOptions(Settings):
