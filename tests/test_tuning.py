@@ -88,6 +88,8 @@ def test_a_space_has_the_grammar_of_sweeps_or_lists():
         ({"low": "hpo"}, r"low=hpo: no such search space; did you mean hppo\?"),
         ({"trials": 0}, "trials=0: must be a whole number of at least 1"),
         ({"callbacks": []}, "^callbacks: trials have none of their own; leave it out$"),
+        ({"objective": "data", "data": "human"}, r"^objective=data: data.held_out must name the people whose"),
+        ({"objective": "loss"}, "^objective=loss: must be 'score' or 'data'$"),
     ],
 )
 @needs_optuna
@@ -133,6 +135,24 @@ def test_a_search_in_a_folder_goes_on_and_refuses_another_one(monkeypatch, tmp_p
     assert again == second and len(run.given) == 6
     with pytest.raises(hpamdp.ConfigError, match="has another search; give a folder of its own"):
         hpamdp.tune("goal", trials=5, space=SPACE, folder=tmp_path / "tuned")
+
+
+@needs_optuna
+def test_held_out_people_choose_with_objective_data(monkeypatch):
+    """Scores in the environment rise towards a rate of 0.003; what the data say of the agents falls with the rate."""
+    run = Run(monkeypatch)
+
+    def judge(folder, **data):
+        assert folder == run.given[-1]["folder"] and data == {"data": "human", "data.held_out": [1, 2]}
+        return [{"return": 1.0 - run.given[-1]["low.lr"]}]
+
+    monkeypatch.setattr(tuning, "judge", judge)
+    best = hpamdp.tune(
+        "boatdock", trials=3, space={"low.lr": [1e-3, 3e-3, 1e-2]}, objective="data", low="iql",
+        mode="offline", data="human", **{"data.held_out": [1, 2]},
+    )  # fmt: skip
+    tried = [each["low.lr"] for each in run.given]
+    assert best.settings["low.lr"] == min(tried) and best.score == 1.0 - min(tried)
 
 
 @needs_optuna

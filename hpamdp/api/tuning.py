@@ -7,9 +7,11 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from hpamdp.api.arguments import count, path_argument
+from hpamdp.api.judging import judge
 from hpamdp.api.training import train
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.search_space import Range, Space, parsed_space, space_of_learner, split_words
@@ -32,7 +34,12 @@ Search for good settings of a learner with Optuna.
   hpamdp tune env=platform low=hppo 'low.lr=tag(log,interval(1e-4,1e-2))'
 
 Words with several values are the space, all others are fixed. The same command with the same --to goes on.
+
+  hpamdp tune mode=offline data=human data.held_out=[0,3,6,9] high=linucb low=iql --objective data
+
+chooses by the transitions of held-out people, as `hpamdp judge` does, and not by the environment.
 """
+Objective = Literal["score", "data"]
 TRIALS_NAME = "trials.log"
 _SEED = 1_000_000
 _DEFINITION = "definition"  # entry of a study: what is searched
@@ -45,8 +52,8 @@ class Tuned:
 
     Attributes:
         settings: the best settings by name, for `hpamdp.train(env, low=..., **settings)`.
-        score: of the evaluation at the end of this trial. The best of many trials is partly lucky, so score its
-            settings again with other seeds.
+        score: of the evaluation at the end of this trial, or what the data say of its agent. The best of many trials
+            is partly lucky, so score its settings again with other seeds.
         words: the settings as words of a command line.
         trials: number of trials, pruned ones included.
     """
@@ -87,6 +94,7 @@ def tune(
     trials: int = 40,
     space: Mapping[str, Any] | None = None,
     folder: str | Path | None = None,
+    objective: Objective = "score",
     seed: int = _SEED,
     progress: bool = True,
     **settings: Any,
@@ -109,6 +117,8 @@ def tune(
             learner, without the settings that are given.
         folder: keeps the trials, in a journal of Optuna. If it holds some already, the search goes on. Several
             processes may search in one folder at the same time. If None, nothing is written.
+        objective: `score`, that of the evaluation at the end; or `data`, the return that `hpamdp.judge` predicts from
+            the transitions of the people in `data.held_out`, without the environment. Then no trial is pruned.
         seed: of the search.
         progress: whether to print a line for each trial, and the best settings at the end.
         settings: those of all trials, as for `train`.
@@ -127,19 +137,25 @@ def tune(
         given = {*settings, *(f"low.{each}" for each in own)}
         space = space_of_learner(str(getattr(name, "__name__", name)), [*given])
     found = parsed_space(space)
-    return _search(_Objective(env, {"low": low, **settings}, found, seed), trials, folder, progress=progress)[0]
+    fixed = {"low": low, **settings}
+    return _search(_Objective(env, fixed, found, seed, objective), trials, folder, progress=progress)[0]
 
 
 @dataclass(frozen=True)
 class _Objective:
-    """What Optuna maximises: the score of a training with the settings of a trial."""
+    """What Optuna maximises: the score of a training with the settings of a trial, or what data say of its agent."""
 
     env: Any
     fixed: Mapping[str, Any]
     space: Space
     seed: int
+    by: Objective = "score"
 
     def __post_init__(self) -> None:
+        if self.by not in get_args(Objective):
+            raise ConfigError(f"objective={self.by}: must be 'score' or 'data'")
+        if self.by == "data" and not self.fixed.get("data.held_out"):
+            raise ConfigError("objective=data: data.held_out must name the people whose transitions judge")
         for name in ("callbacks", "folder", "progress"):
             if name in {*self.fixed, *self.space}:
                 raise ConfigError(f"{name}: trials have none of their own; leave it out")
@@ -147,10 +163,10 @@ class _Objective:
     @property
     def definition(self) -> str:
         """What distinguishes this search from another one, as text."""
-        return json.dumps([self.env, self.fixed, self.space, self.seed], default=_named)
+        return json.dumps([self.env, self.fixed, self.space, self.seed, self.by], default=_named)
 
     def __call__(self, trial: Trial) -> float:
-        """Return the score at the end of the training.
+        """Return the score at the end of the training, or the return that the data predict.
 
         Raises:
             TrialPruned: the training ended early, diverged, or was refused.
@@ -161,18 +177,23 @@ class _Objective:
 
         values = {name: _suggested(trial, name, each) for name, each in self.space.items()}
         report, seeds = _Report(trial), {"seed": self.seed + trial.number, "eval.seed": self.seed}
-        try:
-            train(self.env, callbacks=[report], progress=False, **{**seeds, **self.fixed, **values})
-        except (ConfigError, DivergedError) as error:
-            if isinstance(error, ConfigError) and trial.number == 0:
-                raise
-            trial.set_user_attr(_WHY, one_line(error))
-            raise TrialPruned from error
-        if report.is_pruned:
-            raise TrialPruned
-        if not report.is_over or report.score is None:
-            raise KeyboardInterrupt
-        return report.score
+        with TemporaryDirectory() as folder:
+            kept = {"folder": folder, "offline.eval_every": 0, "eval.layouts": 1} if self.by == "data" else {}
+            try:
+                train(self.env, callbacks=[report], progress=False, **{**seeds, **kept, **self.fixed, **values})
+            except (ConfigError, DivergedError) as error:
+                if isinstance(error, ConfigError) and trial.number == 0:
+                    raise
+                trial.set_user_attr(_WHY, one_line(error))
+                raise TrialPruned from error
+            if report.is_pruned:
+                raise TrialPruned
+            if not report.is_over or report.score is None:
+                raise KeyboardInterrupt
+            if self.by == "score":
+                return report.score
+            (row,) = judge(folder, **{name: each for name, each in self.fixed.items() if name.split(".")[0] == "data"})
+            return float(row["return"])
 
 
 def _search(objective: _Objective, trials: int, folder: Any, *, progress: bool) -> tuple[Tuned, bool]:
@@ -273,6 +294,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     )
     parser.add_argument("--trials", type=whole_number(1, 1_000_000), default=40, help="how many (40)")
     parser.add_argument("--to", type=Path, help="folder that keeps the trials")
+    parser.add_argument("--objective", choices=get_args(Objective), default="score", help="what chooses (score)")
     parser.add_argument("--seed", type=int, default=_SEED, help=f"of the search ({_SEED})")
     options = parser.parse_intermixed_args(words)
     settings, space = split_words(options.words)
@@ -280,5 +302,6 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     settings.setdefault("low", "hppo")
     if not space:
         space = parsed_space(space_of_learner(settings["low"], [*settings]))
-    _, is_finished = _search(_Objective(env, settings, space, options.seed), options.trials, options.to, progress=True)
+    objective = _Objective(env, settings, space, options.seed, options.objective)
+    _, is_finished = _search(objective, options.trials, options.to, progress=True)
     return 0 if is_finished else INTERRUPTED
