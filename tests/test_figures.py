@@ -9,7 +9,6 @@ from hpamdp.analysis.figures import draw_all, learning_curves
 from hpamdp.env.base import Metric
 from hpamdp.env.boatdock import figures as boats
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.run_files import saved_summary
 
 ALL = ["learning_curves.png", "trajectories.png", "choices.png"]
@@ -156,7 +155,7 @@ def test_the_best_possible_score_is_of_both_boats_only_where_the_agent_chose():
     assert boats.episode_title({**evaluation, "option": np.array([-1])}, 0) == "2.00 / 3.00  C"
 
 
-def choices_of_three(without=(), **changed):
+def choices_of_three(**changed):
     rng = np.random.default_rng(0)
     option = np.arange(30) % 3
     best = np.zeros((30, 3))
@@ -170,12 +169,7 @@ def choices_of_three(without=(), **changed):
         "optimum": best,
         **changed,
     }
-    kept = {name: array for name, array in evaluation.items() if name not in without}
-    return boats.draw(kept, {"boats": ["a", "b", "c"]}).get("choices.png")
-
-
-def test_the_choice_of_other_boats_is_left_out_if_one_of_its_arrays_is_missing():
-    assert choices_of_three(without=("optimum",)) is None
+    return boats.draw(evaluation, {"boats": ["a", "b", "c"]})["choices.png"]
 
 
 @pytest.mark.parametrize("num_unknown", [20, 30])
@@ -197,12 +191,6 @@ def test_only_episodes_with_a_known_better_boat_count_in_the_choice_of_people_s(
     title = axes.get_title() + axes.get_title(loc="left")
     assert title == "Congruent boat chosen (better boat in 100%)"
     assert (axes.lines[0].get_ydata() == 1.0).all()
-
-
-def test_a_problem_that_draws_nothing_gets_its_learning_curves(tmp_path):
-    write_metrics(tmp_path)
-    write_evaluation(tmp_path)
-    assert [path.name for path in draw_all(tmp_path, PlatformEnv, {}, arrays_of(tmp_path))] == ["learning_curves.png"]
 
 
 def test_the_choice_of_other_boats_is_drawn_by_their_names(tmp_path):

@@ -77,6 +77,8 @@ def test_no_link_and_no_directive_of_the_site_leads_nowhere(site):
     assert not site.problems
     expected = {"index.md", "studies/table1.md", "changelog.md", "api/hpamdp/env/base.md", "tutorials/python.md"}
     assert expected <= site.pages.keys()
+    code = "source/conf/env/moving.yaml.md"
+    assert f"](../{code})" in site.pages["domains/moving.md"] and "_target_: hpamdp" in site.pages[code]
 
 
 def test_the_first_page_of_the_reference_has_every_public_name_and_the_others_say_that_they_are_internal(hooks, site):
@@ -164,19 +166,6 @@ def test_every_domain_has_a_moving_picture_and_none_is_large():
         picture = page("env", name).with_suffix(".gif")
         assert f"]({picture.name})" in page("env", name).read_text()
         assert picture.stat().st_size < 400_000
-
-
-def test_links_to_code_lead_to_pages_that_show_it(hooks, tmp_path, monkeypatch):
-    (tmp_path / "docs/sub").mkdir(parents=True)
-    (tmp_path / "hpamdp").mkdir()
-    (tmp_path / "hpamdp/part.py").write_text('"""A module."""\n')
-    (tmp_path / "run.py").write_text("print(1)\n")
-    (tmp_path / "docs/sub/page.md").write_text("[a](../../run.py) [b](../../hpamdp/part.py)\n```\n[c](gone.py)\n```\n")
-    monkeypatch.setattr(hooks, "ROOT", tmp_path)
-    site = hooks.Site()
-    assert not site.problems
-    assert site.pages["sub/page.md"].startswith("[a](../source/run.py.md) [b](../api/hpamdp/part.md)\n")
-    assert "```python\nprint(1)\n```" in site.pages["source/run.py.md"]
 
 
 # What makes each one learn within a few steps, and seldom.
