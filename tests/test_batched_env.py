@@ -177,19 +177,6 @@ def test_a_limit_that_costs_may_terminate_instead(problem, by_kernel):
     assert last[keys.TERMINATED].all() and last[keys.DONE].all() and not last[keys.TRUNCATED].any()
 
 
-@pytest.mark.parametrize("env_id", ["hpamdp/Moving-v0", "hpamdp/Goal-v0", "hpamdp/HardGoal-v0"])
-def test_a_limit_that_terminates_does_so_in_every_gymnasium_form(env_id):
-    one = gymnasium.make(env_id, limit="terminated", max_steps=1)
-    one.reset(seed=0)
-    assert one.step(one.action_space.sample())[2:4] == (True, False)
-    many = gymnasium.make_vec(
-        env_id, num_envs=3, vectorization_mode="vector_entry_point", limit="terminated", max_steps=1
-    )
-    many.reset(seed=0)
-    _, _, terminated, truncated, _ = many.step(many.action_space.sample())
-    assert terminated.all() and not truncated.any()
-
-
 @each_with_a_limit
 def test_the_time_limit_truncates(problem):
     env = problem(64, max_steps=2)
@@ -438,28 +425,6 @@ def test_bad_actions_and_options_of_a_adapter_are_refused_in_one_line():
         BatchedEnvAdapter("hpamdp.env.catch_point.environment:CatchPointEnv", render_mode="human")
 
 
-@pytest.mark.parametrize("name", ["platform", "boatdock", "office"])
-def test_a_closed_batch_needs_a_reset_before_the_next_step(name):
-    env = hpamdp.make(name, 2)
-    action = env.rand_action(env.reset())
-    env.close()
-    with pytest.raises(RuntimeError, match="no episode has begun; call reset before step"):
-        env.step(action.clone())
-    env.reset()
-    env.step(action.clone())
-
-
-@pytest.mark.parametrize("num_workers", [0, pytest.param(2, marks=pytest.mark.slow)])
-def test_closed_copies_of_a_gymnasium_environment_neither_step_nor_begin(num_workers):
-    env = GymnasiumEnv(2, id="CartPole-v1", num_workers=num_workers)
-    action = env.rand_action(env.reset())
-    env.close()
-    with pytest.raises(RuntimeError, match="CartPole-v1 is closed; make a new one"):
-        env.step(action)
-    with pytest.raises(RuntimeError, match="CartPole-v1 is closed; make a new one"):
-        env.reset()
-
-
 MAKERS = {
     "PlatformEnv": PlatformEnv,
     "BoatDockEnv": BoatDockEnv,
@@ -515,6 +480,7 @@ def test_a_seed_beyond_32_bits_has_episodes_of_its_own_however_it_is_given(way):
 @pytest.mark.parametrize(
     "env_id",
     [
+        "hpamdp/BoatDock-v0",
         "hpamdp/Platform-v0",
         "hpamdp/Office-v0",
         "hpamdp/CatchPoint-v0",

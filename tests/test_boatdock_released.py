@@ -61,16 +61,6 @@ def test_an_invalid_layout_is_refused(given, complaint):
         one().reset(TensorDict({name: torch.tensor([value]) for name, value in given.items()}, [1]))
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [{"num_envs": 0}, {"controller": "choose"}, {"dtype": "int"}],
-    ids=str,
-)
-def test_an_invalid_argument_is_refused_by_name(arguments):
-    with pytest.raises(ValueError, match=next(iter(arguments))):
-        ReleasedBoatDockEnv(**arguments)
-
-
 def test_results_are_the_outcomes_without_a_score_of_their_own():
     env = ReleasedBoatDockEnv(5)
     outcome = torch.tensor([SUCCESS, WALL, WALL, OUT_OF_FUEL, TIME_LIMIT])

@@ -6,29 +6,13 @@ import math
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
+from test_boatdock import CENTRE, layout, press
 
 from hpamdp import keys
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.task import MAX_PRESSES, OBSERVATION_NAMES
-
-CENTRE = torch.tensor(harbour.CENTRE)
-
-
-def press(env: BoatDockEnv, key, duration) -> TensorDictBase:
-    """Press a key in every boat; `duration` has a number for each boat or is `[N, 3]`."""
-    key = torch.as_tensor(key)
-    duration = torch.as_tensor(duration, dtype=torch.float32)
-    duration = duration if duration.ndim == 2 else duration.reshape(-1, 1).expand(len(key), 3)
-    leaves = TensorDict(discrete=key, parameters=duration, batch_size=[len(key)])
-    return env.step(TensorDict({keys.ACTION: leaves}, batch_size=[len(key)]))["next"]
-
-
-def layout(start, goal, num: int = 1) -> TensorDict:
-    """Return a layout given in px from the harbour's centre, the same for every boat."""
-    points = {"start": torch.tensor(start) + CENTRE, "goal": torch.tensor(goal) + CENTRE}
-    return TensorDict({name: point.expand(num, 2) for name, point in points.items()}, batch_size=[num])
 
 
 def play(env: BoatDockEnv, num_presses: int) -> list[TensorDictBase]:

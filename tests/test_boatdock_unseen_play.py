@@ -3,17 +3,15 @@
 import copy
 import json
 import random
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
 import torch
 from play_players import docked, events_of, random_events, recorded, sailed
+from test_play_replay import in_node, needs_node
 
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.play import episodes
-from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.boatdock.play.replay import Press, settle
 from hpamdp.env.boatdock_unseen import fleet, planner
 from hpamdp.env.boatdock_unseen.environment import UnseenBoatsEnv
@@ -23,7 +21,6 @@ from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
 from hpamdp.env.play_page import EpisodeError
 from hpamdp.run.page_server import EpisodeFile
 
-NODE = shutil.which("node")
 TRIPS = 3
 
 
@@ -180,7 +177,7 @@ def test_play_tells_what_does_not_go_with_sessions_in_one_line(command, words, s
     assert code == 2 and said in err and err.count("\n") == 1
 
 
-@pytest.mark.skipif(NODE is None, reason="needs node")
+@needs_node
 def test_unlike_boats_end_in_the_page_where_python_ends_them(tmp_path):
     page = page_of(family="strength", spread=0.5)
     data = page.data([], has_server=False)
@@ -190,16 +187,12 @@ def test_unlike_boats_end_in_the_page_where_python_ends_them(tmp_path):
         (boat,) = each["boats"]
         for layout in 5 * each["trips"]:
             given.append({"boat": boat, **layout, "events": random_events(rng, rng.randint(1, 12))})
-    (tmp_path / "given.json").write_text(json.dumps({"rules": data["rules"], "trips": given}))
-    script = f"""
-        const given = JSON.parse(require("fs").readFileSync({str(tmp_path / "given.json")!r}));
-        const physics = require({str(BoatPage.files["physics.js"])!r}).makePhysics(given.rules);
-        console.log(JSON.stringify(given.trips.map((trip) =>
-          physics.sail(trip, trip.boat, physics.settle(trip.events), Infinity))));
+    script = """
+        const physics = makePhysics(given.rules);
+        return given.trips.map((trip) => physics.sail(trip, trip.boat, physics.settle(trip.events), Infinity));
     """
-    ended = subprocess.run([NODE, "-e", script], capture_output=True, text=True, check=True, timeout=60)
     outcomes = set()
-    for trip, found in zip(given, json.loads(ended.stdout), strict=True):
+    for trip, found in zip(given, in_node(script, {"rules": data["rules"], "trips": given}, tmp_path), strict=True):
         unlike = {name: trip["boat"][name] for name in ("strength", "glide")}
         limits = {"shortest": page.rules.shortest_press, "longest": physics.MAX_DURATION}
         made = sailed(trip["start"], trip["goal"], trip["boat"]["directions"], trip["events"], **unlike, **limits)

@@ -220,20 +220,6 @@ def test_an_option_without_a_pair_that_goes_together_is_not_possible():
     assert with_decisions(env).reset()[keys.OPTION_MASK].tolist() == [[True, False]] * 4
 
 
-def test_a_mask_of_pairs_of_too_many_combinations_is_refused_in_one_line():
-    class Long(OneStep):
-        parameter_dims = (0,) * 34
-        component_sizes = (2,) * 17
-
-        def _read(self, *, is_over):
-            td = super()._read(is_over=is_over)
-            return td.set(keys.PAIR_MASK, torch.ones(*self.batch_size, 34, 34, dtype=torch.bool))
-
-    env = Long(2, forbids_pairs=True)
-    with pytest.raises(ProblemError, match="takes at most 65,536 combinations of components, but there are 131,072"):
-        with_decisions(env).reset()
-
-
 def test_autoregressive_heads_and_random_agents_never_choose_a_pair_that_is_forbidden():
     torch.manual_seed(0)
     env = OneStep(200, forbids_pairs=True)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from batched_players import action, agrees, is_unchanged, play, random_player, snapshot
-from conftest import compose_config, make_config
+from conftest import make_config
 from goal_players import act, place, trained_player
 from torchrl.envs.utils import check_env_specs
 
@@ -149,16 +149,6 @@ def test_only_the_parameters_of_the_chosen_action_count_and_are_clipped():
     torch.testing.assert_close(readings[0][keys.OBSERVATION], readings[1][keys.OBSERVATION])
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [{"num_envs": 0}, {"noise": NAN}, {"repaired": ["x"]}],
-    ids=str,
-)
-def test_an_invalid_argument_is_refused_by_name(arguments):
-    with pytest.raises(ValueError, match=next(iter(arguments))):
-        GoalEnv(**arguments)
-
-
 def test_a_repair_of_the_middle_shots_is_refused_on_goal_in_one_line_and_made_on_hard_goal():
     words = ["high=none", "low=pdqn", "env.repaired=[middle_shots]"]
     with pytest.raises(
@@ -189,12 +179,3 @@ def test_compiled_ticks_play_the_same_episodes():
         env.reset()
         readings.append(act(env, [0] * 64, [[4.0, 0.0]] * 64))
     torch.testing.assert_close(readings[0][keys.OBSERVATION], readings[1][keys.OBSERVATION], rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("name", ["goal", "hard_goal"])
-def test_the_yaml_makes_the_published_domain_and_names_a_wrong_repair(name):
-    made = make_config([f"env={name}", "high=none", "low=pdqn"]).env.build(num_envs=2)
-    assert (made.max_steps, made.options.noise, made.options.repaired) == (100, 1.0, ())
-    with pytest.raises(ConfigError, match="repaired"):
-        make_config([f"env={name}", "high=none", "low=pdqn", "env.repaired=[kick]"])
-    assert compose_config([f"env={name}"]).env.compile_rules is False

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
@@ -312,11 +310,3 @@ def test_other_breaches_of_gymnasiums_contract_are_told_in_one_line(monkeypatch)
     monkeypatch.setattr(Toy, "reset", lambda self: (np.zeros(2), {}))
     with pytest.raises(ProblemError, match="reset must take seed and options: "):
         env.reset()
-
-
-def test_copies_with_different_spaces_are_refused(monkeypatch):
-    forms = itertools.cycle(["nested", "shared"])
-    make_toy = Toy.__init__
-    monkeypatch.setattr(Toy, "__init__", lambda self, form: make_toy(self, next(forms)))
-    with pytest.raises(ValueError, match="the action_space of copy 1 is "):
-        make(2)

@@ -218,16 +218,3 @@ def test_a_reset_mask_resets_only_its_boats():
     for mask in ([True, False, False], np.zeros(3, bool), np.ones(2, bool), np.ones(3)):
         with pytest.raises(ValueError, match="reset_mask"):
             env.reset(options={"reset_mask": mask})
-
-
-def test_frames_show_the_episode():
-    env = BoatDock(controller="incongruent", render_mode="rgb_array")
-    env.reset(seed=0)
-    before = env.render()
-    assert before.shape == (480, 480, 3) and before.dtype == np.uint8
-    assert np.array_equal(before, env.render())
-    env.step(press(2, 0.7))
-    after = env.render()
-    assert not np.array_equal(before, after)
-    env.reset()
-    assert not np.array_equal(after, env.render())

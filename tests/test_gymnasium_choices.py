@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import gymnasium
 import numpy as np
 import pytest
@@ -117,19 +115,6 @@ def test_a_method_that_gives_a_mask_is_reported_in_one_line_unless_masks_are_ign
         with pytest.raises(ValueError, match=r"gave an action_mask as Methods\.action_masks, which is not "):
             GymnasiumEnv(**arguments)
         assert GymnasiumEnv(**arguments, action_mask="ignore").reset()[keys.OBSERVATION].shape == (1, 1)
-
-
-@pytest.mark.parametrize(
-    ("names", "said"),
-    [
-        (5, "is 5, but must be a list of names"),
-        (["slow", "slow", "fast"], "has a name twice: slow, slow, fast"),
-    ],
-)
-def test_names_of_options_that_are_no_list_of_names_are_reported_in_one_line(names, said, monkeypatch):
-    monkeypatch.setattr(Masked, "option_names", names)
-    with pytest.raises(ValueError, match=re.escape(f"Masked: option_names {said}")):
-        make(form="dict")
 
 
 @pytest.mark.parametrize("form", ["dict", "flat dict", "tuple"])

@@ -8,7 +8,6 @@ import torch
 from gymnasium_players import step
 from PIL import Image
 from tensordict import TensorDict
-from toy_environments import Drawn
 
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
@@ -61,12 +60,6 @@ def test_the_last_picture_is_shown_however_fast_the_environment_is(rate, fps):
         shades = [grey(picture) for picture in env.film(track, fps, 20)]
         assert shades[-1] == num - 1 and shades == sorted(shades)
         assert -0.5 <= len(shades) - fps * num / rate <= 1.5
-
-
-def test_a_rate_of_pictures_may_be_a_number_of_numpy(monkeypatch):
-    monkeypatch.setattr(Drawn, "metadata", {"render_modes": ["rgb_array"], "render_fps": np.float32(12.5)})
-    env = GymnasiumEnv(entry_point=ENTRY_POINT, kwargs={"render_mode": "rgb_array"}, max_steps=4)
-    assert env._copies.pictures_per_second == 12.5
 
 
 def test_something_else_than_a_picture_is_told_in_one_line():

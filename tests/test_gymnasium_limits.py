@@ -109,15 +109,9 @@ def test_without_a_limit_the_line_asks_for_one(limit):
         GymnasiumEnv(entry_point=f"{__name__}:Limited", kwargs={"limit": limit})
 
 
-@pytest.mark.parametrize("where", ["constructor", "import"])
-def test_an_environment_that_ends_the_program_while_it_is_built_is_reported_in_one_line(where, tmp_path, monkeypatch):
-    words = WORDS
-    if where == "import":
-        (tmp_path / "leaving_at_once.py").write_text("import sys\nsys.exit(0)\n")
-        monkeypatch.syspath_prepend(tmp_path)
-        words = [*WORDS, "env.entry_point=leaving_at_once:Env"]
+def test_an_environment_that_ends_the_program_while_it_is_built_is_reported_in_one_line(tmp_path):
     told: list[str] = []
-    assert run(compose_config(words), tmp_path / "run", tell=told.append) == 1
+    assert run(compose_config(WORDS), tmp_path / "run", tell=told.append) == 1
     (line,) = told
     assert line.endswith("called sys.exit(0), which stopped the run") and ".py, line " in line and "\n" not in line
 
@@ -128,11 +122,6 @@ def test_a_reward_of_an_evaluation_that_is_not_finite_is_reported_in_one_line(tm
     line = "^env: GymnasiumEnv: .*: environment 0: step returned the reward nan, which is not finite in float32$"
     with pytest.raises(ConfigError, match=line):
         run(compose_config([*words, "env.entry_point=toy_environments:Toy"]), tmp_path)
-
-
-def test_a_command_tells_in_one_line_that_an_environment_ended_the_program(command):
-    code, _, err = command("watch", "low=random", *WORDS[:3])
-    assert code == 1 and err.count("\n") == 1 and "called sys.exit(0), which stopped the run" in err
 
 
 def test_staggered_copies_end_their_first_episodes_apart_and_later_ones_at_the_limit():

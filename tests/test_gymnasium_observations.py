@@ -5,17 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from conftest import compose_config
 from gymnasium import spaces
 from gymnasium_players import make, step
 from torchrl.envs.utils import check_env_specs
 
-from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 from hpamdp.env.gymnasium.scaling import ObservationScaling
-from hpamdp.run.train import run
 
 
 def test_observations_of_nested_spaces_are_one_vector():
@@ -109,20 +106,6 @@ def test_entries_that_are_not_there_are_refused(entries):
         GymnasiumEnv(entry_point="toy_environments:TickingGoal", max_steps=9, observation_keys=entries)
     with pytest.raises(ValueError, match="has no entries; use null"):
         make(observation_keys=entries)
-
-
-def test_an_environment_with_a_counter_that_leaves_its_space_trains_unchanged(tmp_path):
-    words = [
-        "env=gymnasium",
-        "env.entry_point=toy_environments:TickingGoal",
-        "env.max_steps=9",
-        "env.kwargs={tick:197}",
-    ]
-    words += ["high=none", "low=hppo", "num_envs=4", "steps_per_batch=4", "total_frames=64", "eval.layouts=2"]
-    words += ["low.minibatch_size=16"]
-    assert run(compose_config([*words, "env.observation_keys=[0]"]), tmp_path / "chosen") == 0
-    with pytest.raises(ConfigError, match=r"^env: .*entry 1 is 200, outside Discrete\(200\)"):
-        run(compose_config(words), tmp_path / "all")
 
 
 @pytest.mark.parametrize("scaling", ["bounds", "running"])

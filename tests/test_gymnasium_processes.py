@@ -67,26 +67,6 @@ def faulty(where: str) -> GymnasiumEnv:
     return GymnasiumEnv(3, entry_point="toy_environments:Faulty", kwargs={"where": where}, max_steps=3, num_workers=2)
 
 
-def test_a_close_that_fails_in_a_worker_costs_a_warning(quick_workers, capsys):
-    env = faulty("close")
-    (line,) = capsys.readouterr().err.splitlines()  # of the copy in this process, which the spaces are read from
-    assert line.startswith("Faulty: close raised ValueError: ") and line.endswith("; the run goes on")
-    workers = env._copies._vector.processes
-    env.close()
-    assert [worker.exitcode for worker in workers] == [0, 0]
-
-
-def test_a_worker_that_died_before_the_end_costs_a_warning(quick_workers, capsys):
-    env = toys(2)
-    workers = env._copies._vector.processes
-    workers[1].kill()
-    workers[1].join()
-    env.close()
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith("worker 1 of 2 died (signal 9, SIGKILL) before it was closed; the run goes on")
-    assert not any(worker.is_alive() for worker in workers)
-
-
 @pytest.mark.slow
 def test_a_worker_that_dies_is_told_in_one_line():
     env = GymnasiumEnv(2, entry_point="toy_environments:Killed", max_steps=3, num_workers=2)

@@ -99,31 +99,18 @@ def assert_agrees(case: Case, expected: Simulated) -> None:
     assert case.fuel - after.fuel.item() == pytest.approx(expected.burnt, abs=2e-3)
 
 
-def test_small_time_steps_agree_on_many_presses_of_every_outcome():
-    rng = np.random.default_rng(0)
-    met = dict.fromkeys((SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL), 0)
-    for _ in range(300):
+@pytest.mark.parametrize("has_other_boats", [False, True])
+def test_small_time_steps_agree_on_many_presses_of_every_outcome_also_with_other_strength_and_glide(has_other_boats):
+    rng = np.random.default_rng(int(has_other_boats))
+    met = dict.fromkeys((SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, *([] if has_other_boats else [OUT_OF_FUEL])), 0)
+    for _ in range(150 if has_other_boats else 300):
         x, y, goal_x, goal_y = rng.uniform(-75.0, 75.0, 4)
         if math.hypot(goal_x - x, goal_y - y) < 15.5:
             continue
         heading = math.atan2(goal_y - y, goal_x - x) + rng.normal(0.0, 0.4)
-        case = Case(x, y, goal_x, goal_y, heading, rng.uniform(0.3, 1.6), rng.uniform(0.3, 4.0))
-        expected = simulate(case)
-        if expected.margin > 0.1:
-            assert_agrees(case, expected)
-            met[expected.outcome] += 1
-    assert min(met.values()) >= 10, met
-
-
-def test_small_time_steps_agree_on_boats_with_other_strength_and_glide():
-    rng = np.random.default_rng(1)
-    met = dict.fromkeys((SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS), 0)
-    for _ in range(150):
-        x, y, goal_x, goal_y = rng.uniform(-75.0, 75.0, 4)
-        if math.hypot(goal_x - x, goal_y - y) < 15.5:
-            continue
-        heading = math.atan2(goal_y - y, goal_x - x) + rng.normal(0.0, 0.4)
-        case = Case(x, y, goal_x, goal_y, heading, rng.uniform(0.3, 1.6), 6.0, *rng.uniform(0.5, 2.0, 2))
+        duration = rng.uniform(0.3, 1.6)
+        boat = (6.0, *rng.uniform(0.5, 2.0, 2)) if has_other_boats else (rng.uniform(0.3, 4.0),)
+        case = Case(x, y, goal_x, goal_y, heading, duration, *boat)
         expected = simulate(case)
         if expected.margin > 0.1:
             assert_agrees(case, expected)

@@ -217,12 +217,3 @@ def test_what_cannot_be_is_refused_in_one_line(settings, line):
     with pytest.raises(SettingError, match=line) as raised:
         RDDLEnv(1, **settings)
     assert "\n" not in str(raised.value)
-
-
-@needs_simulator
-def test_a_short_training_from_the_command_line(command, tmp_path):
-    words = ["env=rddl", "env.domain=SupplyChain_or", "env.bounds={ship:[0,20]}", "high=none", "low=hppo"]
-    words += ["total_frames=256", "num_envs=4", "steps_per_batch=32", "eval.layouts=2", f"hydra.run.dir={tmp_path}/run"]
-    code, out, err = command(*words)
-    assert code == 0, err
-    assert "score" in out

@@ -19,8 +19,6 @@ class OneStep(PAMDPEnv):
     The parameter of what the first component chose should be 0.4. How the components pay depends on `pays`:
 
     - `each`: 0.5 for a first component equal to the coin, and 0.5 for a second one of 2;
-    - `matched`: 1 for the pairs (0, 0) and (1, 1), -1 for all others. Each component by itself pays the same whatever
-      it chooses;
     - `climbing`: 1 for the pair (0, 0), but -2 for a first component of 0 with any other second one. On average over
       the other component, 1 pays more than 0 in the first one, and 1 or 2 more than 0 in the second: at most 0.5.
 
@@ -40,7 +38,7 @@ class OneStep(PAMDPEnv):
         self,
         num_envs: int = 1,
         *,
-        pays: Literal["each", "matched", "climbing"] = "each",
+        pays: Literal["each", "climbing"] = "each",
         forbids_pairs: bool = False,
         seed: int = 0,
         device: object = "cpu",
@@ -82,8 +80,6 @@ class OneStep(PAMDPEnv):
         near = -(own - 0.4).square()
         if self.pays == "each":
             return 0.5 * (first == coin) + 0.5 * (second == 2) + near
-        if self.pays == "matched":
-            return torch.where(first == second, 1.0, -1.0) + near
         return torch.tensor([[1.0, -2.0, -2.0], [-0.5, 0.5, 0.5]])[first, second] + near
 
     def _read(self, *, is_over: bool) -> TensorDict:

@@ -64,12 +64,9 @@ class Toy(gymnasium.Env):
         form: of the action space, from FORMS.
         length: steps to the end; 0: it never ends.
         success: `is_success` of the last info; None: the info does not have it.
-        broken: whether the constructor has a bug.
     """
 
-    def __init__(self, form: str = "nested", length: int = 0, success: bool | None = None, broken: bool = False):
-        if broken:
-            len(3)  # a bug
+    def __init__(self, form: str = "nested", length: int = 0, success: bool | None = None):
         self.action_space = FORMS[form][0]
         self.observation_space = spaces.Box(np.array([-3.0, 0.0]), np.array([5.0, np.inf]), dtype=np.float64)
         self.length = length
@@ -102,11 +99,11 @@ MIXED = spaces.Tuple([spaces.Box(-2, 2, (2, 1)), spaces.Discrete(3, start=1), sp
 
 
 class Mixed(Toy):
-    """Observe samples of MIXED, or of a space of texts."""
+    """Observe samples of MIXED."""
 
-    def __init__(self, is_text: bool = False):
+    def __init__(self):
         super().__init__()
-        self.observation_space = spaces.Text(5) if is_text else MIXED
+        self.observation_space = MIXED
 
     def _observation(self):
         return self.observation_space.sample()
@@ -118,18 +115,6 @@ class Texting(Toy):
     def __init__(self):
         super().__init__()
         self.action_space = spaces.Tuple([spaces.Discrete(2), spaces.Text(5)])
-
-
-class Wrong(Toy):
-    """Observe what its observation space does not contain."""
-
-    def __init__(self, size: int = 2, value: float = 0.0):
-        super().__init__()
-        self.size = size
-        self.value = value
-
-    def _observation(self):
-        return np.full(self.size, self.value)
 
 
 class Drawn(Toy):
