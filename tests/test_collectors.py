@@ -215,12 +215,6 @@ def test_batches_ahead_are_made_by_the_policy_from_before_the_last_update(quick_
                 assert torch.equal(batch[name], same[name])
 
 
-def test_the_state_of_another_number_of_environments_is_refused(workers, tmp_path):
-    _, small = make(tmp_path, "num_envs=4")
-    with pytest.raises(ValueError, match=r"num_envs=8: the state is of 4 environments; leave num_envs out"):
-        workers[1].set_state(small.state())
-
-
 @pytest.mark.parametrize("collector", ["single", pytest.param("multi", marks=pytest.mark.slow)])
 def test_a_resumed_run_of_a_gymnasium_environment_begins_new_episodes_with_the_saved_statistics(collector):
     words = [*SMALL, "env=gymnasium", "env.id=CartPole-v1", "env.observation_scaling=running", "high=none"]

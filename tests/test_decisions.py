@@ -1,11 +1,13 @@
 """DecisionTracker gives the semi-MDP view of episodes, and options that end inside an episode are worth choosing."""
 
+from typing import Literal
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import check_env_specs
-from toy_options import Crossing, Toll, best_value, earned, steppers
+from toy_options import Crossing, Listener, Toll, best_value, earned, make_meta_critic, steppers
 
 from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
@@ -14,7 +16,6 @@ from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Selector
 from hpamdp.policies.high_level.actor import Actor
-from hpamdp.policies.high_level.meta_critic import MetaCritic
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.random import Random
 from hpamdp.specs import PAMDPSpecs
@@ -44,14 +45,14 @@ def test_specs_of_a_tracked_environment_hold():
     check_env_specs(with_decisions(Crossing(3, start=6.0), 0.9, 2))
 
 
-def check_accounts(rows: TensorDict, gamma: float, option_length: int | None = None) -> int:
+def check_accounts(rows: TensorDict, gamma: float, option_length: int | Literal["chosen"] | None = None) -> list:
     """Compare every key of the tracker in one environment's rows with sums that are made here.
 
-    Return how many options ended before their episode.
+    Return the steps of each option, and whether it ended before its episode.
     """
     is_due = True
     is_first = True
-    num_cut = 0
+    options = []
     for row in rows:
         assert row[keys.IS_DECISION].item() == is_due
         if is_first:
@@ -62,22 +63,26 @@ def check_accounts(rows: TensorDict, gamma: float, option_length: int | None = N
             steps = 0
             decided_at = row[keys.OBSERVATION]
             option = row[keys.OPTION]
+            length = row[keys.OPTION_LENGTH] if option_length == "chosen" else option_length
         assert row[keys.OPTION] == option, "the option changed where no decision was due"
+        assert option_length != "chosen" or row[keys.OPTION_LENGTH] == length
         reward = row["next", keys.REWARD].item()
         total += gamma**steps * reward
         episode_return += reward
         steps += 1
         episode_steps += 1
         is_first = row["next", keys.DONE].item()
-        is_due = is_first or steps == option_length
-        num_cut += is_due and not is_first
+        is_due = is_first or steps == length
+        if is_due:
+            options.append((steps, not is_first))
+        assert length is None or row["next", keys.OPTION_ENDED].item() == (steps == length)
         assert row["next", keys.IS_DECISION].item() == is_due
         assert row["next", keys.OPTION_STEPS].item() == steps
         assert row["next", keys.OPTION_RETURN].item() == pytest.approx(total, abs=1e-5)
         assert row["next", keys.EPISODE_RETURN].item() == pytest.approx(episode_return, abs=1e-5)
         assert row["next", keys.EPISODE_STEPS].item() == episode_steps
         assert torch.equal(row["next", keys.DECISION_OBSERVATION], decided_at)
-    return num_cut
+    return options
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.9])
@@ -87,7 +92,7 @@ def test_option_returns_are_right_across_collected_batches(gamma):
     rows = torch.cat([batch.clone() for batch in collect(env, random_agent(env).policy, 4, 60, 3)], 1)
     assert rows.shape == (4, 60)
     for environment in rows:
-        assert check_accounts(environment, gamma) == 0
+        assert not any(is_cut for _, is_cut in check_accounts(environment, gamma))
 
 
 @pytest.mark.parametrize(("option_length", "batch_steps"), [(1, 3), (5, 7), (100, 3)])
@@ -99,7 +104,8 @@ def test_returns_of_options_of_a_fixed_length_are_right_across_collected_batches
     rows = torch.cat(rows, 1)
     assert rows["next", keys.DONE].sum() > 10
     for environment in rows:
-        assert (check_accounts(environment, 0.9, option_length) > 5) == (option_length < 100)
+        num_cut = sum(is_cut for _, is_cut in check_accounts(environment, 0.9, option_length))
+        assert (num_cut > 5) == (option_length < 100)
 
 
 @pytest.mark.parametrize("is_choice", [False, True], ids=["both levels", "high level"])
@@ -126,13 +132,6 @@ def points(x):
 
 
 def test_the_selector_learns_from_every_decision_once_and_the_oldest_first():
-    class Listener(Uniform):
-        heard = ()
-
-        def learn(self, decisions):
-            self.heard = (*self.heard, decisions.clone())
-            return {}
-
     torch.manual_seed(0)
     env = with_decisions(Toll(4, start=6.0), 0.9, 2)
     specs = PAMDPSpecs.from_env(env)
@@ -169,16 +168,6 @@ def trained(selector: Selector, option_length: int | None, num_batches: int) -> 
     return earned(agent, GAMMA, option_length)
 
 
-def make_meta_critic() -> MetaCritic:
-    torch.manual_seed(0)
-    options = dict(
-        hidden_dims=[64], num_members=1, exploration="epsilon", epsilon_final=0.2, epsilon_decisions=2000,
-        ucb_width=2.0, gamma=GAMMA, buffer_size=5000, batch_size=64, updates_per_decision=0.15,
-        max_updates=64, warmup_decisions=200, lr=3e-3, tau=0.05,
-    )  # fmt: skip
-    return MetaCritic(PAMDPSpecs.from_env(Crossing()), device=torch.device("cpu"), **options)
-
-
 def make_actor() -> Actor:
     torch.manual_seed(0)
     options = dict(hidden_dims=[64], epochs=4, minibatch_size=128, clip=0.2, entropy=0.01, lr=3e-3, max_grad_norm=0.5)
@@ -186,7 +175,7 @@ def make_actor() -> Actor:
 
 
 def test_meta_critic_chooses_options_of_a_fixed_length_optimally_and_better_than_for_whole_episodes():
-    anew, whole = trained(make_meta_critic(), 2, 20), trained(make_meta_critic(), None, 20)
+    anew, whole = (trained(make_meta_critic(updates_per_decision=0.15), length, 20) for length in (2, None))
     assert anew >= 0.95 * best_value(GAMMA, 2)
     assert whole <= best_value(GAMMA, Crossing.max_steps) + 1e-6 < 0.5 * anew
 

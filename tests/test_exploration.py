@@ -436,13 +436,6 @@ def test_a_bonus_in_plans_has_the_scale_of_the_rewards(kind):
     assert weights == [3.0, pytest.approx(0.03)]
 
 
-def test_settings_of_networks_have_no_effect_on_an_ensemble_and_a_line_says_so(capfd):
-    words = ["env=catch_point", "high=none", "low=pets", "exploration=novelty", "total_frames=512"]
-    for more, is_told in (([], False), (["exploration.lr=0.1"], True)):
-        assemble(make_config([*words, *more]))
-        assert ("exploration.lr=0.1: has no effect on PETS," in capfd.readouterr().err) == is_told
-
-
 def test_pets_plans_before_it_has_seen_a_reward_if_disagreement_is_rewarded():
     for has_bonus in (False, True):
         torch.manual_seed(0)
@@ -536,19 +529,6 @@ def test_what_an_exploration_does_not_go_with_is_refused_in_one_line(words, line
     assert line in str(raised.value) and "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize(
-    ("given", "name", "epsilon"),
-    [({"name": "held", "epsilon": 0.5}, "held", 0.5), (Held, "held", 0.05)],
-)
-def test_an_exploration_is_chosen_from_python_and_is_part_of_the_saved_config(given, name, epsilon):
-    small = {"num_envs": 8, "steps_per_batch": 4, "total_frames": 64, "eval.layouts": 4, "film": False}
-    small |= {"low.warmup_steps": 32, "progress": False}
-    saved = hpamdp.train("platform", low="pdqn", exploration=given, **small)._config.to_dict()
-    assert saved["exploration"].get("epsilon") == epsilon
-    if given is not Held:  # a class has no name of a yaml file
-        assert saved["choices"]["exploration"] == name
-
-
 @pytest.mark.parametrize(("low", "kind"), pairs(("pdqn", "held"), ("hppo", "novelty")))
 def test_a_run_with_exploration_resumes_to_the_last_bit(low, kind, tmp_path, monkeypatch):
     given = ["high=ucb", f"low={low}", *SHORT.get(low, []), *SMALL, f"exploration={kind}"]
@@ -561,16 +541,6 @@ def test_a_run_with_exploration_resumes_to_the_last_bit(low, kind, tmp_path, mon
 def test_a_run_with_exploration_in_worker_processes_resumes_to_the_last_bit(low, kind, tmp_path, monkeypatch):
     given = ["high=ucb", f"low={low}", *SHORT.get(low, []), *SMALL, f"exploration={kind}", "collector=multi"]
     stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
-
-
-def test_an_agent_that_held_actions_is_exported(tmp_path):
-    pytest.importorskip("onnxruntime")
-    small = {"num_envs": 8, "steps_per_batch": 8, "total_frames": 64, "eval.layouts": 4, "film": False}
-    agent = hpamdp.train(
-        "platform", low="hppo", exploration="held", progress=False, **small, **{"low.minibatch_size": 16}
-    )
-    agent.export(tmp_path / "policy.onnx")
-    assert (tmp_path / "policy.onnx").is_file()
 
 
 # A reward that random actions do not reach. Without exploration each learner comes to rest, since steps cost something.

@@ -420,22 +420,6 @@ def test_an_agent_that_cannot_be_exported_is_refused_in_one_line(words, message,
     assert "\n" not in str(refusal.value) and not [*tmp_path.iterdir()]
 
 
-def test_a_learner_that_branches_on_numbers_is_refused_in_one_line(tmp_path, capfd):
-    class Branching(hpamdp.HPPO):
-        def __init__(self, specs, **settings):
-            super().__init__(specs, **settings)
-            forward = self.policy.forward
-            self.policy.forward = lambda td: forward(td) if td["observation"].sum() > 0.0 else forward(td.clone())
-
-    agent = fresh_agent(*PLATFORM, "low=hppo")
-    policy = Branching(agent.specs).policy
-    agent._agent.router.policies[0] = policy
-    with pytest.raises(hpamdp.ConfigError, match="HPPO cannot be traced: ") as refusal:
-        agent.export(tmp_path / "a.onnx")
-    assert "\n" not in str(refusal.value)
-    assert capfd.readouterr() == ("", "")
-
-
 def test_a_missing_package_is_one_line_that_names_the_extra(own_agent, tmp_path, monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr("hpamdp.api.export.find_spec", lambda name: None if name == "onnxscript" else found(name))

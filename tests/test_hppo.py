@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torch.distributions import Categorical, Normal
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives.value.functional import generalized_advantage_estimate
+from toy_steps import SPECS, one_step_rows
 
 from hpamdp import keys
 from hpamdp.geometry import PlaneGeometry
@@ -16,8 +17,6 @@ from hpamdp.policies.base import States
 from hpamdp.policies.low_level.hppo import HPPO, RAW
 from hpamdp.policies.shared.on_policy import generalised_advantages, normalised
 from hpamdp.specs import PAMDPSpecs
-
-SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
     hidden_dims=[32, 32], critic_hidden_dims=[32, 32], min_scale=0.05, min_scale_final=0.01, epochs=4, gamma=0.9,
@@ -42,24 +41,6 @@ def test_the_greedy_policy_takes_mean_parameters_and_one_discrete_action_or_samp
     torch.testing.assert_close(taken, expected, atol=0.1, rtol=0.0)
     assert (acted[RAW] == acted[RAW][0]).all()
     assert (learner.exported() is None) == (greedy_discrete == "sampled")
-
-
-def one_step_rows(learner: HPPO, num: int) -> TensorDict:
-    """Play `num` episodes of one step, `[num, 1]`.
-
-    Discrete action 1 earns the more, the nearer its parameters are to (s0, -s1) / 2, at most 1; the others lose 0.5.
-    """
-    td = learner.policy(TensorDict({keys.OBSERVATION: torch.rand(num, 1, 4) * 2 - 1}, [num, 1]))
-    unit, state = learner.specs.to_unit(td[keys.PARAMETERS]), td[keys.OBSERVATION]
-    error = (unit[..., 1] - 0.5 * state[..., 0]).square() + (unit[..., 2] + 0.5 * state[..., 1]).square()
-    is_end = torch.ones(num, 1, 1, dtype=torch.bool)
-    td["next"] = {
-        keys.OBSERVATION: torch.zeros_like(state),
-        keys.REWARD: torch.where(td[keys.DISCRETE] == 1, 1.0 - error, -0.5).unsqueeze(-1),
-        keys.DONE: is_end,
-        keys.TERMINATED: is_end,
-    }
-    return td
 
 
 def random_rows(learner: HPPO, num: int, steps: int, done: torch.Tensor | None = None) -> TensorDict:
@@ -230,10 +211,10 @@ def test_rows_of_other_learners_change_nothing():
 def test_the_learner_finds_the_best_discrete_action_and_its_parameters():
     learner = make()
     for _ in range(40):
-        td = one_step_rows(learner, 1000)
+        td = one_step_rows(learner, 1000, slope=0.5)
         scalars = learner.learn(td, everything(td))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        td = one_step_rows(learner, 1000)
+        td = one_step_rows(learner, 1000, slope=0.5)
     assert (td[keys.DISCRETE] == 1).float().mean() > 0.99
     assert td["next", keys.REWARD].mean() > 0.98, "random actions earn about -0.3, the optimum 1"
     assert scalars["scale"] < 0.5

@@ -5,13 +5,12 @@ import torch
 from conftest import make_config
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_steps import SPECS
 
 from hpamdp import keys
 from hpamdp.policies.low_level.hyar import LATENT, HyAR
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
-
-SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
     embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], codec_pretrain_updates=700,

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
+from test_decisions import collect
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from toy_options import Crossing, Stepper, Toll, best_value, earned, steppers
+from toy_options import Crossing, Stepper, Toll, best_value, earned, make_meta_critic, steppers
 
 from hpamdp import keys
 from hpamdp.cards import SelectorCard
@@ -43,16 +43,6 @@ def make_critic(**changes: object) -> OptionCritic:
     return OptionCritic(SPECS, device=CPU, **{**options, **changes})
 
 
-def make_meta_critic() -> MetaCritic:
-    torch.manual_seed(0)
-    options = dict(
-        hidden_dims=[64], num_members=1, exploration="epsilon", epsilon_final=0.2, epsilon_decisions=2000,
-        ucb_width=2.0, gamma=GAMMA, buffer_size=10_000, batch_size=64, updates_per_decision=0.1,
-        max_updates=64, warmup_decisions=200, lr=3e-3, tau=0.05,
-    )  # fmt: skip
-    return MetaCritic(SPECS, device=CPU, **options)
-
-
 def ending(selector, learners=None) -> HierarchicalAgent:
     """Return an agent whose selector decides where options end."""
     learners = [Stepper(SPECS), Stepper(SPECS)] if learners is None else learners
@@ -73,18 +63,6 @@ def test_options_of_a_data_set_last_an_episode_and_are_stored_where_the_selector
         stored = learner.buffer[:9]
         assert (stored["option"] == i).all() and (stored["next_option"] == i).all()
         assert not stored["option_ended"].any()
-
-
-def collect(agent: HierarchicalAgent, env: Crossing, num_steps: int, batch_steps: int, num_envs: int):
-    collector = Collector(
-        with_decisions(env, GAMMA, math.inf),
-        agent.policy,
-        frames_per_batch=num_envs * batch_steps,
-        total_frames=num_envs * num_steps,
-        auto_register_policy_transforms=False,
-    )
-    yield from collector
-    collector.shutdown()
 
 
 def account(decision: TensorDict) -> tuple:
@@ -112,7 +90,8 @@ def test_options_that_the_selector_ends_have_the_right_accounts_and_are_heard_of
     torch.manual_seed(0)
     agent = ending(Listener(SPECS), [Hearing(SPECS), Stepper(SPECS)])
     rows = []
-    for batch in collect(agent, Toll(4, start=6.0), 60, batch_steps, 4):
+    env = with_decisions(Toll(4, start=6.0), GAMMA, math.inf)
+    for batch in collect(env, agent.policy, 4, 60, batch_steps):
         rows.append(batch.clone())
         agent.learn(batch)
     rows = torch.cat(rows, 1)
@@ -147,7 +126,8 @@ def test_options_that_the_selector_ends_have_the_right_accounts_and_are_heard_of
 
 def train(selector, batch_steps: int = 10) -> HierarchicalAgent:
     agent = ending(selector)
-    for batch in collect(agent, Crossing(50, start=6.0), 180, batch_steps, 50):
+    env = with_decisions(Crossing(50, start=6.0), GAMMA, math.inf)
+    for batch in collect(env, agent.policy, 50, 180, batch_steps):
         agent.learn(batch)
     return agent
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 from conftest import TRAINED, compose_config, make_config
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from test_assemble import train
-from test_decisions import collect
+from test_decisions import check_accounts, collect
 from test_grid import SHORT, SHORT_SELECTORS
 from test_resume import SMALL as RESUMED
 from test_resume import rows_of, stop_and_resume
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from toy_options import Stepper, Toll
+from toy_options import Listener, Stepper, Toll
 
 import hpamdp
 from hpamdp import keys
@@ -55,29 +55,6 @@ def steppers(selector: Selector, specs: PAMDPSpecs) -> HierarchicalAgent:
     return HierarchicalAgent(selector, [Stepper(specs), Stepper(specs)], specs, option_lengths=LENGTHS)
 
 
-def check_lengths(rows: TensorDict, gamma: float) -> list[tuple[int, bool]]:
-    """Check one environment's steps `[T]` against sums made here; return each option's steps and whether it was cut."""
-    found = []
-    is_due = True
-    for row in rows:
-        assert row[keys.IS_DECISION].item() == is_due
-        if is_due:
-            option, length, steps, total = row[keys.OPTION].item(), row[keys.OPTION_LENGTH].item(), 0, 0.0
-        assert (row[keys.OPTION].item(), row[keys.OPTION_LENGTH].item()) == (option, length)
-        total += gamma**steps * row["next", keys.REWARD].item()
-        steps += 1
-        done, is_over = row["next", keys.DONE].item(), steps == length
-        is_due = done or is_over
-        assert row["next", keys.IS_DECISION].item() == is_due
-        assert row["next", keys.OPTION_ENDED].item() == is_over
-        assert row["next", keys.OPTION_STEPS].item() == steps
-        assert row["next", keys.OPTION_RETURN].item() == pytest.approx(total, abs=1e-5)
-        if is_due:
-            found.append((steps, not is_over))
-            assert is_over or steps < length
-    return found
-
-
 @pytest.mark.parametrize("batch_steps", [1, 7])
 def test_an_option_is_held_for_exactly_the_chosen_steps_unless_its_episode_ends(batch_steps):
     torch.manual_seed(0)
@@ -85,29 +62,16 @@ def test_an_option_is_held_for_exactly_the_chosen_steps_unless_its_episode_ends(
     specs = PAMDPSpecs.from_env(env)
     agent = steppers(Uniform(of_pairs(specs)), specs)
     rows = torch.cat([batch.clone() for batch in collect(env, agent.policy, 4, 63, batch_steps)], 1)
-    ended = [each for environment in rows for each in check_lengths(environment, GAMMA)]
-    whole = {steps for steps, is_cut in ended if not is_cut}
-    assert whole == {*LENGTHS} and sum(is_cut for _, is_cut in ended) > 3
-
-
-class Listener(Uniform):
-    """Choose uniformly and keep what there is to learn from."""
-
-    def __init__(self, specs: PAMDPSpecs) -> None:
-        super().__init__(specs)
-        self.gamma = GAMMA
-        self.heard: list[TensorDict] = []
-
-    def learn(self, decisions: TensorDictBase) -> dict[str, float]:
-        self.heard.append(decisions.clone())
-        return {}
+    ended = [each for environment in rows for each in check_accounts(environment, GAMMA, "chosen")]
+    whole = {steps for steps, is_before_episode in ended if is_before_episode}
+    assert whole == {*LENGTHS} and sum(not is_before_episode for _, is_before_episode in ended) > 3
 
 
 def test_the_selector_learns_from_pairs_whose_next_value_is_discounted_by_their_steps():
     torch.manual_seed(0)
     env = with_decisions(Toll(4, start=0.0), GAMMA, "chosen")
     specs = PAMDPSpecs.from_env(env)
-    agent = steppers(Listener(of_pairs(specs)), specs)
+    agent = steppers(Listener(of_pairs(specs), gamma=GAMMA), specs)
     scalars = []
     for batch in collect(env, agent.policy, 4, 60, 5):
         scalars.append((agent.learn(batch), batch[keys.OPTION_LENGTH][batch[keys.IS_DECISION].squeeze(-1)]))

@@ -211,13 +211,6 @@ def test_what_an_action_has_no_parameter_for_is_0_in_every_sample():
     assert [discrete.shape[1] for discrete, _ in seen] == [9, 3, 1]
 
 
-def test_actions_without_any_parameters_can_be_searched():
-    found = SequenceSearch((0, 0), **SEARCH)(
-        lambda steps: whole(steps)[0].sum(-1, keepdim=True).float().expand(whole(steps)[1].shape[:3]), 4, CPU
-    )
-    assert found.own.shape == (4, 0) and (found.discrete == 1).all()
-
-
 def test_a_return_weights_rewards_by_the_end_of_the_episode():
     one = torch.ones(2, 5)
     step = Prediction(one, 2.0 * one, torch.stack([3.0 * one[0], 5.0 * one[0]]), torch.zeros(2, 5))

@@ -34,7 +34,6 @@ from hpamdp.policies.low_level.hsac import HSAC
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.run import compatibility
-from hpamdp.run.recorder import Recorder
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
@@ -143,16 +142,6 @@ def test_running_statistics_skip_pictures():
     rollout(env)
     assert env.statistics()["observation_mean"].shape == (16 + 3 + 2,)
     env.close()
-
-
-def test_values_that_are_no_pixels_are_refused_in_one_line():
-    class Wrong(Camera):
-        def observation(self):
-            return self.picture().astype(np.int16) + 200
-
-    env = GymnasiumEnv(1, make=Wrong, max_steps=5)
-    with pytest.raises(ProblemError, match="outside its bounds 0 to 255"):
-        env.reset()
 
 
 def test_a_scaled_picture_is_refused_even_if_all_its_pixels_are_whole():
@@ -389,31 +378,6 @@ def test_an_agent_acts_on_pictures_in_gymnasiums_form():
         agent.act(observation + 0.5)
     with pytest.raises(ConfigError, match="export: HPPO cannot be exported: it observes pictures"):
         agent.export("agent.onnx")
-
-
-def test_workers_collect_the_pictures_that_one_process_collects(quick_workers, monkeypatch):
-    take, pictures = Recorder.take, []
-
-    def take_and_keep(self, batch, scalars):
-        pictures.append(batch[keys.OBSERVATION].clone())
-        take(self, batch, scalars)
-
-    monkeypatch.setattr(Recorder, "take", take_and_keep)
-    for collector in ("single", "multi"):
-        hpamdp.train(
-            Mixed,
-            low={"name": "hppo", "minibatch_size": 16},
-            encoder={"name": "cnn", "channels": [4, 4, 4], "num_features": 8},
-            collector=collector,
-            progress=False,
-            total_frames=32,
-            num_envs=4,
-            steps_per_batch=8,
-            **{"eval.layouts": 2, "env.max_steps": 5, "env.observation_scaling": "bounds"},
-        )
-    one, other = pictures
-    # What is seen depends on the seed and the step alone.
-    assert len(one[:, 0].unique(dim=0)) == 4 and torch.equal(one, other)
 
 
 # Catch Point's own picture.

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from test_resume import stop_and_resume, words_of
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import ExplorationType
-from toy_options import steppers
+from toy_options import Listener, steppers
 from toy_trips import HiddenAction, HiddenOption, Sessions, SessionsOfOptions
 
 import hpamdp
@@ -43,20 +43,6 @@ from hpamdp.specs import PAMDPSpecs
 GAMMA = 0.5
 
 
-class Listener(Uniform):
-    """Choose uniformly, and keep what there is to learn."""
-
-    gamma = GAMMA
-
-    def __init__(self, specs: PAMDPSpecs) -> None:
-        super().__init__(specs)
-        self.heard: list[TensorDict] = []
-
-    def learn(self, decisions):
-        self.heard.append(decisions.clone())
-        return {}
-
-
 # Options.
 
 
@@ -70,7 +56,7 @@ def test_a_selector_decides_once_a_trip_and_hears_each_trips_return(split):
     torch.manual_seed(0)
     env = with_decisions(SessionsOfOptions(4, trips=3), GAMMA)
     specs = PAMDPSpecs.from_env(env)
-    selector = Listener(specs)
+    selector = Listener(specs, gamma=GAMMA)
     agent = steppers(selector, specs)
     rolled = env.rollout(12, agent.policy, break_when_any_done=False)
     assert rolled[keys.IS_DECISION][0, :, 0].tolist() == [True, False] * 6
@@ -517,12 +503,6 @@ def test_what_does_not_go_with_trips_is_refused_in_one_line(env, settings, messa
     with pytest.raises(ConfigError, match=message) as error:
         hpamdp.train(env, low="hppo", **{**SMALL, **settings})
     assert "\n" not in str(error.value)
-
-
-def test_an_evaluation_learns_nothing_and_so_ignores_where_values_end(command):
-    words = ["mode=eval", "checkpoint=hppo_boatdock_unseen", "env=platform"]
-    code, _, err = command(*words)
-    assert code != 0 and "values_end" not in err and "whose sizes env sets" in err
 
 
 @pytest.mark.parametrize(

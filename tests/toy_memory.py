@@ -15,8 +15,7 @@ class Cue(PAMDPEnv):
     """See a cue of -1 or 1 in the first step, then the time alone; only the last of `length` steps is rewarded.
 
     The right discrete action, 1 for a positive cue, earns 1 less the distance of its parameter from half the cue. The
-    other one earns -1. So the best return is 1, and the best one without memory 0 on average. With options, the option
-    of the last step counts instead: 1 if it is the one of the cue, else -1.
+    other one earns -1. So the best return is 1, and the best one without memory 0 on average.
 
     Args:
         num_envs: environments of the batch.
@@ -33,8 +32,7 @@ class Cue(PAMDPEnv):
         n = num_envs
         self.observation_spec = Composite(observation=Bounded(-1.0, 1.0, shape=(n, 2)), shape=(n,))
         action = Composite(discrete=Categorical(2, shape=(n,)), parameters=Bounded(-1.0, 1.0, shape=(n, 2)), shape=(n,))
-        option = {"option": Categorical(2, shape=(n,))} if self.option_names else {}
-        self.action_spec = Composite(action=action, **option, shape=(n,))
+        self.action_spec = Composite(action=action, shape=(n,))
         self.reward_spec = Unbounded(shape=(n, 1))
         self.done_spec = self.make_done_spec()
         self._set_seed(seed)
@@ -60,8 +58,6 @@ class Cue(PAMDPEnv):
     def earned(self, tensordict: TensorDictBase) -> Tensor:
         """Return what the actions of a last step earn, `[N]`."""
         chosen = (self.cue > 0.0).long()
-        if self.option_names:
-            return torch.where(tensordict[keys.OPTION] == chosen, 1.0, -1.0)
         parameter = tensordict[keys.PARAMETERS].gather(-1, chosen.unsqueeze(-1)).squeeze(-1)
         return torch.where(tensordict[keys.DISCRETE] == chosen, 1.0 - (parameter - 0.5 * self.cue).abs(), -1.0)
 

@@ -14,6 +14,8 @@ from hpamdp import keys
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner, Selector
+from hpamdp.policies.high_level.meta_critic import MetaCritic
+from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -60,3 +62,26 @@ def earned(agent: HierarchicalAgent, gamma: float, option_length: int | None) ->
         rows = env.rollout(Crossing.max_steps, agent.policy)
     rewards = rows["next", keys.REWARD].flatten()
     return (gamma ** torch.arange(len(rewards)) * rewards).sum().item()
+
+
+class Listener(Uniform):
+    """Choose uniformly, and keep what there is to learn from."""
+
+    def __init__(self, specs: PAMDPSpecs, *, gamma: float = 1.0) -> None:
+        super().__init__(specs)
+        self.gamma = gamma
+        self.heard: list[TensorDictBase] = []
+
+    def learn(self, decisions: TensorDictBase) -> dict[str, float]:
+        self.heard.append(decisions.clone())
+        return {}
+
+
+def make_meta_critic(**changes: object) -> MetaCritic:
+    """Return a meta-critic that learns Crossing within some thousand decisions."""
+    torch.manual_seed(0)
+    options = dict(
+        hidden_dims=[64], num_members=1, exploration="epsilon", epsilon_final=0.2, epsilon_decisions=2000,
+        gamma=0.9, buffer_size=10_000, batch_size=64, updates_per_decision=0.1, warmup_decisions=200, lr=3e-3, tau=0.05,
+    )  # fmt: skip
+    return MetaCritic(PAMDPSpecs.from_env(Crossing()), **{**options, **changes})

@@ -14,15 +14,15 @@ def states(num: int) -> TensorDict:
     return TensorDict({keys.OBSERVATION: torch.rand(num, 4) * 2 - 1}, [num])
 
 
-def one_step_rows(learner: Learner, num: int) -> TensorDict:
+def one_step_rows(learner: Learner, num: int, slope: float = 1.0) -> TensorDict:
     """Play `num` episodes of one step, `[num, 1]`.
 
-    Discrete action 1 earns the more, the nearer its parameters are to (s0, -s1), at most 1; action 2 always earns 0.2,
-    action 0 loses 0.5.
+    Discrete action 1 earns the more, the nearer its parameters are to slope * (s0, -s1), at most 1; action 2 always
+    earns 0.2, action 0 loses 0.5.
     """
     td = learner.policy(states(num))
     unit, state = learner.specs.to_unit(td[keys.PARAMETERS]), td[keys.OBSERVATION]
-    error = (unit[:, 1] - state[:, 0]).square() + (unit[:, 2] + state[:, 1]).square()
+    error = (unit[:, 1] - slope * state[:, 0]).square() + (unit[:, 2] + slope * state[:, 1]).square()
     reward = torch.stack([torch.full_like(error, -0.5), 1.0 - error, torch.full_like(error, 0.2)], -1)
     is_end = torch.ones(num, 1, dtype=torch.bool)
     reward = reward.gather(-1, td[keys.DISCRETE].unsqueeze(-1))
