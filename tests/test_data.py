@@ -1,9 +1,7 @@
 """What serves any recording: demonstrations, tables and memory-mapped files, and Minari."""
 
 import json
-import os
 import re
-import resource
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -15,7 +13,7 @@ from conftest import make_config
 from gymnasium import spaces
 from gymnasium_players import make
 from tensordict import TensorDict
-from torchrl.data import Binary, Unbounded
+from torchrl.data import Unbounded
 
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
@@ -197,10 +195,6 @@ def timed(row=slice(None), value=2.5):
         ),
         (spoilt(keys.IS_DECISION, 2, False), SPECS, "row 2: is_decision is false, but must be true in an episode's"),
         (spoilt(("next", keys.IS_DECISION), 0, True), SPECS, "row 0: next.is_decision is true, but must be the same"),
-        (episodes(2).set(keys.OBSERVATION, torch.zeros(2, 3)), SPECS, "observation has 3 numbers a row, but the"),
-        (episodes(2).set(keys.DISCRETE, torch.zeros(2)), SPECS, "discrete is float32 [N], but must be int64 [N]"),
-        (episodes(2)[:0], SPECS, "shape [0], but must be [N], of at least one row"),
-        (dict(episodes(2)), SPECS, "of class dict, but must be a TensorDict"),
         (episodes(2), WITH_OPTIONS, "lack option, which the agent chooses here, of left, right"),
         (with_option(0, 1, 1, 1, 1), WITH_OPTIONS, "row 1: option is 1, but must be the same as in the row before"),
         (
@@ -316,22 +310,11 @@ class Timed(PlatformEnv):
         return {keys.DURATION: torch.ones(self.num_envs, 1)}
 
 
-class Masked(PlatformEnv):
-    """A problem that writes an action mask."""
-
-    def _knowledge_specs(self):
-        return {keys.ACTION_MASK: Binary(3, (self.num_envs, 3), dtype=torch.bool)}
-
-    def _knowledge(self):
-        return {keys.ACTION_MASK: torch.ones(self.num_envs, 3, dtype=torch.bool)}
-
-
 class PlatformRows(Demonstrations):
     """Transitions of Platform, with some entries besides."""
 
-    def __init__(self, durations: bool = False, masks: bool = False) -> None:
-        env = Masked(1)
-        rows = env.rollout(5, break_when_any_done=True, auto_reset=True).squeeze(0)
+    def __init__(self, durations: bool = False) -> None:
+        rows = PlatformEnv(1).rollout(5, break_when_any_done=True, auto_reset=True).squeeze(0)
         rows[keys.DISCRETE], rows[keys.PARAMETERS] = torch.zeros_like(rows[keys.DISCRETE]), 0 * rows[keys.PARAMETERS]
         rows["next", keys.TRUNCATED][-1] = ~rows["next", keys.TERMINATED][-1]
         rows["next", keys.DONE][-1] = True
@@ -340,8 +323,6 @@ class PlatformRows(Demonstrations):
         rows[TRAJECTORY] = torch.zeros(len(rows), dtype=torch.long)
         if durations:
             rows["next", keys.DURATION] = torch.full((len(rows), 1), 3.0)
-        if not masks:
-            rows = rows.exclude(keys.ACTION_MASK, ("next", keys.ACTION_MASK))
         super().__init__(rows)
 
 
@@ -365,15 +346,6 @@ def test_a_data_set_without_the_durations_that_its_problem_writes_is_said_to_lac
 def test_durations_of_a_problem_whose_steps_take_the_same_time_are_refused():
     with pytest.raises(ConfigError, match=r"it has next\.duration, but steps of env=platform do not take different"):
         data_of(PlatformEnv(1), "+data.durations=true")
-
-
-def test_a_data_set_without_the_masks_that_its_problem_writes_is_said_to_lack_them(capsys):
-    data_of(Masked(1))
-    assert capsys.readouterr().err == (
-        "data=none: it lacks action_mask, next.action_mask, so learners take everything as allowed in its states\n"
-    )
-    data_of(Masked(1), "+data.masks=true")
-    assert capsys.readouterr().err == ""
 
 
 def test_an_offline_learner_discounts_by_the_durations_in_the_data():
@@ -499,8 +471,6 @@ def light(**_):
 SPOILS = {
     "its metadata have no action_space": spec_that_runs,
     "cannot be read as transitions (no JSON": lambda folder: (folder / "metadata.json").write_text("[" * 9999),
-    "is a named pipe": lambda folder: ((folder / "metadata.json").unlink(), os.mkfifo(folder / "metadata.json")),
-    "cannot be read as transitions (No data found": lambda folder: (folder / "main_data.hdf5").unlink(),
     "cannot be read as transitions (Unable to": lambda folder: (folder / "main_data.hdf5").write_bytes(b"\x89HDF" * 99),
     "the transitions, row 3: next.reward is nan, but must be finite": lambda folder: with_values(
         folder, "rewards", lambda group, name, old: group.create_dataset(name, data=old * np.nan)
@@ -520,28 +490,6 @@ def test_a_foreign_minari_data_set_runs_no_code_and_is_refused_in_one_line(works
     message = str(refused.value)
     assert message.startswith("test/tools-v0: ") and said in message and "\n" not in message
     assert not is_lit
-
-
-def test_a_full_disk_stops_every_export_in_a_line_and_leaves_nothing(workshop_id, tmp_path, monkeypatch):
-    pytest.importorskip("minari")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    rows = episodes(*[5] * 99)
-    tables = {"rows": rows.flatten_keys(".")}
-    writes = [
-        lambda: export.write_memmap(rows, tmp_path / "memmap"),
-        lambda: export.write_npz(tables, tmp_path / "rows.npz"),
-        lambda: export.write_csv(tables, tmp_path / "csv"),
-        lambda: minari.export(rows, "test/tools-v0", LAYOUT, env_id=workshop_id, env_kwargs={"size": 2}),
-    ]
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    for write in writes:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
-        try:
-            with pytest.raises(DataError, match="File too large"):
-                write()
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert not [path for path in tmp_path.rglob("*") if path.is_file() or path.name.startswith(".")]
 
 
 def test_what_is_written_as_memory_maps_is_read_back(tmp_path):

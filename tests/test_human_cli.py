@@ -8,7 +8,8 @@ import json
 import re
 import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,6 @@ from hpamdp.data.human.dataset import HumanExperienceReplay
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.download import download
 from hpamdp.data.human.released_file import read
-from hpamdp.data.human.rest_to_rest import to_rest_to_rest
 from hpamdp.data.human.transitions import transitions
 from hpamdp.env.boatdock.environment import BoatDockEnv
 
@@ -104,18 +104,6 @@ def test_a_recording_without_a_press_is_checked_and_summarised_and_gives_no_tran
             HumanDemonstrations(BoatDockEnv(1), path=str(path), checksum=None, rest_to_rest=rest_to_rest)
 
 
-def test_presses_of_which_none_is_from_rest_to_rest_are_refused_in_one_line(tmp_path):
-    people = synthetic_human.recording()
-    data = read(synthetic_human.write(tmp_path / "all.mat", people), checksum=None, one_frame=True)
-    left = to_rest_to_rest(data).presses["episode"].bincount(minlength=len(data.episodes))
-    number = int(((left == 0) & (data.episodes["presses"] > 0)).nonzero()[0])
-    episode = [each for person in people for each in person][number]
-    path = str(synthetic_human.write(tmp_path / "taps.mat", [[episode]]))
-    with pytest.raises(DataError, match="no press is left as a rest-to-rest press; use rest_to_rest=false"):
-        HumanDemonstrations(BoatDockEnv(1), path=path, checksum=None)
-    assert len(HumanDemonstrations(BoatDockEnv(1), path=path, checksum=None, rest_to_rest=False).batch)
-
-
 @pytest.mark.parametrize(
     ("form", "given", "said"),
     [
@@ -189,59 +177,30 @@ def test_exports_overwrite_nothing_and_leave_nothing_behind(capsys, path, tmp_pa
     )
 
 
-class Server(ThreadingHTTPServer):
-    """Serves `body`."""
-
-    body: bytes
-    num_requests = 0
-
-
-class Handler(BaseHTTPRequestHandler):
-    server: Server
-
-    def do_GET(self) -> None:
-        server = self.server
-        server.num_requests += 1
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(server.body)))
-        self.end_headers()
-        self.wfile.write(server.body)
-
-    def log_message(self, *_: object) -> None:
-        pass
-
-
 @pytest.fixture
-def without_proxies(monkeypatch) -> None:
+def served(tmp_path_factory, monkeypatch) -> Iterator[tuple[str, bytes]]:
+    """The address of a file, and what it holds."""
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
-
-
-@pytest.fixture
-def server(without_proxies) -> Iterator[Server]:
-    with Server(("127.0.0.1", 0), Handler) as server:
-        server.body = np.random.default_rng(0).bytes(300_000)
+    folder, body = tmp_path_factory.mktemp("served"), np.random.default_rng(0).bytes(300_000)
+    (folder / "people.mat").write_bytes(body)
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=folder)) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
-        yield server
+        yield f"http://127.0.0.1:{server.server_address[1]}/people.mat", body
         server.shutdown()
         thread.join()
 
 
-def address(server: Server) -> str:
-    return f"http://127.0.0.1:{server.server_address[1]}/people.mat"
+def test_a_download_is_kept_and_not_fetched_again(served, tmp_path):
+    address, body = served
+    target, checksum = tmp_path / "cache" / "people.mat", hashlib.sha256(body).hexdigest()
+    assert download(address, target, checksum=checksum) == target
+    assert target.read_bytes() == body and list(target.parent.iterdir()) == [target]
+    assert download("http://127.0.0.1:1/nowhere", target, checksum=checksum) == target
 
 
-def test_a_download_is_kept_and_not_fetched_again(server, tmp_path, capfd):
-    target, checksum = tmp_path / "cache" / "people.mat", hashlib.sha256(server.body).hexdigest()
-    assert download(address(server), target, checksum=checksum) == target
-    assert target.read_bytes() == server.body and list(target.parent.iterdir()) == [target]
-    download(address(server), target, checksum=checksum)
-    assert server.num_requests == 1
-    assert capfd.readouterr() == ("", "")  # no progress bar outside a terminal
-
-
-def test_a_download_of_another_file_is_thrown_away(server, tmp_path, capsys):
-    message = error_of(capsys, "download", "--url", address(server), "--to", tmp_path / "people.mat")
-    assert "does not match the known hash" in message
+def test_a_download_of_another_file_is_thrown_away(served, tmp_path, capfd):
+    assert cli.main(["download", "--url", served[0], "--to", str(tmp_path / "people.mat")]) == 2
+    assert "does not match the known hash" in capfd.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -120,19 +120,6 @@ def test_an_unknown_code_is_refused(tmp_path):
     )
 
 
-def test_missing_fields_and_wrong_sizes_are_named(tmp_path):
-    people = synthetic_human.recording()
-    del people[0][2]["tank"]
-    assert "person 0, episode 2: the fields are" in refusal(
-        synthetic_human.write(tmp_path / "a.mat", people), checksum=None
-    )
-    people = synthetic_human.recording()
-    people[0][2]["SG"] = np.zeros((1, 3))
-    assert "SG has 3 numbers, but must have 4" in refusal(
-        synthetic_human.write(tmp_path / "a.mat", people), checksum=None
-    )
-
-
 def test_people_who_never_pressed_a_key_are_read(tmp_path):
     people = synthetic_human.recording()
     silent = [episode for episodes in people for episode in episodes if not episode["gas"].size]

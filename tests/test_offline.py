@@ -60,16 +60,6 @@ def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, pat
     assert [row["frames"] for row in rows if "eval/score" in row] == [0, 3, 6]
 
 
-def test_a_run_that_fails_in_its_first_evaluation_keeps_its_data_set(path, tmp_path, monkeypatch):
-    given = overrides(path, "iql")
-    with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
-        patched.setattr(Trainer, "_evaluate", lambda self, bar, request: 1 / 0)
-        run(compose_config(given), tmp_path / "first", given)
-    resumed = ["mode=offline", f"resume={tmp_path / 'first'}"]
-    assert run(compose_config(resumed), tmp_path / "second", resumed) == 0
-    assert json.loads((tmp_path / "second" / "summary.json").read_text())["without_update"] == []
-
-
 def test_a_run_that_fails_at_its_start_adds_its_data_set_once(path, tmp_path, monkeypatch):
     added, add = [], HierarchicalAgent.add_demonstrations
     counted = lambda self, *data: (added.append(len(data[0])), add(self, *data))  # noqa: E731

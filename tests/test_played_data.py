@@ -59,16 +59,6 @@ def test_the_tables_hold_the_episodes_and_their_presses(file):
     assert len(played_file.read(file, practice=True).episodes) == len(rounds) + 1
 
 
-def test_the_tables_have_the_columns_of_the_recording_of_people(file):
-    data = played_file.read(file)
-    columns = {"person", "index", "block", "controller", "keymap", "presses", "outcome", "tank"}
-    assert all(data.episodes[name].dtype == torch.int64 for name in columns)
-    assert {*data.episodes.keys()} == columns | {"complete", "start", "goal", "centre"}
-    floats = {"position", "next_position", "duration", "speed", "distance", "gas"}
-    assert {*data.presses.keys()} == floats | {"episode", "press", "is_final", "key"}
-    assert all(data.presses[name].dtype == torch.float32 for name in floats)
-
-
 def test_an_interrupted_press_leads_to_where_the_next_one_began(file):
     data = played_file.read(file)
     first = data.presses[data.presses["episode"] == len(data.episodes) - 1][0]
