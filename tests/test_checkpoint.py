@@ -107,7 +107,8 @@ def damaged(data: bytes, number: int) -> bytes:
     return data[:place] + bytes(length) + data[place + length :]
 
 
-def load_damaged(numbers, trained, parts, tmp_path) -> None:
+@pytest.mark.parametrize("numbers", [range(60), pytest.param(range(1000, 1500), marks=pytest.mark.slow)], ids=len)
+def test_a_damaged_checkpoint_is_refused_in_one_line(numbers, trained, parts, tmp_path):
     data = (trained / "checkpoint.safetensors").read_bytes()
     file = tmp_path / "damaged"
     for number in numbers:
@@ -118,15 +119,6 @@ def load_damaged(numbers, trained, parts, tmp_path) -> None:
         with pytest.raises(ConfigError) as error:
             load(checkpoint.find(file, "resume"), parts)
         assert "\n" not in str(error.value), number
-
-
-def test_a_damaged_checkpoint_is_refused_in_one_line(trained, parts, tmp_path):
-    load_damaged(range(60), trained, parts, tmp_path)
-
-
-@pytest.mark.slow
-def test_five_hundred_damaged_checkpoints_end_in_one_line_each(trained, parts, tmp_path):
-    load_damaged(range(1000, 1500), trained, parts, tmp_path)
 
 
 def test_missing_parts_foreign_files_and_other_agents_are_refused(trained, parts, tmp_path):

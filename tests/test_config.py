@@ -9,7 +9,6 @@ from conftest import CONF, choices, compose_config, make_config
 from omegaconf import OmegaConf
 from pydantic import Field, PositiveInt
 
-from hpamdp.config import schema
 from hpamdp.config.components import (
     CALLBACK,
     GROUPS,
@@ -25,7 +24,6 @@ from hpamdp.config.saved import read_saved
 from hpamdp.policies.high_level.ucb import UCB
 from hpamdp.policies.low_level.random import Random
 from hpamdp.run import compatibility
-from hpamdp.run.train import run
 from hpamdp.settings import SettingError
 
 FILES = [(group, name) for group in GROUPS for name in choices(group)]
@@ -256,39 +254,11 @@ def test_a_saved_config_has_names_instead_of_modules_and_is_read_back_the_same(w
     assert read_saved(saved) == config
 
 
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (
-            ["agent.termination=steps"],
-            "agent.option_length: missing; agent.termination=steps needs the number of steps of an option",
-        ),
-        (
-            ["agent.option_length=3"],
-            "agent.option_length=3: goes with agent.termination=steps only, not with episode",
-        ),
-    ],
-)
-def test_a_number_of_steps_goes_with_options_that_end_after_steps_alone(words, complaint):
-    with pytest.raises(ConfigError) as error:
-        compatibility.check(make_config(words))
-    assert str(error.value) == complaint
-
-
 def test_a_name_of_a_saved_config_that_is_nowhere_is_told_in_one_line():
     saved = make_config([]).to_dict()
     saved["choices"]["low"] = "gone"
     with pytest.raises(ConfigError, match=r"the saved run chose low/gone, which is not there; is a --config-dir miss"):
         read_saved(saved)
-
-
-def test_one_run_checks_its_config_once(tmp_path, monkeypatch):
-    checked = []
-    known = schema.component
-    monkeypatch.setattr(schema, "component", lambda *given, **more: checked.append(given[0]) or known(*given, **more))
-    words = ["low=random", "num_envs=4", "eval.layouts=4", "total_frames=64", "eval.every=0"]
-    assert run(compose_config(words), tmp_path, words) == 0
-    assert sorted(checked) == sorted(GROUPS)
 
 
 def test_every_yaml_says_what_it_is():

@@ -6,7 +6,6 @@ import math
 import os
 import signal
 import struct
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -160,17 +159,6 @@ def test_a_file_of_a_users_own_with_the_name_of_a_result_is_never_deleted(own, t
         assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("kept", ["checkpoint.safetensors", "summary.json"])
-def test_a_run_that_has_lost_most_of_its_files_may_be_overwritten(kept, tmp_path):
-    start(tmp_path)
-    for path in tmp_path.iterdir():
-        if path.name not in (kept, "policy.safetensors"):
-            path.unlink()
-    with pytest.raises(ConfigError, match="holds the results of a run"):
-        start(tmp_path)
-    assert start(tmp_path, "overwrite=true", "seed=7") == 0
-
-
 def test_an_error_file_that_no_sweep_has_written_is_never_removed_and_one_of_a_sweep_goes_with_the_run(tmp_path):
     (tmp_path / ERROR_NAME).write_text("my own errors\n")
     for word in ("overwrite=false", "overwrite=true"):
@@ -232,17 +220,6 @@ def test_an_evaluation_never_touches_the_record_of_a_run(tmp_path, command, caps
     assert code == 2 and err.count("\n") == 1
     after = contents(tmp_path)
     assert {name: after[name] for name in before} == before and {*after} - {*before} <= {"multirun.yaml", "report.csv"}
-
-
-def test_an_evaluation_may_replace_another_and_read_a_folder_that_it_cannot_write(tmp_path):
-    start(tmp_path / "run")
-    (tmp_path / "run").chmod(0o555)
-    words = ["mode=eval", f"checkpoint={tmp_path / 'run'}"]
-    try:
-        assert run(compose_config(words), tmp_path / "scored", words) == 0
-        assert run(compose_config([*words, "overwrite=true"]), tmp_path / "scored", words) == 0
-    finally:
-        (tmp_path / "run").chmod(0o755)
 
 
 def test_a_run_is_not_resumed_where_another_process_is_at_work(tmp_path, command):
@@ -395,16 +372,6 @@ def test_other_values_of_an_environments_own_arguments_make_another_run(env, sav
     assert sorted(differing_settings(here, there)) == sorted(differing_settings(there, here)) == names
 
 
-def test_a_missing_argument_of_an_environment_is_named_as_no_value(tmp_path, command):
-    words = [*TINY, "env=gymnasium", "env.entry_point=toy_environments:Drawn", "env.max_steps=4", "high=none"]
-    words += ["film=false", "hydra.run.dir=run", "resume=auto"]
-    assert command(*words, "env.kwargs={is_wrong: true}")[0] == 0
-    code, _, err = command(*words, "env.kwargs={is_wrong: 1}")
-    assert code == 2 and "with env.kwargs.is_wrong=true for 1;" in err
-    code, _, err = command(*words)
-    assert code == 2 and "with env.kwargs.is_wrong=true for no value;" in err
-
-
 def test_a_job_that_was_finished_by_hand_counts_as_finished_in_its_sweep(tmp_path, command):
     words = ["-m", *TINY, "film=false", "checkpoint_every=96", "seed=0", "hydra.sweep.dir=sweep"]
     with pytest.MonkeyPatch.context() as patch:
@@ -425,30 +392,6 @@ def after_batches(monkeypatch: pytest.MonkeyPatch, number: int, do: Callable[[],
             do()
 
     monkeypatch.setattr(Recorder, "take", watched)
-
-
-def kill_wandb() -> None:
-    children = subprocess.run(["ps", "-o", "pid=,comm=", "--ppid", str(os.getpid())], capture_output=True, text=True)
-    (service,) = [line.split()[0] for line in children.stdout.splitlines() if "wandb-core" in line]
-    os.kill(int(service), signal.SIGKILL)
-
-
-@pytest.mark.slow
-def test_a_run_outlives_wandbs_service_and_the_next_run_starts_another(
-    tmp_path,
-    monkeypatch,
-    capsys,
-    without_login,  # noqa: F811
-):
-    with monkeypatch.context() as patch:
-        after_batches(patch, 2, kill_wandb)
-        assert start(tmp_path / "a", "logger=wandb", "logger.mode=offline") == 0
-    assert capsys.readouterr().err.count("the run continues without this logger") == 1
-    assert len(read_rows(tmp_path / "a/metrics.csv")) == 5
-    assert start(tmp_path / "b", "logger=wandb", "logger.mode=offline") == 0
-    wandb.teardown()
-    ((*_, last),) = wandb_curves(tmp_path / "b").values()
-    assert last[0] == 128 and "continues without" not in capsys.readouterr().err
 
 
 def test_a_job_that_a_signal_stops_is_saved_before_its_launcher_gets_the_signal(tmp_path, command, monkeypatch):

@@ -64,16 +64,6 @@ def test_what_cannot_be_sent_to_processes_is_refused_in_one_line_and_nothing_is_
     assert ("collector=single" if processes is WORKERS else "or use 0") in str(raised.value)
 
 
-def test_a_learners_class_that_cannot_be_sent_is_refused_by_its_name():
-    lock = threading.Lock()
-
-    class Locked(hpamdp.HPPO):
-        held = lock
-
-    with pytest.raises(hpamdp.ConfigError, match="low=Locked: cannot be sent to the workers of collector=multi"):
-        hpamdp.train("platform", low=Locked, **TINY, **WORKERS)
-
-
 def test_what_cannot_be_sent_is_trained_in_one_process():
     assert hpamdp.train(with_lock("function"), **OWN).history[-1]["frames"] == 1024
 

@@ -4,17 +4,15 @@
 import json
 import shutil
 import statistics
-import threading
 import time
-from contextlib import contextmanager
 
 import pytest
+from test_page_server import serving
 
 from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
 from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
-from hpamdp.run.page_server import EpisodeFile, PageServer
 from hpamdp.run.play import export
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
@@ -36,20 +34,6 @@ def browser():
 @pytest.fixture(scope="module")
 def page_data():
     return BoatPage(seed=0).data([], has_server=True)
-
-
-@contextmanager
-def serving(path, data, page=None):
-    page = BoatPage(seed=0) if page is None else page
-    server = PageServer(("127.0.0.1", 0), page, data, EpisodeFile(path, page))
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
-    thread.start()
-    try:
-        yield server.address
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
 
 
 class Player:
@@ -102,9 +86,9 @@ class Player:
 
 @pytest.fixture
 def player(browser, page_data, tmp_path):
-    with serving(tmp_path / "played.jsonl", page_data) as address:
+    with serving(tmp_path / "played.jsonl", data=page_data) as server:
         context = browser.new_context(viewport={"width": 1100, "height": 900})
-        one = Player(context, address)
+        one = Player(context, server.address)
         one.file = tmp_path / "played.jsonl"
         yield one
         assert one.errors == []
@@ -191,9 +175,9 @@ def test_auto_repeat_is_no_press(player):
 
 
 def test_fingers_steer_on_a_narrow_screen_on_which_everything_fits(browser, page_data, tmp_path):
-    with serving(tmp_path / "played.jsonl", page_data) as address:
+    with serving(tmp_path / "played.jsonl", data=page_data) as server:
         context = browser.new_context(viewport={"width": 390, "height": 740}, has_touch=True, is_mobile=True)
-        player = Player(context, address)
+        player = Player(context, server.address)
         player.board(layout=DOWN_THE_MIDDLE)
         assert player.page.evaluate("document.documentElement.scrollWidth") <= 390
         box = player.page.locator(".key[data-key='1']").bounding_box()
@@ -229,9 +213,9 @@ def test_the_exported_page_plays_from_files_and_gives_its_episodes_as_a_file(bro
 @pytest.mark.parametrize("boats", [1, 2])
 def test_a_session_shows_where_its_boats_keys_push_only_when_it_is_over_and_is_stored_then(browser, tmp_path, boats):
     page = SessionPage(seed=0, options=UnseenBoatsOptions(trips=2, boats=boats, family="strength"))
-    with serving(tmp_path / "played.jsonl", page.data([], has_server=True), page) as address:
+    with serving(tmp_path / "played.jsonl", page, page.data([], has_server=True)) as server:
         context = browser.new_context(viewport={"width": 1100, "height": 900})
-        player = Player(context, address, mode="session")
+        player = Player(context, server.address, mode="session")
         player.file = tmp_path / "played.jsonl"
         shown = lambda: player.page.locator("main svg").count()  # noqa: E731
         for trip in range(2):

@@ -26,6 +26,7 @@ from hpamdp.settings import OnlyWith
 SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "eval.every=0"]
 PLATFORM = "env=platform high=none low=random "
 GYMNASIUM = "env=gymnasium high=none low=random env.max_steps=9 "
+CROSSING = "env=crossing low=stepper"
 
 REFUSED = [
     ("low=qpamdp collector=multi collector.ahead=true", "low=qpamdp learns from steps of its current policy"),
@@ -65,6 +66,18 @@ REFUSED = [
     ("env.switch_cost=0.2 high=oracle low=planner", "low=planner: its plans on env=boatdock change options, but"),
     ("env.switch_cost=0.2 agent.termination=steps agent.option_length=1", "high=ucb is a bandit, which counts what "),
     ("high=meta_critic agent.termination=steps agent.option_length=1", "agent.termination=steps: env=boatdock keeps"),
+    ("high=none", "high=none: env=boatdock needs a selector; use another high or env.controller=congruent (or incong"),
+    # Levels that do not go together.
+    ("high=ucb env=platform low=random", "high=ucb: env=platform has no options to choose; use high=none"),
+    ("high=none low=planner env=platform", "low=planner: env=platform has no planner to ask"),
+    ("high=ucb env.controller=random", "high=ucb: env=boatdock leaves nothing to choose; use high=none or env.contr"),
+    ("high=none env.controller=random low=random low.freeze=true", "low.freeze=true: there is no choice left to learn"),
+    ("high=linucb env.observation=pixels", "high: inputs=[14, 15]: the observation has entries 0 to 13; null: all"),
+    ("high=exp3 low=iql mode=offline data=human", "high=exp3: learns from its own choices only; use mode=train, or"),
+    ("low=random low.checkpoint=/nowhere", "low.checkpoint=/nowhere: no checkpoint there; give a run's output folder"),
+    (f"{CROSSING} high=actor agent.termination=learned", "high=actor does not decide where options end; use high=opt"),
+    (f"{CROSSING} high=ucb agent.termination=steps agent.option_length=3 low.freeze=true", "plays whole episodes; use"),
+    ("agent.termination=steps", "agent.option_length: missing; agent.termination=steps needs the number of steps of"),
     # Observations of others.
     (
         GYMNASIUM + "env.entry_point=toy_environments:TickingGoal env.observation_keys=[2]",

@@ -156,23 +156,11 @@ def started(folder: Path, *words: str, output: IO[str] | int, start: Callable[..
     raise AssertionError("nothing was logged")
 
 
-def exit_code(process: multiprocessing.Process) -> int | None:
-    """Wait for the end of a forked process."""
-    process.join(60)
-    return process.exitcode
-
-
 @pytest.fixture
 def printed(tmp_path) -> Iterator[IO[str]]:
     """A file for what a program prints."""
     with (tmp_path / "printed.txt").open("w+") as file:
         yield file
-
-
-def lines_of(printed: IO[str]) -> list[str]:
-    """Return what was printed, without empty lines."""
-    printed.seek(0)
-    return [line for line in printed.read().splitlines() if line]
 
 
 @pytest.mark.slow
@@ -185,16 +173,6 @@ def test_ctrl_c_saves_when_the_reader_of_its_output_is_gone(tmp_path):
     assert process.wait(60) == 130
     assert frames_of(tmp_path / "run") > 0
     assert not json.loads((tmp_path / "run/summary.json").read_text())["finished"]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-def test_a_run_whose_output_is_full_goes_on_and_saves(tmp_path):
-    with open("/dev/full", "w") as full:
-        process = started(tmp_path / "run", output=full, start=interpreter)
-        process.terminate()
-        assert process.wait(60) == 130
-    assert frames_of(tmp_path / "run") > 0
 
 
 @pytest.mark.parametrize("collector", ["single", pytest.param("multi", marks=pytest.mark.slow)])
@@ -218,17 +196,6 @@ def test_a_killed_run_loses_no_more_than_the_minutes_between_two_checkpoints(tmp
     assert frames_of(tmp_path / "run") > 0
     words = [f"resume={tmp_path / 'run'}", f"total_frames={frames_of(tmp_path / 'run') + 64}"]
     assert run(compose_config(words), tmp_path / "resumed", words) == 0
-
-
-def test_a_second_run_in_the_folder_of_one_that_runs_is_refused(tmp_path, printed):
-    with open(os.devnull, "w") as nothing:
-        process = started(tmp_path / "run", output=nothing)
-    second = program(tmp_path, [f"hydra.run.dir={tmp_path / 'run'}"], printed)
-    assert exit_code(second) == 2
-    process.kill()
-    process.join()
-    (line,) = lines_of(printed)
-    assert "another process is at work in this folder" in line
 
 
 @pytest.mark.parametrize(

@@ -261,17 +261,11 @@ def test_text_of_a_saved_config_stays_text(of_toy, monkeypatch, tmp_path, comman
         assert read_saved(saved(config)) == config
 
 
-def nested(depth: int) -> dict:
-    return {} if depth == 0 else {"a": nested(depth - 1)}
-
-
 @pytest.mark.parametrize(
     "change",
     [
-        set_to("choices", "env", "x" * 5000),
         set_to("low", "per_option", {"a": {"name": ["random"]}}),
         set_to("env", "\x1b[31m", 1),
-        set_to("logger", "deep", nested(500)),
         lambda config: config.update(hydra={"run": {"dir": "/"}}),
     ],
 )
@@ -289,16 +283,3 @@ def test_the_name_that_0_3_had_for_practice_is_read():
     del saved["agent"]["practice"]
     saved["agent"]["uniform_option_steps"] = 77
     assert read_saved(saved).run.agent.practice == 77
-
-
-def test_a_word_may_need_a_setting_that_the_saved_run_has(command):
-    words = ["env=boatdock_unseen", "env.fleet_size=2", "env.frame=first_press", "high=none", "low=random"]
-    words += ["total_frames=64", "num_envs=8", "steps_per_batch=8", "eval.every=0", "eval.layouts=2", "film=false"]
-    assert command(*words, "hydra.run.dir=run")[0] == 0
-    scored = ["mode=eval", "checkpoint=run", "env.scored_boats=training", "film=false", "hydra.run.dir=scored"]
-    code, _, err = command(*scored)
-    assert code == 0, err
-    env = yaml.safe_load(Path("scored/config.yaml").read_text())["env"]
-    assert (env["fleet_size"], env["scored_boats"], env["frame"]) == (2, "training", "first_press")
-    code, _, err = command(*scored[:-1], "env.fleet_size=null", "hydra.run.dir=again")
-    assert code == 2 and err.startswith("env: scored_boats=training: needs a fleet_size")

@@ -1,8 +1,7 @@
 """Learners and their settings: built from the sizes of a problem alone, from a model, or from single settings."""
 
-import inspect
+from functools import partial
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -10,13 +9,8 @@ from toy_steps import SPECS
 
 import hpamdp
 from hpamdp.data.demonstrations import Demonstrations
-from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.platform.environment import PlatformEnv
-from hpamdp.policies.base import Level
-from hpamdp.policies.exploration.counts import Counts
-from hpamdp.policies.exploration.held import Held
-from hpamdp.policies.exploration.novelty import Novelty
 from hpamdp.policies.low_level.bc import BC
 from hpamdp.policies.low_level.hppo import HPPO
 from hpamdp.policies.low_level.hsac import HSAC
@@ -25,7 +19,6 @@ from hpamdp.policies.low_level.paddpg import PADDPG
 from hpamdp.policies.low_level.qpamdp import QPAMDP
 from hpamdp.policies.low_level.td3_bc import TD3BC
 from hpamdp.settings import SettingError
-from hpamdp.specs import PAMDPSpecs
 
 LEARNERS = [BC, HPPO, HSAC, IQL, PADDPG, QPAMDP, TD3BC]
 
@@ -67,31 +60,21 @@ def test_python_code_gets_one_line_that_guesses_the_setting_that_was_meant(setti
     assert str(raised.value).startswith(complaint) and len(str(raised.value).splitlines()) == 1
 
 
-def takers_of_a_device():
-    """Return functions of a device by name: every public class that takes one, and the other ways to give one."""
-    specs = PAMDPSpecs.from_env(BoatDockEnv(1))
-    classes = [each for name in dir(hpamdp) if isinstance(each := getattr(hpamdp, name), type)]
-    levels = [each for each in classes if issubclass(each, Level) and "device" in inspect.signature(each).parameters]
-    takers = {each.__name__: lambda device, cls=each: cls(specs, device=device) for each in levels}
-    for exploration in (Counts, Held, Novelty):
-        takers[exploration.__name__] = lambda device, cls=exploration: cls(hpamdp.PDQN(specs), device=device)
-    return takers | {
-        "PlatformEnv": lambda device: PlatformEnv(2, device=device),
-        "GymnasiumEnv": lambda device: GymnasiumEnv(id="CartPole-v1", device=device),
-        "gymnasium.make": lambda device: gymnasium.make("hpamdp/Platform-v0", device=device),
-        "gymnasium.make_vec": lambda device: gymnasium.make_vec("hpamdp/BoatDock-v0", 2, device=device),
-        "Demonstrations": lambda device: Demonstrations(None, device),
-        "make": lambda device: hpamdp.make("platform", device=device),
-        "make_gymnasium": lambda device: hpamdp.make_gymnasium("platform", 2, device=device),
-        "load": lambda device: hpamdp.load("hppo_platform", device=device),
-        "train": lambda device: hpamdp.train("platform", device=device, total_frames=8, progress=False),
-    }
-
-
-@pytest.mark.parametrize("name", takers_of_a_device())
-def test_a_wrong_device_is_refused_in_one_line_wherever_it_is_given(name):
+@pytest.mark.parametrize(
+    "take",
+    [
+        partial(hpamdp.PDQN, SPECS),
+        partial(PlatformEnv, 2),
+        partial(GymnasiumEnv, id="CartPole-v1"),
+        partial(Demonstrations, None),
+        partial(hpamdp.make_gymnasium, "platform", 2),
+        partial(hpamdp.load, "hppo_platform"),
+        partial(hpamdp.train, "platform"),
+    ],
+)
+def test_a_wrong_device_is_refused_in_one_line_wherever_it_is_given(take):
     with pytest.raises(ValueError, match=r"device=\W?gpu\W?: .*cpu") as raised:
-        takers_of_a_device()[name]("gpu")
+        take(device="gpu")
     assert "\n" not in str(raised.value)
 
 

@@ -15,7 +15,6 @@ from omegaconf import OmegaConf
 
 from hpamdp import cli
 from hpamdp.files import replacing
-from hpamdp.messages import say
 from hpamdp.run import train
 from hpamdp.search_path import put_working_directory_last
 from hpamdp.shell import for_hydra, path_setting, setting
@@ -88,21 +87,6 @@ def test_an_unreadable_yaml_is_refused_in_one_line(command, tmp_path, text, line
     assert code == 2 and err.count("\n") == 1 and line in err
 
 
-ODD_WORDS = [
-    [f"resume={'x' * 300}"],
-    ["--config-name", "missing"],
-    ["--config-dir", "missing"],
-    ["watch", "=1"],
-    ["😀=1"],
-]
-
-
-@pytest.mark.parametrize("words", ODD_WORDS, ids=[" ".join(words)[:30] for words in ODD_WORDS])
-def test_an_odd_word_is_reported_in_one_line(command, words):
-    code, out, err = command(*words)
-    assert (code, out) == (2, "") and err.count("\n") == 1 and err.strip()
-
-
 def test_a_setting_with_dashes_is_reported_without_them(command):
     code, _, err = command("--seed=1", "low=hppo")
     assert (code, err) == (2, "--seed=1: settings have no dashes, write seed=1; a wandb sweep ${args_no_hyphens}\n")
@@ -119,35 +103,6 @@ def ends_with(folder: Path, words: list[str], out: int, encoding: str, err: Path
     finally:
         sys.stdout.close()
         sys.stderr.close()
-
-
-@pytest.mark.parametrize("words", [["--cfg", "job"], ["watch", "--help"]])
-def test_help_that_cannot_be_written_costs_one_line_at_most(tmp_path, words):
-    err = tmp_path / "err.txt"
-    with open("/dev/full", "w") as full:
-        assert forked(ends_with, tmp_path, words, full.fileno(), "utf-8", err) == 1
-    assert err.read_text() == "stdout: No space left on device\n"
-    reader, writer = os.pipe()
-    os.close(reader)
-    assert forked(ends_with, tmp_path, words, writer, "utf-8", err) == 1 and err.read_text() == ""
-    os.close(writer)
-
-
-def test_letters_that_a_terminal_cannot_show_are_replaced(tmp_path, monkeypatch):
-    encoding = "ascii"
-    out, err = tmp_path / "out.txt", tmp_path / "err.txt"
-
-    def run(cfg, folder, *_, **__):
-        say(f"Everything is in {folder}")
-        return 0
-
-    monkeypatch.setattr(train, "run", run)
-    with out.open("w") as file:
-        for words in (["hydra.run.dir='läufe/a b Ω'"], ["-m", "seed=1", "hydra.sweep.dir='Ω'"]):
-            assert forked(ends_with, tmp_path, words, file.fileno(), encoding, err) == 0
-        assert forked(ends_with, tmp_path, ["env=Ω"], file.fileno(), encoding, err) == 2
-    text = out.read_text(encoding)
-    assert text.count("\\u03a9") == 2 and "1 job: 1 finished" in text and "Traceback" not in err.read_text()
 
 
 @pytest.fixture

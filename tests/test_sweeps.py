@@ -129,10 +129,6 @@ def test_an_error_file_of_the_users_own_stays_in_the_folder_of_a_job(command, jo
     assert {(tmp_path / f"sweep/{number}/error.txt").read_text() for number in range(2)} == {"mine"}
 
 
-def test_a_sweep_that_fails_by_mistakes_alone_exits_with_2(command, jobs):
-    assert command("-m", "seed=0,1", "hydra.sweep.dir=sweep")[0] == 2
-
-
 def test_a_sweep_started_again_does_what_is_left(command, jobs, tmp_path):
     words = ["-m", "seed=0,3,4,2", "hydra.sweep.dir=sweep"]
     code, out, _ = command(*words)
@@ -162,11 +158,6 @@ def test_a_folder_of_experiments_stands_for_a_sweep_over_all_in_it():
     line = completed(parse(["--multirun", "experiment=domains", "seed=0,4"], CONF), CONF)
     experiments, seeds = line.words[-2:]
     assert line.is_multirun and seeds == "seed=0,4" and experiments.count(",") == len(choices("experiment/domains")) - 1
-
-
-def test_the_problem_that_all_experiments_of_a_folder_choose_may_be_given():
-    line = completed(parse(["experiment=circuits", "env=circuit", "low=random"], CONF), CONF)
-    assert line.is_multirun and "env=circuit" in line.words
 
 
 def test_a_glob_stands_for_a_sweep_over_the_choices_that_match(command, jobs, tmp_path):
