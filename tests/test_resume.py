@@ -92,16 +92,9 @@ def test_a_run_of_the_selector_alone_resumes_to_the_last_bit(tmp_path, monkeypat
     stop_and_resume([*words_of("linucb", "random"), "low.freeze=true"], tmp_path, monkeypatch, signal.SIGINT)
 
 
-SIGTERM, *OTHERS = STOP_SIGNALS[1:]
-
-
-@pytest.mark.parametrize(
-    "number",
-    [SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in OTHERS)],
-    ids=lambda number: number.name,
-)
-def test_every_signal_that_stops_a_run_saves_it(number, tmp_path, monkeypatch):
-    stop_and_resume(words_of("ucb", "random"), tmp_path, monkeypatch, number)
+@pytest.mark.slow
+def test_every_signal_that_stops_a_run_saves_it(tmp_path, monkeypatch):
+    stop_and_resume(words_of("ucb", "random"), tmp_path, monkeypatch, *STOP_SIGNALS)
 
 
 @pytest.mark.slow
@@ -153,7 +146,7 @@ def test_options_that_end_with_the_last_batch_before_a_stop_are_learned_from(col
     stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
 
 
-@pytest.mark.parametrize("env", ["platform", "boatdock_released"])
+@pytest.mark.parametrize("env", [pytest.param("platform", marks=pytest.mark.slow), "boatdock_released"])
 def test_other_problems_resume_to_the_last_bit(env, tmp_path, monkeypatch):
     given = [*words_of("none", "pdqn"), f"env={env}", "env.max_steps=12"]
     stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)

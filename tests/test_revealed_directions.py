@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from conftest import make_config
 from tensordict import TensorDict
 from test_resume import stop_and_resume
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -21,6 +22,7 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.shared.known_directions import KnownDirections
+from hpamdp.run.assemble import assemble
 from hpamdp.specs import PAMDPSpecs
 
 SMALL = dict(
@@ -303,11 +305,10 @@ def test_learners_of_which_only_some_remember_directions_are_refused(second):
         hpamdp.train("boatdock_unseen", low="pets", **more)
 
 
-@pytest.mark.parametrize("augment", ["auto", False])
+@pytest.mark.parametrize("augment", ["auto", "false"])
 def test_runs_warn_of_forgotten_trips_only_if_no_directions_are_remembered(augment, capsys):
-    more = {**QUIET, **QUICK, "low.augment": augment}
-    hpamdp.train("boatdock_unseen", high="none", low="pets", **more)
-    assert ("forgets earlier trips" in capsys.readouterr().err) == (augment is False)
+    assemble(make_config([*RUN, f"low.augment={augment}"]))
+    assert ("forgets earlier trips" in capsys.readouterr().err) == (augment == "false")
 
 
 def test_an_agent_remembers_directions_until_its_session_ends():

@@ -5,6 +5,7 @@ import signal
 
 import pytest
 import torch
+from conftest import make_config
 from tensordict import TensorDict
 from test_resume import stop_and_resume, words_of
 from torchrl.envs import check_env_specs
@@ -38,6 +39,7 @@ from hpamdp.policies.low_level.qpamdp import QPAMDP
 from hpamdp.policies.low_level.random import Random
 from hpamdp.policies.shared.sequences import sample_with_past, states_of_past
 from hpamdp.policies.shared.session_bandit import SESSION_REWARDS, SessionRewards
+from hpamdp.run.assemble import assemble
 from hpamdp.specs import PAMDPSpecs
 
 GAMMA = 0.5
@@ -506,16 +508,16 @@ def test_what_does_not_go_with_trips_is_refused_in_one_line(env, settings, messa
 
 
 @pytest.mark.parametrize(
-    ("low", "settings", "instead"),
+    ("words", "instead"),
     [
-        ("hppo", {"low.memory": "gru", "low.minibatch_size": 64}, "agent.sharing=shared"),
-        ("hppo", {"low.memory": "gru", "low.minibatch_size": 64, "agent.sharing": "shared"}, None),
-        ("hppo", {"low.minibatch_size": 64}, "low.memory=gru"),
-        ("random", {}, None),
+        ("low=hppo low.memory=gru", "agent.sharing=shared"),
+        ("low=hppo low.memory=gru agent.sharing=shared", None),
+        ("low=hppo", "low.memory=gru"),
+        ("low=random", None),
     ],
 )
-def test_a_learner_that_forgets_earlier_trips_is_told_of_in_one_line(low, settings, instead, capsys):
-    hpamdp.train(HiddenOption, low=low, **QUIET, progress=False, **settings)
+def test_a_learner_that_forgets_earlier_trips_is_told_of_in_one_line(words, instead, capsys):
+    assemble(make_config([f"env={choosing_class('env', HiddenOption)}", "eval.layouts=4", *words.split()]))
     warned = [line for line in capsys.readouterr().err.splitlines() if "forgets earlier trips" in line]
     assert len(warned) == (instead is not None) and all(instead in line for line in warned)
 
