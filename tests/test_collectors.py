@@ -250,28 +250,6 @@ def test_a_frozen_presser_goes_with_the_share(tmp_path):
     assert isinstance(policy, PolicyCopy) and policy.out_keys == ["option"]
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["collector=multi", "collector.num_workers=3"], "collector.num_workers=3: must divide num_envs=8"),
-        (
-            [
-                *("collector=multi", "high=none", "env=gymnasium", *GYMNASIUM),
-                *("env.observation_scaling=running", "collector.ahead=true"),
-            ],
-            "collector.ahead=true: env=gymnasium learns the scale",
-        ),
-        (
-            ["collector=multi", "high=none", "env=gymnasium", *GYMNASIUM, "env.num_workers=2"],
-            "collector=multi: env=gymnasium starts processes itself; use collector=single",
-        ),
-    ],
-)
-def test_what_workers_cannot_do_is_refused(overrides, message, quick_workers, tmp_path):
-    with pytest.raises(ConfigError, match=message):
-        run(compose_config([*SMALL, *overrides]), tmp_path)
-
-
 def test_a_missing_ray_is_told_with_its_cure(monkeypatch, tmp_path):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))

@@ -20,7 +20,6 @@ from toy_steps import SPECS, one_step_rows, states
 
 import hpamdp
 from hpamdp import keys
-from hpamdp.config.errors import ConfigError
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Bonus
@@ -475,7 +474,7 @@ def test_each_options_learner_has_its_own_exploration():
         parts.close()
 
 
-@pytest.mark.parametrize(("low", "kind"), pairs(("hyar", "held"), ("pets", "novelty")))
+@pytest.mark.parametrize(("low", "kind"), pairs(("pets", "novelty")))
 def test_every_learner_that_takes_an_exploration_trains_with_it_and_is_reloaded(low, kind, tmp_path):
     words = [*PLATFORM, f"low={low}", f"exploration={kind}", *SHORT.get(low, []), *SMALL, "film=false"]
     assert run(compose_config(words), tmp_path, words) == 0
@@ -497,36 +496,6 @@ def test_a_table_of_counts_is_saved_for_training_alone(tmp_path, monkeypatch):
     assert table < (tmp_path / "whole").stat().st_size
     scores = [hpamdp.load(file).evaluate(episodes=4) for file in (policy, checkpoint, tmp_path / "whole")]
     assert scores[0] == scores[1] == scores[2]
-
-
-REFUSED = [
-    (
-        "low=random exploration=held",
-        "exploration=held: changes actions, which low=random does not take; use exploration",
-    ),
-    ("low=bc mode=offline data=human exploration=held", "exploration=held: mode=offline takes no steps"),
-    ("low=hppo low.freeze=true exploration=held", "exploration=held: low.freeze=true keeps the learners as they are"),
-    ("low=pdqn low.augment=true exploration=novelty", "exploration: low.augment=true: maps states to others that were"),
-    (
-        "low=hppo env=catch_point_picture exploration=counts",
-        "exploration: no picture is seen twice; use exploration=novelty",
-    ),
-    (
-        "high=value low=pets exploration=counts",
-        "exploration: low=pets does not predict whole observations here, so it cannot tell how new they are; use low.a",
-    ),
-    (
-        "high=value low=pets exploration=novelty exploration.in_plans=distillation",
-        "use low.augment=false, or exploration=novelty exploration.in_plans=disagreement",
-    ),
-]
-
-
-@pytest.mark.parametrize(("words", "line"), REFUSED, ids=[words for words, _ in REFUSED])
-def test_what_an_exploration_does_not_go_with_is_refused_in_one_line(words, line):
-    with pytest.raises(ConfigError) as raised:
-        assemble(make_config([*words.split(), "num_envs=4", "eval.layouts=4"]))
-    assert line in str(raised.value) and "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(("low", "kind"), pairs(("pdqn", "held"), ("hppo", "novelty")))

@@ -22,7 +22,6 @@ from toy_options import Listener, Stepper, Toll
 
 import hpamdp
 from hpamdp import keys
-from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
@@ -261,15 +260,15 @@ def test_an_option_without_an_allowed_action_ends_before_its_length(sharing, tmp
 
 # Runs.
 
-QUICK = (("meta_critic", "pets", "shared"),)
 # The features of Q-PAMDP would be too many with the one-hot option at the end of the observation.
 RUNS = [
-    pytest.param(*pair, marks=[] if pair in QUICK else [pytest.mark.slow])
+    pair
     for pair in itertools.product(("meta_critic", "actor"), TRAINED, ("per_option", "shared"))
     if pair[1] != "planner" and pair[1:] != ("qpamdp", "shared")
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("high", "low", "sharing"), RUNS)
 def test_lengths_are_chosen_over_every_learner(high, low, sharing, tmp_path):
     given = words_of(high, low, f"agent.sharing={sharing}")
@@ -279,12 +278,15 @@ def test_lengths_are_chosen_over_every_learner(high, low, sharing, tmp_path):
     assert 1.0 <= float(rows[-1]["high/length"]) <= 4.0
 
 
-@pytest.mark.parametrize(("high", "low"), [("actor", "hppo"), ("meta_critic", "pdqn")])
+@pytest.mark.parametrize(
+    ("high", "low"), [("actor", "hppo"), pytest.param("meta_critic", "pdqn", marks=pytest.mark.slow)]
+)
 def test_a_run_that_chooses_lengths_resumes_to_the_last_bit(high, low, tmp_path, monkeypatch):
     stop_and_resume([*words_of(high, low), *RESUMED], tmp_path, monkeypatch, signal.SIGINT)
 
 
-@pytest.mark.parametrize("ahead", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ahead", [False, True])
 def test_workers_choose_lengths_and_resume_to_the_last_bit(ahead, quick_workers, tmp_path, monkeypatch):
     given = [*words_of("meta_critic", "hppo"), *RESUMED, "collector=multi", f"collector.ahead={str(ahead).lower()}"]
     stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
@@ -330,29 +332,6 @@ def test_an_evaluation_measures_the_mean_length_of_the_options_that_were_chosen(
     played = evaluation.run(agent.policy)
     assert played["option_length"].tolist() == pytest.approx([3.4, 3.4])
     assert evaluation.measure(played)["option_length"] == pytest.approx(3.4)
-
-
-# What is refused.
-
-
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        ("high=ucb", "agent.termination=chosen: high=ucb is a bandit, which counts what an option returns"),
-        ("high=value low=hppo", "agent.termination=chosen: high=value compares the learners' values, which do not"),
-        ("high=actor data=recorded data.path=x", "agent.termination=chosen: the decisions of data=recorded have no"),
-        ("high=actor low.freeze=true", "agent.termination=chosen: low.freeze=true plays whole episodes; use"),
-        ("high=actor agent.option_lengths=[1,4,2]", "agent.option_lengths=[1, 4, 2]: must be increasing numbers"),
-        ("high=actor agent.option_lengths=[0,1]", "agent.option_lengths.0=0: must be greater than 0"),
-        ("high=actor agent.termination=steps agent.option_length=2", "agent.option_lengths=[1, 2, 4]: goes with"),
-        ("high=actor compile_updates=true low=pdqn", "compile_updates=true: goes with agent.termination=episode only"),
-    ],
-)
-def test_what_does_not_go_with_chosen_lengths_is_refused_in_one_line(words, complaint):
-    base = ["env=rooms", *CHOSEN[2:], *SMALL, "low=random"]
-    with pytest.raises(ConfigError) as error:
-        assemble(make_config([*base, *words.split()]))
-    assert str(error.value).startswith(complaint) and "\n" not in str(error.value)
 
 
 def test_the_lengths_are_powers_of_two_by_default():

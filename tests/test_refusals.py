@@ -27,6 +27,9 @@ SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4",
 PLATFORM = "env=platform high=none low=random "
 GYMNASIUM = "env=gymnasium high=none low=random env.max_steps=9 "
 CROSSING = "env=crossing low=stepper"
+PICTURE = "env=catch_point_picture high=none "
+CHOSEN = "env=rooms low=random agent.termination=chosen agent.option_lengths=[1,2,4] "
+SCALED = "env=gymnasium env.id=hpamdp/Moving-v0 high=none low=hppo collector=multi env.observation_scaling=running "
 
 REFUSED = [
     ("low=qpamdp collector=multi collector.ahead=true", "low=qpamdp learns from steps of its current policy"),
@@ -43,6 +46,7 @@ REFUSED = [
         "num_envs=1024 steps_per_batch=65536 total_frames=524288",
         "steps_per_batch=65536: counts the steps of each of num_envs=1024, so a batch has 67,108,864",
     ),
+    ("eval.stop_score=1.97", "eval.stop_score=1.97: "),
     ("low=pdqn low.n_step=5", "low.n_step=5: must be at most steps_per_batch=4, as sums of rewards end with a batch"),
     ("low=dlpa low.horizon=10000000", "low: horizon=10000000, num_iterations=5, num_samples=256: a plan would try"),
     ("low.updates_per_step=1e9", "low: updates_per_step=1000000000.0: must be at most 1000"),
@@ -78,6 +82,53 @@ REFUSED = [
     (f"{CROSSING} high=actor agent.termination=learned", "high=actor does not decide where options end; use high=opt"),
     (f"{CROSSING} high=ucb agent.termination=steps agent.option_length=3 low.freeze=true", "plays whole episodes; use"),
     ("agent.termination=steps", "agent.option_length: missing; agent.termination=steps needs the number of steps of"),
+    # Data sets.
+    ("low=bc", "low=bc learns from data sets only; use mode=offline and a data set"),
+    ("low=hppo mode=offline data=human", "low=hppo learns from its own steps only; use data=none"),
+    ("low=iql mode=offline", "mode=offline: data=none leaves nothing to learn from; choose a data set"),
+    ("low=iql high=none env=platform mode=offline data=human", "people docked boats; use env=boatdock"),
+    ("low=iql data=human mode=offline collector=multi", "mode=offline takes no steps"),
+    # Explorations.
+    ("low=random exploration=held", "exploration=held: changes actions, which low=random does not take; use "),
+    ("low=bc mode=offline data=human exploration=held", "exploration=held: mode=offline takes no steps"),
+    ("low=hppo low.freeze=true exploration=held", "exploration=held: low.freeze=true keeps the learners as they are"),
+    ("low=pdqn low.augment=true exploration=novelty", "exploration: low.augment=true: maps states to others that were"),
+    ("high=none low=hppo env=catch_point_picture exploration=counts", "exploration: no picture is seen twice; use "),
+    ("high=value low=pets exploration=counts", "exploration: low=pets does not predict whole observations here, so "),
+    ("high=value low=pets exploration=novelty exploration.in_plans=distillation", "use low.augment=false, or explor"),
+    # Pictures.
+    (
+        PICTURE + "low=pets",
+        "low=pets: env=catch_point_picture observes pictures, which it has no encoder for; use anot",
+    ),
+    (PICTURE + "low=hyar", "low=hyar: env=catch_point_picture observes pictures"),
+    ("high=none env=goal low=hppo encoder=cnn", "encoder=cnn: env=goal observes no pictures; use encoder=auto"),
+    ("high=none env=goal low=hppo encoder.channels=[8,8,8]", "encoder.channels=[8, 8, 8]: env=goal observes no"),
+    (PICTURE + "low=hppo encoder.net=nature encoder.num_features=0", "encoder.num_features=0"),
+    # Memories.
+    ("low=hppo low.memory=gru low.vector_products=true", "vector_products=true: does not go with memory"),
+    ("low=pets low.memory=gru low.augment=true", "augment=true: does not go with memory=gru"),
+    ("low=pdqn low.memory=gru low.n_step=2", "n_step=2: does not go with memory=gru"),
+    ("low=hppo low.memory=gru compile_updates=true total_frames=9999", "compile_updates=true: low=hppo: memory=gru"),
+    ("low=pdqn low.memory=gru data=human", "lacks what a policy remembered"),
+    ("low=hppo high=actor high.memory=gru", "high.memory=gru: agent.termination=episode has one decision"),
+    ("low=hppo high=option_critic high.memory=gru", "must be 'none' or 'stack'"),
+    # Updates.
+    (PLATFORM + "low=qpamdp compile_updates=true", "compile_updates=true: low=qpamdp: its updates cannot be compiled"),
+    (PLATFORM + "low=qpamdp update_precision=bfloat16", "low=qpamdp: its updates are made in float32 alone"),
+    # Lengths that are chosen.
+    (CHOSEN + "high=ucb", "agent.termination=chosen: high=ucb is a bandit, which counts what an option returns"),
+    (CHOSEN + "high=value low=hppo", "agent.termination=chosen: high=value compares the learners' values, which do "),
+    (CHOSEN + "high=actor data=recorded data.path=x", "agent.termination=chosen: the decisions of data=recorded have"),
+    (CHOSEN + "high=actor low.freeze=true", "agent.termination=chosen: low.freeze=true plays whole episodes; use"),
+    (CHOSEN + "high=actor agent.option_lengths=[1,4,2]", "agent.option_lengths=[1, 4, 2]: must be increasing numbers"),
+    (CHOSEN + "high=actor agent.option_lengths=[0,1]", "agent.option_lengths.0=0: must be greater than 0"),
+    (CHOSEN + "high=actor agent.termination=steps agent.option_length=2", "agent.option_lengths=[1, 2, 4]: goes with"),
+    (CHOSEN + "high=actor compile_updates=true low=pdqn", "compile_updates=true: goes with agent.termination=episode "),
+    # Workers.
+    ("collector=multi collector.num_workers=3", "collector.num_workers=3: must divide num_envs=4"),
+    (SCALED + "collector.ahead=true", "collector.ahead=true: env=gymnasium learns the scale"),
+    (SCALED + "env.num_workers=2", "collector=multi: env=gymnasium starts processes itself; use collector=single"),
     # Observations of others.
     (
         GYMNASIUM + "env.entry_point=toy_environments:TickingGoal env.observation_keys=[2]",
@@ -95,7 +146,8 @@ def composed(*choices: str) -> DictConfig:
 def config_of(words: str) -> DictConfig:
     """Compose the choices of groups and set the other words, which is quicker than composing all of them."""
     pairs = [word.partition("=") for word in words.split()]
-    cfg = copy.deepcopy(composed(*(f"{key}={value}" for key, _, value in pairs if key in GROUPS)))
+    groups = {key: f"{key}={value}" for key, _, value in pairs if key in GROUPS}
+    cfg = copy.deepcopy(composed(*groups.values()))
     for key, _, value in pairs:
         if key not in GROUPS:
             # YAML reads 1e30 as a text, Hydra as a number.

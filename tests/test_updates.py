@@ -326,30 +326,6 @@ def test_in_bfloat16_parameters_near_a_bound_still_have_a_gradient(name):
 SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=20000", "eval.layouts=4"]
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (
-            ["env=platform", "high=none", "low=qpamdp", "compile_updates=true"],
-            "compile_updates=true: low=qpamdp: its updates cannot be compiled",
-        ),
-        (
-            ["env=platform", "+env.grouping=default", "high=meta_critic", "low=pdqn", "agent.termination=steps",
-             "agent.option_length=3", "compile_updates=true"],
-            "compile_updates=true: goes with agent.termination=episode only, not with steps",
-        ),
-        (
-            ["env=platform", "high=none", "low=qpamdp", "update_precision=bfloat16"],
-            "update_precision=bfloat16: low=qpamdp: its updates are made in float32 alone",
-        ),
-    ],
-)  # fmt: skip
-def test_what_updates_cannot_do_is_refused_in_one_line(words, message):
-    with pytest.raises(ConfigError) as error:
-        assemble(make_config([*SMALL, *words]))
-    assert str(error.value) == message
-
-
 def test_a_missing_compiler_is_told_in_one_line(monkeypatch):
     from torch._inductor import cpp_builder
     from torch._inductor.exc import InvalidCxxCompiler
