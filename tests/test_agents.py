@@ -15,7 +15,6 @@ from hpamdp.config.saved import upgraded
 from hpamdp.run import checkpoint
 from hpamdp.run.play import own_agents
 from hpamdp.run.players import load_agent
-from hpamdp.run.resume import resolve
 from hpamdp.run.train import run
 
 FOLDER = Path(__file__).resolve().parent.parent / "agents"
@@ -110,13 +109,6 @@ def test_networks_alone_are_scored_but_not_resumed():
         checkpoint.find(folder, "resume")
     with pytest.raises(ConfigError, match=r"policy\.safetensors: networks alone, which cannot be resumed; give a"):
         hpamdp.train(resume=f"{folder}/policy.safetensors", progress=False)
-
-
-def test_the_words_of_eval_take_the_agent_from_its_folder():
-    words = ["mode=eval", f"checkpoint={FOLDER / 'linucb_hppo'}", "eval.layouts=7"]
-    config, file = resolve(compose_config(words), words)
-    assert (config.high.name, config.low.name, config.run.eval.layouts) == ("linucb", "hppo", 7)
-    assert file == FOLDER / "linucb_hppo" / "policy.safetensors"
 
 
 def test_an_agent_is_found_by_its_name_by_every_command(command, tmp_path):

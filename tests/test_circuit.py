@@ -450,13 +450,3 @@ def test_the_oracle_with_the_planner_reaches_the_ceiling_and_always_chooses_righ
 def test_settings_that_make_no_sense_are_refused_in_one_line(settings, words):
     with pytest.raises(ValueError, match=words):
         CircuitEnv(**settings)
-
-
-def test_a_film_needs_the_state_alone():
-    env = CircuitEnv(3, task="random_state", gate_set="ion", oracle=True)
-    env.reset()
-    track = [{name: column[:1] for name, column in env.film_state(2).items()}]
-    assert len([*env.film(track, 8.0, 120)]) == 2
-    copy = CircuitEnv(3, task="random_state", gate_set="ion", oracle=True)
-    copy.set_env_state(env.env_state())
-    assert (copy.read() == env.read()).all()

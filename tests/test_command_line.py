@@ -44,10 +44,7 @@ MISTAKES = [
     (["low._target_=os.path.join"], "low._target_=os.path.join: there is no class join in os.path"),
     (["env.reward=big"], "env.reward=\"big\": must be 'paper' or 'sparse' (BoatDockEnv, given as an argument)"),
     # The same in a sweep.
-    (
-        ["-m", "high=ucb,fixed", "high.window=1,2"],
-        "high.window: no such setting of Fixed; it has",
-    ),
+    (["-m", "high=ucb,fixed", "high.window=1,2"], "high.window: no such setting of Fixed; it has"),
     (["-m", "seed=range(0,0)"], "seed=range(0,0): no job to run"),
     (["-m", "hydra.run.dir=x"], "hydra.run.dir=x: has no effect on a sweep; give hydra.sweep.dir"),
     (["experiment=few_steps", "hydra.run.dir=x"], "hydra.run.dir=x: has no effect on a sweep; give hydra.sweep.dir"),

@@ -32,13 +32,6 @@ TINY = ["num_envs=16", "steps_per_batch=4", "eval.layouts=4", "eval.every=0"]
             "1,000",
             "640",
         ),
-        (
-            640,
-            "low.freeze=true low=random high=actor high.minibatch_size=1024",
-            "high.minibatch_size=1024 (high=actor)",
-            "1,024",
-            "640",
-        ),
     ],
 )
 def test_a_run_that_ends_before_a_first_update_is_refused(total, words, setting, needed, most, tmp_path):
@@ -59,7 +52,6 @@ def test_the_last_batch_counts_as_a_whole():
     ("words", "without"),
     [
         (["high=ucb", "low=hppo", *SHORT["hppo"]], []),
-        (["high=uniform", "low=random"], []),
         (
             ["high=fixed", "low=pets", *SHORT["pets"], "high.option=congruent", "agent.sharing=per_option"],
             ["low/incongruent"],

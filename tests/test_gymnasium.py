@@ -264,10 +264,7 @@ def mistake_in(**options) -> str:
         ({"id": "Toy-v0", "entry_point": TOY}, "both are set"),
         ({"id": "Nowhere-v0"}, "Nowhere-v0: Environment `Nowhere` doesn't exist"),
         ({"id": "Endless-v0"}, "Endless-v0: has no time limit of its own; set env.max_steps"),
-        (
-            {"entry_point": "toy_environments:Texting", "max_steps": 5},
-            "Texting: action space Tuple(Discrete(2), Text(1, 5, ",
-        ),
+        ({"entry_point": "toy_environments:Texting", "max_steps": 5}, "Texting: action space Tuple(Discrete(2), Text("),
         (
             {"id": "hpamdp/CatchPoint-v0", "kwargs": {"wide": 1}},
             "hpamdp/CatchPoint-v0: wide: no such setting of CatchPointOptions",

@@ -204,11 +204,7 @@ def test_masks_are_flat_or_have_the_structure_of_gymnasiums_samples(tree, mask, 
         ("discretes and a box", [1, 0, 2, 1, 1, 1], "gave .* as action_mask, which must be 6 numbers, 0 or 1$"),
         ("discretes and a box", ([1, 0], [1, 1, 1], [1]), r"gave \[1\] in action_mask, which must be None for a Box"),
         ("multi binary", [[0, 1], [2, 3]], r"gave .* as action_mask, which must be 0, 1 or 2 \(both\) in shape"),
-        (
-            "two choices",
-            {"foot": [0, 1]},
-            r"action_mask, which must be a dict with names of \['arm', 'leg'\]",
-        ),
+        ("two choices", {"foot": [0, 1]}, r"action_mask, which must be a dict with names of \['arm', 'leg'\]"),
         ("discretes and a box", [1, 0, 1, 0, 0, 0], "environment 0 gave an action_mask that allows nothing"),
     ],
 )
@@ -259,12 +255,7 @@ def test_a_pair_mask_says_what_goes_together(place):
     ("tree", "said", "settings", "line"),
     [
         ("two discretes", {"pair_mask": np.ones((5, 5))}, {}, r"env\.pair_mask=info; env\.pair_mask=ignore ignores"),
-        (
-            "two discretes",
-            {},
-            {"pair_mask": "info"},
-            "gave None as pair_mask, which must be 5 rows of 5 numbers",
-        ),
+        ("two discretes", {}, {"pair_mask": "info"}, "gave None as pair_mask, which must be 5 rows of 5 numbers"),
         ("nested", {}, {"pair_mask": "info"}, "pair_mask=info: the action has one component, so there are no pairs"),
     ],
 )

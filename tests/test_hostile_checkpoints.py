@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from conftest import compose_config, make_config, parts_of
+from conftest import assert_same, compose_config, make_config, parts_of
 from torchrl.data import ReplayBuffer
 
 from hpamdp.config.errors import ConfigError
@@ -64,16 +64,6 @@ class Opener:
         return copy.deepcopy(states)
 
 
-def same(one, other) -> bool:
-    if torch.is_tensor(one):
-        return torch.is_tensor(other) and one.dtype == other.dtype and torch.equal(one, other)
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[name], other[name]) for name in one)
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(same, one, other))
-    return one == other
-
-
 def tensors(state, place=()):
     """Yield the place and the value of every tensor in nested dictionaries."""
     for name, value in state.items() if isinstance(state, dict) else ():
@@ -113,7 +103,7 @@ def test_other_types_and_shapes_are_refused_in_one_line_and_change_nothing(opene
         with pytest.raises(ConfigError) as error:
             opener.resume(**{name: put(opener.states[name], place, other)})
         assert "\n" not in str(error.value) and len(str(error.value)) < 600, (name, place)
-        assert same(opener.all_of_agent(), before), (name, place)
+        assert_same(opener.all_of_agent(), before, f"{name} {place}")
 
 
 def test_weights_in_half_precision_are_read(opener):
@@ -138,7 +128,7 @@ def test_learners_are_taken_over_as_a_whole_or_not_at_all(opener):
     with pytest.raises(ConfigError, match=r"^low\.checkpoint=.*of another class or size than low") as error:
         checkpoint.load_learners(opener.file, opener.parts.agent, opener.parts.device)
     assert "\n" not in str(error.value)
-    assert same(opener.all_of_agent(), before)
+    assert_same(opener.all_of_agent(), before)
 
 
 def test_weights_that_overflowed_are_not_saved(opener):

@@ -37,18 +37,3 @@ def test_a_number_that_differs_is_named_and_written_on_request(module, tmp_path,
     assert page.read_text() == numbers.format("\u22123.50", "two") + data
     page.write_text("<!--data hsac: runs.json low=hsac-->")
     assert module.differences(tmp_path) == ["page.md: LookupError: no row has runs.json low=hsac"]
-
-
-@pytest.mark.parametrize(
-    ("expression", "style", "text"),
-    [
-        ("spread(a.score)", ".1f", "2.0 ± 1.0"),
-        ("span(means(a.score, a.low))", ".1f", "1.5 to 3.0"),
-        ("span(a.seed - a.seed)", "d", "0"),
-        ("each(first(a.score, a.score >= 2, a.low))", ".0f", "2 and 3"),
-    ],
-)
-def test_an_expression_gives_one_number_or_several(module, expression, style, text):
-    low = ["hppo", "hppo", "pdqn"]
-    table = module.Table([{"low": low, "score": k + 1.0, "seed": k} for k, low in enumerate(low)])
-    assert module.text_of(eval(expression, dict(module.FUNCTIONS), {"a": table}), style) == text

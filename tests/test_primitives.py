@@ -95,13 +95,6 @@ def test_without_the_simulator_one_line_says_what_to_install(monkeypatch):
     assert "\n" not in str(raised.value)
 
 
-def test_a_wrong_task_is_refused_with_those_that_exist():
-    with pytest.raises(SettingError, match="task='pick_place': must be 'drawer_close', 'soccer'"):
-        Manipulation("pick_place")
-    with pytest.raises(SettingError, match="drawer_close"):
-        PrimitivesEnv(1, task="pick_place")
-
-
 def test_the_options_suggested_hold_every_action_once():
     for actions in ("primitives", "all"):
         facts = PrimitivesEnv.facts(PrimitivesEnv.Options(actions=actions))

@@ -207,10 +207,7 @@ def test_files_of_ones_own_are_read_and_watched(tmp_path):
         ({"bounds": {"relese": [0, 1]}}, r"bounds: relese: .* did you mean release\?"),
         ({"bounds": {"release": [-2, -1]}}, r"nothing is left for release___t1$"),
         ({"bounds": {"release": [1]}}, r"bounds"),
-        (
-            {"domain": "SupplyChain_or"},
-            r"no bounds of the numbers ship; give 'env\.bounds=\{ship:\[0,HIGH\]\}'$",
-        ),
+        ({"domain": "SupplyChain_or"}, r"no bounds of the numbers ship; give 'env\.bounds=\{ship:\[0,HIGH\]\}'$"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(settings, line):

@@ -113,16 +113,6 @@ def test_the_exit_code_says_whether_all_studies_worked(module, experiments, monk
     assert capsys.readouterr().err == "" and "fine_study" not in sys.modules
 
 
-def test_a_study_may_have_each_table_at_a_place_of_its_own(module, experiments):
-    page = experiments / "fine" / "README.md"
-    page.write_text(
-        "# Fine\n\n<!-- table 2 of fine -->\n| old |\n<!-- /table -->\n\n<!-- table 9 of fine -->\n<!-- /table -->\n"
-    )
-    failures = module.report(experiments)
-    assert f"<!-- table 2 of fine -->\n{SECOND_TABLE}\n<!-- /table -->" in page.read_text()
-    assert "README.md: no table 9 of fine" in failures
-
-
 def test_tables_of_directives_are_renewed_in_all_pages_and_wrong_ones_are_told(module, tmp_path):
     docs = tmp_path / "docs"
     (docs / "domains").mkdir(parents=True)
