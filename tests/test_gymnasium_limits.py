@@ -130,3 +130,9 @@ def test_staggered_copies_end_their_first_episodes_apart_and_later_ones_at_the_l
     assert [row.nonzero().squeeze(-1).tolist() for row in ended] == [[7, 15, 23], [4, 12, 20], [1, 9, 17], [6, 14, 22]]
     evaluated = env.rollout(8, auto_reset=False, tensordict=env.reset(env.fixed_episodes(0)))
     assert evaluated["next", "done"].squeeze(-1).sum(-1).tolist() == [1, 1, 1, 1] and evaluated.shape == (4, 8)
+
+
+def test_episodes_terminate_at_a_limit_that_belongs_to_the_problem_but_not_where_copies_are_staggered():
+    env = GymnasiumEnv(4, make=Limited, max_steps=8, staggered=True, terminates_at_limit=True)
+    ended = env.rollout(24, break_when_any_done=False)["next", "terminated"].squeeze(-1)
+    assert [row.nonzero().squeeze(-1).tolist() for row in ended] == [[7, 15, 23], [12, 20], [9, 17], [14, 22]]

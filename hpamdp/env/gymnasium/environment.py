@@ -151,6 +151,7 @@ class GymnasiumEnv(PAMDPEnv):
         self._is_over = np.zeros(num_envs, bool)
         self._rows = [*range(num_envs)]
         self._is_staggered = options.staggered
+        self._terminates_at_limit = options.terminates_at_limit
         self._first_ends = np.zeros(num_envs, np.int64)  # steps to the end of a staggered first episode; else 0
         self._reports_success = False
         self._set_seed(seed)
@@ -431,6 +432,8 @@ class GymnasiumEnv(PAMDPEnv):
             is_stepped &= tensordict.get("_step").reshape(-1).numpy(force=True)
         is_all = bool(is_stepped.all())
         self._copies.step(self._rows if is_all else np.flatnonzero(is_stepped).tolist(), option, chosen, values)
+        if self._terminates_at_limit:
+            results.terminated[is_stepped & (results.truncated > 0.0)] = 1.0
         if self._first_ends.any():
             results.truncated[is_stepped & (self._first_ends == 1) & (results.terminated == 0.0)] = 1.0
             self._first_ends -= is_stepped & (self._first_ends > 0)

@@ -76,6 +76,12 @@ class GymnasiumOptions(Settings):
     Otherwise copies whose episodes all have the same length stay at the same step. Batches that are shorter than an
     episode then hold only a part of it: the day, or the night.
     """
+    terminates_at_limit: bool = False
+    """Terminate episodes at the time limit, which then belongs to the problem: no value follows.
+
+    Otherwise they are truncated, and learners bootstrap from the value of the next state. If the observation shows the
+    time, training never visits such a state, so its value is never corrected.
+    """
     num_workers: NonNegativeInt = 0
     """Processes that step the copies at the same time, for slow environments. If 0, this process steps them."""
 
