@@ -109,7 +109,7 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 
 $(SLOW)/.installed: pyproject.toml constraints.txt
 	$(venv)
-	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray,browser,video,traffic,robots,rddl]'
+	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,tune,ray,browser,video,traffic,robots,rddl]'
 	@touch $@
 
 # This launcher wants cloudpickle < 3, so it has constraints of its own; without them pip searches for an hour.

@@ -11,13 +11,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
-from conftest import CONF, choices, compose_config
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import OmegaConf
+from conftest import CONF, choices
 
 from hpamdp import messages
 from hpamdp.config.command_line import completed, parse
-from hpamdp.config.components import component
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
 from hpamdp.messages import warn
@@ -307,37 +304,11 @@ def test_a_job_of_submitit_that_is_preempted_is_requeued_and_goes_on(tmp_path):
     [
         ("hydra/launcher=joblib", "hydra-joblib-launcher", "joblib"),
         ("hydra/launcher=submitit_slurm", "hydra-submitit-launcher", "slurm"),
-        ("search=hppo", "hydra-optuna-sweeper", "optuna"),
     ],
 )
-def test_a_missing_launcher_or_sweeper_is_told_with_its_extra(command, word, package, extra):
+def test_a_missing_launcher_is_told_with_its_extra(command, word, package, extra):
     if is_installed(package):
         pytest.skip(f"{package} is installed")
     code, _, err = command("-m", word, "seed=0,1")
     assert code == 2 and err.count("\n") == 1
     assert err.endswith(f"not installed; pip install 'hpamdp[{extra}]'\n")
-
-
-def values_of(word: str) -> list:
-    """Return the ends, or the choices, of what a search may give a value."""
-    override = OverridesParser.create().parse_overrides([word])[0]
-    assert override.is_sweep_override(), word
-    value = override.value()
-    return [value.start, value.end] if override.is_interval_sweep() else list(override.sweep_iterator())
-
-
-@pytest.mark.parametrize(
-    "name",
-    [low for low in choices("low") if low not in ("random", "planner") and not low.endswith("_published")],
-)
-def test_every_learner_has_a_search_space_of_allowed_values(name):
-    space = OmegaConf.load(CONF / f"search/{name}.yaml").hydra.sweeper.params
-    node = compose_config([f"low={name}"]).low
-    assert len(space) >= 3
-    for key, word in space.items():
-        default = OmegaConf.select(node, key.removeprefix("low."), throw_on_missing=True)
-        values = values_of(f"{key}={word}")
-        assert default in values or min(values) <= default <= max(values), key
-        for value in values:
-            settings = OmegaConf.merge(node, {key.removeprefix("low."): value})
-            component("low", name, OmegaConf.to_container(settings, resolve=True))

@@ -6,10 +6,12 @@ import sys
 from importlib.util import find_spec
 
 import pytest
-from conftest import choices
+from conftest import choices, compose_config
+from omegaconf import OmegaConf
 
 import hpamdp
 from hpamdp.api import tuning
+from hpamdp.config.components import component
 from hpamdp.config.search_space import Range, parsed_space, space_of_learner, split_words
 from hpamdp.run.trainer import DivergedError
 
@@ -49,10 +51,22 @@ class Run:
         self.is_stopped = True
 
 
-@pytest.mark.parametrize("name", [file for file in choices("search") if file in choices("low")])
-def test_every_space_of_the_package_is_understood(name):
+@pytest.mark.parametrize(
+    "name",
+    [low for low in choices("low") if low not in ("random", "planner") and not low.endswith("_published")],
+)
+def test_every_learner_has_a_space_of_allowed_values_around_its_defaults(name):
     space = parsed_space(space_of_learner(name, []))
-    assert len(space) >= 3 and all(isinstance(each, Range) or len(each) > 1 for each in space.values())
+    node = compose_config([f"low={name}"]).low
+    assert len(space) >= 3
+    for setting, each in space.items():
+        values = [each.low, each.high] if isinstance(each, Range) else each
+        own = setting.removeprefix("low.")
+        default = OmegaConf.select(node, own, throw_on_missing=True)
+        assert default in values or min(values) <= default <= max(values), setting
+        for value in values:
+            settings = OmegaConf.merge(node, {own: value})
+            component("low", name, OmegaConf.to_container(settings, resolve=True))
 
 
 def test_a_space_has_the_grammar_of_sweeps_or_lists():
@@ -96,6 +110,12 @@ def test_a_space_has_the_grammar_of_sweeps_or_lists():
 def test_a_wrong_argument_is_refused_in_one_line(given, line):
     with pytest.raises(hpamdp.ConfigError, match=line):
         hpamdp.tune("platform", **given)
+
+
+@pytest.mark.parametrize("search", ["hppo", None])
+def test_a_search_as_a_group_is_refused_with_the_command(search):
+    with pytest.raises(hpamdp.ConfigError, match=r"^search=.*: a search is a command; write hpamdp tune low=LEARNER$"):
+        hpamdp.train("platform", search=search)
 
 
 def test_without_optuna_one_line_says_what_to_install(monkeypatch):

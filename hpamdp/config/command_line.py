@@ -28,6 +28,8 @@ from hpamdp.shell import for_hydra, setting
 GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
 # The setting that adds folders of yaml files.
 SEARCH_PATH = "hydra.searchpath"
+# The folder of conf/ with what `hpamdp tune` searches for each learner.
+SEARCH = "search"
 _SAVED_RUNS = ("resume", "checkpoint", "low.checkpoint")
 # Flags of Hydra, with their short forms and their arguments for argparse.
 _SWITCH: dict[str, Any] = {"action": "store_true"}
@@ -208,6 +210,8 @@ def _check_groups(line: CommandLine, conf: Path) -> None:
         is_text = override.is_sweep_override() or isinstance(override.value(), str | None)
         if override.key_or_group in _SAVED_RUNS and not override.is_delete() and not is_text:
             raise ConfigError(f"{override.input_line}: must be a folder; write {as_text(override.input_line or '')}")
+        if override.key_or_group == SEARCH:
+            raise ConfigError(f"{override.input_line}: a search is a command; write hpamdp tune low=LEARNER")
         if override.key_or_group == CALLBACK:
             raise ConfigError(f"{override.input_line}: a run has a list of callbacks; write callbacks=[NAME, ...]")
         if override.is_add() and override.key_or_group in GROUPS:

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from hpamdp.config.command_line import CommandLine, choices_in
+from hpamdp.config.command_line import SEARCH, CommandLine, choices_in
 from hpamdp.config.components import CALLBACK, GROUPS, component
 from hpamdp.config.compose import listed_callbacks, plain
 from hpamdp.config.errors import ConfigError
@@ -69,6 +69,7 @@ def help_page(line: CommandLine, conf: Path) -> str:
         ConfigError: the command line cannot be composed.
     """
     folders = {folder.name: choices_in(folder) for folder in sorted(conf.iterdir()) if folder.is_dir()}
+    folders.pop(SEARCH)
     groups = [
         textwrap.fill(f"{name:<12}{', '.join(choices)}", _WIDTH, initial_indent="  ", subsequent_indent=" " * 14)
         for name, choices in folders.items()

@@ -16,18 +16,16 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.complaints import close_names, no_such
-from hpamdp.config.command_line import GRAMMAR, CommandLine, as_text, choices_in, written_out
+from hpamdp.config.command_line import GRAMMAR, SEARCH, CommandLine, as_text, choices_in, written_out
 from hpamdp.config.components import GROUPS, TARGET
 from hpamdp.config.compose import NESTED, beginning_of
 from hpamdp.config.schema import RUN_FILE
 from hpamdp.messages import file_and_reason, first_line
 from hpamdp.renamed import elsewhere, renamed
 
-# Launchers and sweepers in separate packages, and the extra of pyproject.toml that installs each.
-_EXTRAS = {
-    "hydra/launcher": {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray-launcher"},
-    "hydra/sweeper": {"optuna": "optuna"},
-}
+# Launchers in separate packages, and the extra of pyproject.toml that installs each.
+_LAUNCHER = "hydra/launcher"
+_EXTRAS = {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray-launcher"}
 
 
 def explained(error: Exception, line: CommandLine, conf: Path) -> str:
@@ -54,10 +52,10 @@ def not_understood(word: str) -> str:
 
 def _missing_choice(file: str, there: Sequence[str], conf: Path) -> str:
     group, _, name = file.rpartition("/")
-    if group in _EXTRAS:
-        if name in _EXTRAS[group]:
-            return f"{group}={name}: not installed; pip install 'hpamdp[{_EXTRAS[group][name]}]'"
-        return f"{group}={name}: no such choice; there is {', '.join(sorted({*there, *_EXTRAS[group]}))}"
+    if group == _LAUNCHER:
+        if name in _EXTRAS:
+            return f"{group}={name}: not installed; pip install 'hpamdp[{_EXTRAS[name]}]'"
+        there = (*there, *_EXTRAS)
     if not group.startswith("hydra"):  # a folder of a group may be part of the choice
         group, _, name = file.partition("/")
     if os.path.isdir(conf / group / name):
@@ -129,7 +127,7 @@ def _in_groups(cfg: DictConfig, name: str) -> list[str]:
 def _no_such_setting(cfg: DictConfig, path: list[str], name: str, known: list[str], conf: Path) -> str:
     if not path:
         folders = {folder.name for folder in conf.iterdir() if folder.is_dir()}
-        names = sorted({*known, *folders} - {"hydra"})
+        names = sorted({*known, *folders} - {"hydra", SEARCH})
         guesses = elsewhere(name, names) or close_names(name, names) or _in_groups(cfg, name)
         return no_such(f"group or value of the run ({RUN_FILE})", name, names, guesses=guesses)
     if len(path) == 1 and path[0] in GROUPS:

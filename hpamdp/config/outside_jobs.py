@@ -197,9 +197,8 @@ def check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
     swept = [name for name in cfg.hydra.sweeper.get("params") or {} if name not in given]
     if cfg.hydra.mode == RunMode.MULTIRUN and swept:
         chosen = cfg.hydra.runtime.choices
-        sweep = next((f"{group}={chosen[group]}" for group in ("experiment", "search") if chosen.get(group)), "train")
         raise ConfigError(
-            f"{sweep}: a sweep over {', '.join(swept)}, for the command line; to train one agent, give "
+            f"experiment={chosen['experiment']}: a sweep over {', '.join(swept)}, for the command line; to train one agent, give "
             f"{'it a value' if len(swept) == 1 else 'each of them a value'}"
         )
 

@@ -11,8 +11,8 @@ from hydra.core.override_parser.types import Override, QuotedString
 from hydra.errors import OverrideParseException
 
 from hpamdp.complaints import no_such
-from hpamdp.config.command_line import parsed_words
-from hpamdp.config.compose import conf_dir, names_of
+from hpamdp.config.command_line import SEARCH, choices_in, parsed_words
+from hpamdp.config.compose import conf_dir
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import not_understood
 
@@ -41,11 +41,12 @@ def space_of_learner(name: str, given: Sequence[str]) -> dict[str, str]:
     Raises:
         ConfigError: there is none for this learner.
     """
-    file = conf_dir() / "search" / f"{name}.yaml"
+    folder = conf_dir() / SEARCH
+    file = folder / f"{name}.yaml"
     if not file.is_file():
-        raise ConfigError(f"low={name}: {no_such('search space', name, names_of('search'))}; give a space of your own")
-    params = yaml.safe_load(file.read_text())["hydra"]["sweeper"]["params"]
-    return {setting: str(values) for setting, values in params.items() if setting not in given}
+        raise ConfigError(f"low={name}: {no_such('search space', name, choices_in(folder))}; give a space of your own")
+    space = yaml.safe_load(file.read_text())
+    return {setting: str(values) for setting, values in space.items() if setting not in given}
 
 
 def parsed_space(given: Mapping[str, Any]) -> Space:

@@ -37,7 +37,7 @@ _LARGE_BATCH = 1_000_000  # steps that fit into memory, so that a run may be sho
 AUTO_ENCODER = "auto"
 
 # Parts of the config that define the agent.
-GROUPS_OF_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment", "search", RECIPE)
+GROUPS_OF_AGENT = ("high", "low", "encoder", "exploration", "agent", "experiment", RECIPE)
 
 # Words of a command line that change nothing, by the mode of the run: settings, groups, and mappings of settings.
 # There is no run for a `player`, who is watched or played with, and for an `agent` that Python code loads.
