@@ -57,7 +57,7 @@ def complaints(
     what: str,
     *,
     prefix: str = "",
-    where: Callable[[str | None], str] = lambda _: "",
+    where: str = "",
     show: Callable[[Any], str] = as_json,
 ) -> str:
     """Return what is wrong with the values of a model, in one line.
@@ -68,13 +68,11 @@ def complaints(
         values: the values by name.
         what: kind of the values, such as `setting of HPPO`.
         prefix: of the names, such as `low.`.
-        where: returns the place of the value with this name, for the end of a complaint; an empty text for no place.
-            It gets None for a check of several values.
+        where: what defines the values, for the end of a complaint about a value; an empty text for nothing.
         show: writes a value.
     """
     unknown: list[str] = []
     wrong: dict[str, dict[str, None]] = {}
-    place: dict[str, str] = {}
     for problem in error.errors(include_url=False):
         path, value = _locate(problem["loc"], values, is_missing=problem["type"] == "missing")
         setting = prefix + ".".join(path)
@@ -83,20 +81,15 @@ def complaints(
             unknown.append(f"{setting}: {renamed(setting, known) or no_such(what, path[-1], known)}")
         elif problem["type"] == "missing":
             wrong[setting] = {"missing": None}
-            place[setting] = where(setting)
         elif not path:  # a check of several fields, whose message names them
-            complaint = prefix.replace(".", ": ") + _reworded(problem["msg"], value, show)
-            wrong[complaint] = {"": None}
-            place[complaint] = where(None)
+            wrong[prefix.replace(".", ": ") + _reworded(problem["msg"], value, show)] = {"": None}
         else:
             # A union complains once for each of its types.
-            given = f"{setting}={show(value)}"
-            wrong.setdefault(given, {})[_reworded(problem["msg"], value, show)] = None
-            place[given] = where(setting)
-    lines = []
-    for given, messages in wrong.items():
-        complaint = f"{given}: {' or '.join(messages)}" if any(messages) else given
-        lines.append(f"{complaint} ({place[given]})" if place[given] else complaint)
+            wrong.setdefault(f"{setting}={show(value)}", {})[_reworded(problem["msg"], value, show)] = None
+    end = f" ({where})" if where else ""
+    lines = [
+        (f"{given}: {' or '.join(messages)}" if any(messages) else given) + end for given, messages in wrong.items()
+    ]
     return "; ".join([*_shortened(unknown), *lines])
 
 

@@ -42,7 +42,7 @@ MISTAKES = [
     (["mode=eval"], "checkpoint: missing; mode=eval needs the output folder of a run"),
     (["checkpoint=x"], "checkpoint: goes with mode=eval only"),
     (["low._target_=os.path.join"], "low._target_=os.path.join: there is no class join in os.path"),
-    (["env.reward=big"], "env.reward=\"big\": must be 'paper' or 'sparse' (BoatDockEnv, given as an argument)"),
+    (["env.reward=big"], "env.reward=\"big\": must be 'paper' or 'sparse' (BoatDockEnv)"),
     # The same in a sweep.
     (["-m", "high=ucb,fixed", "high.window=1,2"], "high.window: no such setting of Fixed; it has"),
     (["-m", "seed=range(0,0)"], "seed=range(0,0): no job to run"),

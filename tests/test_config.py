@@ -107,21 +107,6 @@ def test_an_unknown_option_gets_the_likely_one_first_and_then_all():
     assert mistake_in(xyz=3).startswith("low.xyz: no such setting of Sample; it has bounds, depth, ")
 
 
-def test_a_wrong_value_is_told_with_the_place_where_it_was_set(tmp_path):
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment/long.yaml").write_text("# @package _global_\nlow: {gamma: 2.0}\n")
-    (tmp_path / "low").mkdir()
-    (tmp_path / "low/mine.yaml").write_text("defaults: [hppo]\ngamma: 3.0\n")
-    path = f"hydra.searchpath=[{tmp_path}]"
-    for words, place in (
-        (["low=hppo", "low.gamma=2.0"], "given as an argument"),
-        (["low=hppo", "experiment=long"], "conf/experiment/long.yaml"),
-        (["low=mine"], "conf/low/mine.yaml"),
-    ):
-        with pytest.raises(ConfigError, match=rf"^low\.gamma=[23]\.0: .*\(HPPO, {place}\)$"):
-            read(compose_config([path, *words]))
-
-
 def test_all_problems_come_in_one_line():
     line = mistake_in(size=0, rate=2, siz=3)
     assert all(f"low.{name}" in line for name in ("size=0", "rate=2", "siz:")) and line.count("; ") >= 2

@@ -194,7 +194,7 @@ def test_play_accepts_a_guarded_setting_if_repeated_or_if_the_file_is_trusted(co
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["env.slip=abc"], 'env.slip="abc": must be a valid number (BoatDockEnv, given as an argument)'),
+        (["env.slip=abc"], 'env.slip="abc": must be a valid number (BoatDockEnv)'),
         (
             ["env=platform"],
             "high=linucb: env=platform has no options to choose; use high=none. "

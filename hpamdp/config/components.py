@@ -13,7 +13,7 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, TypeAlias, get_type_hints
+from typing import Any, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, PydanticUserError, create_model
 
@@ -44,8 +44,6 @@ RUN_VALUES: dict[str, tuple[str, ...]] = {
     "env": ("grouping",),
     CALLBACK: ("name",),
 }
-# Returns where a setting with this name in messages, such as `low.lr`, was set; None if that is not known.
-PlaceOf: TypeAlias = Callable[[str], "str | None"]
 # The base class that a group's classes must have, and their card. If the base is a protocol, a class needs its methods.
 _BASES: dict[str, tuple[str, type[cards.Card]]] = {
     "env": ("hpamdp.env.base.PAMDPEnv", cards.ProblemCard),
@@ -150,13 +148,7 @@ class Component:
         return self.build(entry=entry)
 
 
-def component(
-    group: str,
-    name: str,
-    given: Mapping[str, Any],
-    prefix: str = "",
-    place_of: PlaceOf | None = None,
-) -> Component:
+def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "") -> Component:
     """Check the class and the settings of a group without building the object.
 
     Args:
@@ -164,7 +156,6 @@ def component(
         name: name of the chosen yaml file.
         given: the group's part of the config as plain values, with its `_target_`.
         prefix: what precedes the name of a setting in messages; by default the group and a dot.
-        place_of: returns where a setting with this name in messages was set; None if that is not known.
 
     Raises:
         ConfigError: a class or a setting is wrong; the message lists all mistakes in one line.
@@ -186,11 +177,8 @@ def component(
             f"run; rename the setting ({file})"
         )
 
-    def where(setting: str | None) -> str:
-        place = None if setting is None or place_of is None else place_of(setting)
-        return _name_of(chosen) if place is None else f"{_name_of(chosen)}, {place}"
-
-    checked = validated(model, settings, prefix or f"{group}.", f"setting of {_name_of(chosen)}", where)
+    class_name = _name_of(chosen)
+    checked = validated(model, settings, prefix or f"{group}.", f"setting of {class_name}", class_name)
     made = Component(group, name, chosen, dict(checked))
     return made if made.model is None else dataclasses.replace(made, options=checked)
 

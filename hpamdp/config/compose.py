@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.complaints import as_json, no_such
-from hpamdp.config.components import CALLBACK, GROUPS, TARGET, PlaceOf, file_of
+from hpamdp.config.components import CALLBACK, GROUPS, TARGET, file_of
 from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.schema import Config, RunConfig, check_run, checked_config
 from hpamdp.config.yaml_files import SCHEME
@@ -69,12 +69,12 @@ def read(cfg: DictConfig) -> Config:
     Raises:
         ConfigError: a value is wrong, or nothing is chosen for a group.
     """
-    given, names, place_of, folders = _as_plain_values(cfg)
-    return replace(check(given, names, place_of), config_dirs=folders)
+    given, names, folders = _as_plain_values(cfg)
+    return replace(check(given, names), config_dirs=folders)
 
 
-def read_run(cfg: DictConfig) -> tuple[RunConfig, PlaceOf | None, tuple[str, ...]]:
-    """Check the values of the run alone; return them, where settings were set, and the folders besides conf/.
+def read_run(cfg: DictConfig) -> tuple[RunConfig, tuple[str, ...]]:
+    """Check the values of the run alone; return them, and the folders of yaml files besides conf/.
 
     This is for a config that a saved run completes. The choices of the groups are then those of the saved run, and
     settings that need each other may come from either config.
@@ -82,14 +82,14 @@ def read_run(cfg: DictConfig) -> tuple[RunConfig, PlaceOf | None, tuple[str, ...
     Raises:
         ConfigError: a value is wrong, or nothing is chosen for a group.
     """
-    given, names, place_of, folders = _as_plain_values(cfg, may_lack=True)
-    return check_run(given, names, place_of), place_of, folders
+    given, names, folders = _as_plain_values(cfg, may_lack=True)
+    return check_run(given, names), folders
 
 
 def _as_plain_values(
     cfg: DictConfig, *, may_lack: bool = False
-) -> tuple[dict[str, Any], Mapping[str, str], PlaceOf | None, tuple[str, ...]]:
-    """Return the composed config as plain values, the names, where a setting was set, and the folders of yaml files.
+) -> tuple[dict[str, Any], Mapping[str, str], tuple[str, ...]]:
+    """Return the composed config as plain values, the names, and the folders of yaml files.
 
     `may_lack`: see `plain`.
     """
@@ -103,36 +103,11 @@ def _as_plain_values(
     OmegaConf.set_struct(own, False)
     own.pop("hydra", None)
     folders: tuple[str, ...] = ()
-    place_of: PlaceOf | None = None
     if "hydra" in cfg or HydraConfig.initialized():
         node = cfg.hydra if "hydra" in cfg else HydraConfig.get()
         _check_found(node, names)
         folders = searched_folders(node)
-        place_of = partial(_place_of, words_in(node.overrides.task), names, folders)
-    return plain(own, may_lack=may_lack), names, place_of, folders
-
-
-def _place_of(words: Sequence[str], names: Mapping[str, str], folders: Sequence[str], setting: str) -> str | None:
-    """Return where a setting was set: as an argument, or in the last yaml file that names it.
-
-    Args:
-        words: the words of the command line. Arguments of Python functions become such words, too.
-        names: the name that was chosen for each group.
-        folders: folders of yaml files besides conf/.
-        setting: its name on the command line, such as `low.lr`.
-    """
-    given = [re.split("[=~]", word.lstrip("+~"), maxsplit=1)[0] for word in words]
-    if any(
-        f"{setting}.".startswith(f"{name}.") or name.startswith(f"{setting}.") for name in given if name not in GROUPS
-    ):
-        return "given as an argument"
-    group, _, rest = setting.partition(".")
-    for where, path in ((_EXPERIMENT, setting), (f"{RECIPE}/{group}", setting), (RECIPE, setting), (group, rest)):
-        for folder in (*folders, str(conf_dir())):
-            file = Path(folder) / where / f"{names.get(where)}.yaml"
-            if file.is_file() and OmegaConf.select(OmegaConf.load(file), path) is not None:
-                return file_of(where, names[where])
-    return None
+    return plain(own, may_lack=may_lack), names, folders
 
 
 def searched_folders(node: Any) -> tuple[str, ...]:
@@ -171,20 +146,19 @@ def _check_found(node: Any, names: Mapping[str, str]) -> None:
             raise ConfigError(f"{group}={recipe}: {no_such(f'file in conf/{group}', recipe, names_of(group))}")
 
 
-def check(given: Mapping[str, Any], names: Mapping[str, str], place_of: PlaceOf | None = None) -> Config:
+def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
     """Check the config as plain values, without resolving text.
 
     Args:
         given: the values of the run, and for each group a mapping of `_target_` and the settings.
         names: the name that was chosen for each group.
-        place_of: returns where a setting such as `low.lr` was set, for errors; None if that is not known.
 
     Raises:
         ConfigError: a value is wrong.
     """
-    run = check_run(given, names, place_of)
+    run = check_run(given, names)
     learners = _learners_of_options(run, names["env"])
-    return checked_config(run, given, names, learners, listed_callbacks(run.callbacks, run.model_dump()), place_of)
+    return checked_config(run, given, names, learners, listed_callbacks(run.callbacks, run.model_dump()))
 
 
 def _learners_of_options(run: RunConfig, env: str) -> dict[str, tuple[str, dict[str, Any]]]:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from hpamdp.complaints import complaints
 from hpamdp.messages import ProblemError, first_line
-
-# The class or the file that defines a value, and where the value was set if that is known.
-Where: TypeAlias = Callable[[str | None], str]
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -50,7 +47,7 @@ class MissingChoiceError(ConfigError):
         self.known = tuple(known)
 
 
-def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: str, where: Where | str) -> ModelT:
+def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: str, where: str) -> ModelT:
     """Return the values as the model.
 
     Args:
@@ -58,21 +55,16 @@ def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: st
         values: plain values by name.
         prefix: the names' prefix on the command line, such as `low.`.
         what: kind of the values, such as `setting of HPPO`.
-        where: text for the end of a complaint, or a function that returns it. The function gets the value's name on the
-            command line, or None for a check of several values.
+        where: the class or the file that defines the values, for the end of a complaint.
 
     Raises:
         ConfigError: some values are wrong; the message lists all of them in one line.
     """
-
-    def place(setting: str | None) -> str:
-        return where if isinstance(where, str) else where(setting)
-
     try:
         # As JSON, in which the strict mode takes what a yaml can hold: a list for a tuple, 1 for 1.0.
         return model.model_validate_json(json.dumps(values, default=_plain))
     except ValidationError as error:
-        raise ConfigError(complaints(error, model, values, what, prefix=prefix, where=place)) from error
+        raise ConfigError(complaints(error, model, values, what, prefix=prefix, where=where)) from error
 
 
 def _plain(value: Any) -> Any:

@@ -198,8 +198,8 @@ def check_no_sweep(cfg: DictConfig, words: Sequence[str]) -> None:
     if cfg.hydra.mode == RunMode.MULTIRUN and swept:
         chosen = cfg.hydra.runtime.choices
         raise ConfigError(
-            f"experiment={chosen['experiment']}: a sweep over {', '.join(swept)}, for the command line; to train one agent, give "
-            f"{'it a value' if len(swept) == 1 else 'each of them a value'}"
+            f"experiment={chosen['experiment']}: a sweep over {', '.join(swept)}, for the command line; to train one "
+            f"agent, give {'it a value' if len(swept) == 1 else 'each of them a value'}"
         )
 
 

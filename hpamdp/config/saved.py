@@ -11,7 +11,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from hpamdp.complaints import as_json
-from hpamdp.config.components import GROUPS, TARGET, PlaceOf
+from hpamdp.config.components import GROUPS, TARGET
 from hpamdp.config.compose import check, choosing, chosen_names, compose, is_name, plain_groups
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import AgentConfig, Config
@@ -38,7 +38,6 @@ def read_saved(
     composed: DictConfig | None = None,
     trust: bool = False,
     file: object = "the saved run",
-    place_of: PlaceOf | None = None,
 ) -> Config:
     """Return a saved config, changed by the given values and checked.
 
@@ -51,7 +50,6 @@ def read_saved(
             are composed once more, which takes a quarter of a second.
         trust: whether the saved config may set the `guarded_settings` of a class.
         file: the file of the config.
-        place_of: returns where a setting in `given` was set, for errors; None if that is not known.
 
     Raises:
         ConfigError: a value is wrong, a name has no yaml file in the searched folders, or only `saved` sets a
@@ -70,12 +68,7 @@ def read_saved(
         values[group] = {**today[group], **own, TARGET: today[group][TARGET]}
     for name, value in given.items():
         _set(values, name.split("."), value)
-
-    def place_of_given(setting: str) -> str | None:
-        is_given = any(setting == name or setting.startswith(f"{name}.") for name in given)
-        return place_of(setting) if is_given and place_of is not None else None
-
-    config = check(values, {**choices, **names}, place_of_given)
+    config = check(values, {**choices, **names})
     found = {} if trust else _guarded(config, saved, today, given)
     if found:
         settings = ", ".join(f"{setting}={as_json(value)}" for setting, value in found.items())

@@ -13,7 +13,7 @@ import yaml
 from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeInt, PositiveInt
 
 from hpamdp.complaints import as_json
-from hpamdp.config.components import CALLBACK, GROUPS, TARGET, Component, PlaceOf, check_base_class, component, file_of
+from hpamdp.config.components import CALLBACK, GROUPS, TARGET, Component, check_base_class, component, file_of
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.settings import FromList, NumAtOnce, Settings
 
@@ -266,27 +266,21 @@ class Config:
         return yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True)
 
 
-def check_run(given: Mapping[str, Any], names: Mapping[str, str], place_of: PlaceOf | None = None) -> RunConfig:
+def check_run(given: Mapping[str, Any], names: Mapping[str, str]) -> RunConfig:
     """Check the values of the run.
 
     Args:
         given: the values of the run, including its values in the groups `env` and `low`.
         names: the name that was chosen for each group.
-        place_of: as for `checked_config`.
 
     Raises:
         ConfigError: a wrong value.
     """
-
-    def where(setting: str | None) -> str:
-        place = None if setting is None or place_of is None else place_of(setting)
-        return RUN_FILE if place is None else f"{RUN_FILE}, {place}"
-
     values = {name: value for name, value in given.items() if name not in GROUPS}
     own: dict[str, type[Settings]] = {"env": EnvConfig, "low": LowConfig}
     for group, entries in own.items():
         values[group] = {name: given[group][name] for name in entries.model_fields if name in given[group]}
-    run = validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", where)
+    run = validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
     if "budget" in given["low"]:
         file, budget = file_of("low", names["low"]), given["low"]["budget"]
         if not isinstance(budget, dict):
@@ -301,7 +295,6 @@ def checked_config(
     names: Mapping[str, str],
     learners: Mapping[str, tuple[str, Any]],
     callbacks: Sequence[tuple[str, Any]],
-    place_of: PlaceOf | None = None,
 ) -> Config:
     """Check the classes and the settings of all groups.
 
@@ -311,16 +304,13 @@ def checked_config(
         names: the name that was chosen for each group.
         learners: for single options, by the option's name: the learner's name, and a mapping as for a group.
         callbacks: the name of each callback, and a mapping as for a group.
-        place_of: returns where a setting such as `low.lr` was set, for errors; None if that is not known.
 
     Raises:
         ConfigError: a wrong value.
     """
     for group in GROUPS:
         check_base_class(group, names[group], given[group].get(TARGET))
-    components: dict[str, Any] = {
-        group: component(group, names[group], given[group], place_of=place_of) for group in GROUPS
-    }
+    components: dict[str, Any] = {group: component(group, names[group], given[group]) for group in GROUPS}
     low_of = {}
     for option, (name, low) in learners.items():
         check_base_class("low", name, low.get(TARGET))

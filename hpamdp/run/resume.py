@@ -55,7 +55,7 @@ def resolve(
         compatibility.check_saved_run(config.run)
         compatibility.check_effects(config.run.mode, overrides)
         return choose_selector(config, overrides), None
-    run, place_of, folders = read_run(cfg)
+    run, folders = read_run(cfg)
     compatibility.check_saved_run(run)
     where = "resume" if run.resume is not None else "checkpoint"
     source = run.resume or run.checkpoint or ""
@@ -77,7 +77,7 @@ def resolve(
         values |= {f"env.{name}": None for name in SOURCE_SETTINGS if f"env.{name}" not in values}
     names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
     try:
-        resolved = read_saved(saved, values, names, composed=cfg, trust=run.trust, file=file, place_of=place_of)
+        resolved = read_saved(saved, values, names, composed=cfg, trust=run.trust, file=file)
     except MissingChoiceError as error:
         raise _not_there(error, file) from error
     if run.resume is not None:
