@@ -19,16 +19,13 @@ names is used.
 
 import lazy_loader
 
-from hpamdp.search_path import is_command_line, put_working_directory_last
+from hpamdp.shell import is_command_line
 
 __version__ = "0.3.0"
 # `__init__.pyi` lists the names with their modules, which are imported when a name is used.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-if is_command_line():
-    # `python -m` puts the working directory first, and the next import needs other packages.
-    put_working_directory_last()
-else:
+if not is_command_line():
     # The command line leaves this to `env=gymnasium`: importing Gymnasium takes longer than refusing a wrong setting.
     from hpamdp.env.registration import register
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import CONF, forked
+from conftest import forked
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import QuotedString
 from omegaconf import OmegaConf
@@ -16,8 +16,7 @@ from omegaconf import OmegaConf
 from hpamdp import cli
 from hpamdp.files import replacing
 from hpamdp.run import train
-from hpamdp.search_path import put_working_directory_last
-from hpamdp.shell import for_hydra, path_setting, setting
+from hpamdp.shell import find_own_classes, for_hydra, path_setting, setting
 
 FOLDERS = [
     *("sweep", "outputs/2025-01-31/12-00-00-000001", "lr=0.1,seed=1", "my runs/a", "läufe", "a(b)"),
@@ -145,8 +144,9 @@ def test_a_clone_stays_first_where_python_looks_for_modules(monkeypatch, tmp_pat
     assert sys.path == [root, "/packages"]
     monkeypatch.setattr(sys, "path", [str(tmp_path), root, "/packages", ""])
     monkeypatch.chdir(tmp_path)
-    put_working_directory_last()
-    assert sys.path == [root, "/packages", str(tmp_path)]
+    find_own_classes()
+    find_own_classes()
+    assert sys.path == ["/packages", str(tmp_path)]
 
 
 def test_relative_paths_count_from_the_working_directory_even_if_hydra_changes_it(command, tmp_path, monkeypatch):
