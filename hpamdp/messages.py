@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from io import TextIOWrapper
 from typing import Any, TextIO, cast
 
 # Exit codes of the command line, beside 0.
@@ -41,13 +42,10 @@ def first_line(text: object) -> str:
 
 
 class LenientStream:
-    """A text stream on which writing never fails.
-
-    If the terminal was closed or the disk is full, only the text is lost. A letter that the stream cannot encode is
-    written as its number.
+    """A text stream on which writing never fails. If the terminal was closed or the disk is full, only text is lost.
 
     Args:
-        stream: the stream to write to.
+        stream: the stream to write to. A letter that it cannot encode is written as its number.
 
     Attributes:
         error: the last error of a write; None if all text was written.
@@ -56,27 +54,19 @@ class LenientStream:
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self.error: OSError | ValueError | None = None
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
     def __getattr__(self, name: str) -> Any:
-        if name == "_stream":  # of a copy whose attributes are not there yet
-            raise AttributeError(name)
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
         """Write the text if possible."""
         try:
             self._stream.write(text)
-        except UnicodeEncodeError:
-            encoding = self._stream.encoding
-            self.write(text.encode(encoding, "backslashreplace").decode(encoding))
         except (OSError, ValueError) as error:
             self.error = error
         return len(text)
-
-    def writelines(self, lines: Iterable[str]) -> None:
-        """Write the lines if possible."""
-        for line in lines:
-            self.write(line)
 
     def flush(self) -> None:
         """Flush the stream if possible."""
@@ -85,34 +75,13 @@ class LenientStream:
         except (OSError, ValueError) as error:
             self.error = error
 
-    def isatty(self) -> bool:
-        """Return whether the stream is a terminal."""
-        with suppress(OSError, ValueError):
-            return self._stream.isatty()
-        return False
-
-
-@contextmanager
-def lenient_streams() -> Iterator[None]:
-    """Keep prints inside the block from failing, and the interpreter's last flush of stdout and stderr as well."""
-    before = sys.stdout, sys.stderr
-    out, err = map(LenientStream, before)
-    sys.stdout, sys.stderr = cast(TextIO, out), cast(TextIO, err)
-    try:
-        yield
-    finally:
-        sys.stdout, sys.stderr = before
-        for stream in (out, err):
-            _finish(stream)
-
-
-def _finish(stream: LenientStream) -> None:
-    """Flush a stream, or drop the rest of its text if that fails."""
-    stream.error = None
-    stream.flush()
-    if stream.error is not None:
-        with suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    def finish(self) -> None:
+        """Flush the stream, or drop the rest of its text if that fails, so that the interpreter's last flush works."""
+        self.error = None
+        self.flush()
+        if self.error is not None:
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
 
 def exit_code(program: Callable[[], int | None]) -> int:
@@ -124,20 +93,24 @@ def exit_code(program: Callable[[], int | None]) -> int:
     Args:
         program: returns its exit code. None stands for 0.
     """
-    with lenient_streams():
-        try:
-            code = program() or 0
-        except SystemExit as stop:
-            if stop.code:
-                raise
-            code = 0  # argparse has printed its help
-        sys.stdout.flush()
-        error = getattr(sys.stdout, "error", None)
-        if code or error is None:
-            return code
-        if not isinstance(error, BrokenPipeError):
-            warn(f"stdout: {reason_of(error)}")
-        return FAILED
+    out, err = LenientStream(sys.stdout), LenientStream(sys.stderr)
+    try:
+        with redirect_stdout(cast(TextIO, out)), redirect_stderr(cast(TextIO, err)):
+            try:
+                code = program() or 0
+            except SystemExit as stop:
+                if stop.code:
+                    raise
+                code = 0  # argparse has printed its help
+            out.flush()
+            if code or out.error is None:
+                return code
+            if not isinstance(out.error, BrokenPipeError):
+                warn(f"stdout: {reason_of(out.error)}")
+            return FAILED
+    finally:
+        out.finish()
+        err.finish()
 
 
 def say(text: str) -> None:
@@ -151,11 +124,8 @@ def warn(message: str) -> None:
 
 
 def _print(text: str, stream: TextIO) -> None:
-    lenient = LenientStream(stream)
-    lenient.write(f"{text}\n")
-    lenient.flush()
-    if lenient.error is not None:
-        _finish(lenient)  # otherwise the interpreter fails again when it ends
+    with suppress(OSError, ValueError):
+        print(text, file=stream, flush=True)
 
 
 def reason_of(error: BaseException | None) -> str:
