@@ -26,7 +26,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.files import replacing
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, MISTAKE, one_line, reason_of, say, warn
-from hpamdp.run.folder import has_foreign_error, is_about_folder, locked, remove_error, write_error
+from hpamdp.run.folder import is_about_folder, locked, write_error
 from hpamdp.run.stopping import exits_explained, pass_on_signal
 from hpamdp.run_files import ERROR_NAME, saved_summary
 from hpamdp.shell import path_setting
@@ -185,7 +185,7 @@ def _run_rest(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[
     done, source = rest_of(config, folder)
     if done is not None:
         return _SKIPPED, done, ""
-    remove_error(folder)
+    (folder / ERROR_NAME).unlink(missing_ok=True)
     if source is not None:
         say(f"Going on from {source}")
     reasons: list[str] = []
@@ -246,13 +246,13 @@ def report(start: str, error: BaseException | None = None) -> int:
     _print_tally(jobs)
     for job in failed:
         folder = Path(job.folder)
-        is_told = os.path.exists(folder / ERROR_NAME) and not has_foreign_error(folder)
-        warn(f"{job.overrides}: {job.reason} ({_shown(folder / ERROR_NAME if is_told else folder)})")
+        told = folder / ERROR_NAME
+        warn(f"{job.overrides}: {job.reason} ({_shown(told if told.exists() else folder)})")
     if is_stopped or (error is not None and len(failed) < len(jobs)):
         if error is not None and not is_stopped:
-            told = sweep_dir / ERROR_NAME if write_error(sweep_dir, error) else sweep_dir
+            write_error(sweep_dir, error)
             reason = one_line("".join(traceback.format_exception_only(error)))
-            warn(f"The sweep broke off: {reason} ({_shown(told)})")
+            warn(f"The sweep broke off: {reason} ({_shown(sweep_dir / ERROR_NAME)})")
         say(f"To go on: the same command with {path_setting('hydra.sweep.dir', _shown(sweep_dir))}")
         return INTERRUPTED if is_stopped else FAILED
     if not failed:

@@ -25,7 +25,7 @@ from hpamdp.run import checkpoint
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, metrics_of, mistakes_explained, named, states_of
 from hpamdp.run.collection.base import Collection
-from hpamdp.run.folder import mark_unfinished, moved_aside
+from hpamdp.run.folder import mark_unfinished, remove_run
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
 from hpamdp.run.summary import KEPT_FRAMES, KEPT_SCORE
@@ -147,24 +147,20 @@ class Trainer:
             is_own: whether the folder holds the continued run. Otherwise an earlier run there is deleted.
 
         Raises:
-            ConfigError: the logger refuses its settings; the folder stays as it was.
+            ConfigError: the logger refuses its settings.
         """
         if self.output_dir is None:
             return
-        if is_own:
-            self.recorder.start()
-            self._write_config(self.output_dir)
-            mark_unfinished(self.output_dir)
-            return
-        self.output_dir.mkdir(parents=True, exist_ok=True)
-        with moved_aside(self.output_dir):
-            self._write_config(self.output_dir)
-            self.recorder.start()
-            self.recorder.metrics.keep_resumed()
-
-    def _write_config(self, folder: Path) -> None:
-        with replacing(folder / CONFIG_NAME) as partial:
+        if not is_own:
+            self.output_dir.mkdir(parents=True, exist_ok=True)
+            remove_run(self.output_dir)
+        self.recorder.start()
+        with replacing(self.output_dir / CONFIG_NAME) as partial:
             partial.write_text(self.config.to_yaml())
+        if is_own:
+            mark_unfinished(self.output_dir)
+        else:
+            self.recorder.metrics.keep_resumed()
 
     def stop(self, reason: str = "") -> None:
         """End training after the current batch. The run counts as finished.
