@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from hpamdp.run.trainer import Trainer
 
 SCORE = "eval/score"
-_RAISED_BY = "_raised_by_callback"  # attribute of an error
 OWN = "own/"  # prefix of the columns with callbacks' metrics
 
 
@@ -281,7 +280,7 @@ def named(callbacks: Iterable[Callback]) -> dict[str, Callback]:
 def mistakes_explained(name: str) -> Iterator[None]:
     """Name the callback in the line about a user's mistake, so that training is saved before it ends.
 
-    Other errors go through as they are, with the callback's name for `raised_by`.
+    Other errors go through as they are.
 
     Raises:
         CallbackError: the block raised a `ConfigError`.
@@ -292,14 +291,6 @@ def mistakes_explained(name: str) -> Iterator[None]:
         raise
     except ConfigError as error:
         raise CallbackError(f"{name}: {first_line(error)}") from error
-    except Exception as error:
-        vars(error).setdefault(_RAISED_BY, name)
-        raise
-
-
-def raised_by(error: Exception) -> str | None:
-    """Return the name of the callback that raised an error, or None if it was no callback."""
-    return vars(error).get(_RAISED_BY)
 
 
 def metrics_of(callbacks: Mapping[str, Callback], trainer: Trainer) -> dict[str, float]:

@@ -12,11 +12,10 @@ from hpamdp.cards import CallbackCard, outside_card
 from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.saved import needs_trust
 from hpamdp.config.schema import Config, RunConfig
-from hpamdp.env.errors import EnvironmentFaultError, fault_of
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble, choose_selector, facts_about
-from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, raised_by
+from hpamdp.run.callbacks import BestAgent, Callback, CallbackError
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import CollectionError
 from hpamdp.run.compatibility import check_effects_on, need_of_evaluations, settings_without_effect
@@ -172,11 +171,6 @@ def _run_to_the_end(trainer: Trainer, output_dir: Path, tell: Callable[[str], No
             saved = f"to go on: {_resuming(config, output_dir)}" if has_learned else "nothing was learned"
             tell(f"{error} at frame {trainer.frames:,}; {saved}")
             return FAILED
-        except Exception as error:
-            fault = _fault_of_callback(error, trainer)
-            if fault is None:
-                raise
-            raise fault from error
     say(trainer.finish(is_finished=not is_interrupted))
     if trainer.stop_reason and not is_interrupted:
         say(f"Training ended at {trainer.frames:,}{trainer.unit}: {trainer.stop_reason}")
@@ -184,14 +178,6 @@ def _run_to_the_end(trainer: Trainer, output_dir: Path, tell: Callable[[str], No
     if is_interrupted:
         say(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: {_resuming(config, output_dir)}")
     return INTERRUPTED if is_interrupted else 0
-
-
-def _fault_of_callback(error: Exception, trainer: Trainer) -> EnvironmentFaultError | None:
-    """Return the fault that an error in a callback of the user's own is, or None if the error came from elsewhere."""
-    name = raised_by(error)
-    if name is None or type(trainer.callbacks[name]).__module__.startswith("hpamdp."):
-        return None
-    return fault_of(error, name)
 
 
 def _resuming(config: Config, output_dir: Path) -> str:
