@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 from multiprocessing import connection, resource_tracker
-from pathlib import Path
 from typing import Any
 
 from torchrl.collectors import MultiSyncCollector
 
 from hpamdp.config.schema import Config
-from hpamdp.files import read_regular
 from hpamdp.limits import full_shared_memory
 from hpamdp.messages import warn
 from hpamdp.run.assemble import AssembledRun
@@ -20,7 +17,6 @@ from hpamdp.run.collection.options import CARDS, WorkerOptions
 from hpamdp.run.collection.worker import EnvShard, SharedMemoryCollector
 from hpamdp.run.collection.workers import WorkerCollection, children_without
 from hpamdp.run.stopping import STOP_SIGNALS
-from hpamdp.run_files import MAX_TEXT_BYTES
 
 _PATIENCE_S = 2.0  # from the moment a worker's pipe is closed until it has an exit code
 
@@ -62,7 +58,7 @@ class MultiCollection(WorkerCollection):
 
     def _death(self, worker: MultiSyncCollector | None, error: Exception) -> str | None:
         if worker is None:
-            return _death_at_start() if isinstance(error.__cause__, EOFError) else None
+            return "as it started" if isinstance(error.__cause__, EOFError) else None
         process = worker.procs[0]
         if not connection.wait([process.sentinel], _PATIENCE_S):
             return None
@@ -73,15 +69,3 @@ class MultiCollection(WorkerCollection):
         if code == -signal.SIGBUS:
             return f"signal {signal.SIGBUS}, SIGBUS: {full_shared_memory()}"
         return f"exit code {code}" if code >= 0 else f"signal {-code}, {signal.Signals(-code).name}"
-
-
-def _death_at_start() -> str:
-    """Return as text that a worker died as it started, with the reason if the user's script lacks its guard."""
-    script = getattr(sys.modules["__main__"], "__file__", None)
-    try:
-        lacks_guard = script is not None and b"__main__" not in read_regular(Path(script), MAX_TEXT_BYTES)
-    except OSError:  # such as the <stdin> of a notebook
-        lacks_guard = False
-    if not lacks_guard:
-        return "as it started"
-    return f'as it started: workers import {script} again, so put what it runs below if __name__ == "__main__":'
