@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import inspect
-import re
 from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 from gymnasium import VectorizeMode
-from gymnasium.envs.registration import EnvSpec, load_env_creator
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from pydantic import NonNegativeInt
 
@@ -23,24 +21,13 @@ from hpamdp.config.outside_jobs import composed
 from hpamdp.config.schema import Device, usable_device
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
-from hpamdp.limits import is_about_memory
 from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run.assemble import grouped
 from hpamdp.run.compatibility import lack_of, settings_without_effect
-from hpamdp.settings import NumAtOnce, SettingError, Settings
+from hpamdp.settings import NumAtOnce, Settings
 
 # Values of `vectorization_mode` for a problem's own vector, if it has one.
 _OWN_VECTOR = (None, "vector_entry_point", VectorizeMode.VECTOR_ENTRY_POINT)
-# Errors of Gymnasium and of constructors about their arguments.
-_REFUSALS = (
-    gymnasium.error.Error,
-    AssertionError,
-    ModuleNotFoundError,
-    MemoryError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
 
 
 class _Sizes(Settings):
@@ -131,11 +118,8 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         if num_envs is None:
             return gymnasium.make(env_id, **own)
         return gymnasium.make_vec(env_id, num_envs=checked.num_envs, **_vector_arguments(env_id, own))
-    except _REFUSALS as error:
-        complaint = _complaint(error, env_id, num_envs)
-        if complaint is None:
-            raise
-        raise ConfigError(f"{env_id}: {complaint}") from error
+    except (gymnasium.error.Error, AssertionError, ImportError, RuntimeError, TypeError, ValueError) as error:
+        raise ConfigError(f"{env_id}: {first_line(error)}") from error
 
 
 def _vector_arguments(env_id: str, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -158,31 +142,6 @@ def _spec_of(env_id: str) -> EnvSpec:
     if module:
         importlib.import_module(module)  # as `gymnasium.make` does
     return gymnasium.spec(name)
-
-
-def _names_of_arguments(env_id: str) -> list[str]:
-    """Return the names of the arguments that the constructor behind an id takes."""
-    creator: Any = _spec_of(env_id).entry_point
-    if isinstance(creator, str):
-        creator = load_env_creator(creator)
-    parameters = [] if creator is None else inspect.signature(creator).parameters.values()
-    return [each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
-
-
-def _complaint(error: Exception, env_id: str, num_envs: int | None) -> str | None:
-    """Return what a user gave wrong, in one line; None for other errors, whose traceback says more."""
-    if is_about_memory(error) and num_envs is not None:
-        return f"num_envs={num_envs}: takes more memory than there is"
-    if isinstance(error, TypeError):
-        wrong_class = re.match(r"options: must be \w+, not \w+", str(error))
-        if wrong_class is not None:
-            return wrong_class.group()
-        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
-        if unknown is None:
-            return None
-        return f"{unknown.group(1)}: {no_such('argument', unknown.group(1), _names_of_arguments(env_id))}"
-    is_refusal = isinstance(error, gymnasium.error.Error | SettingError | ModuleNotFoundError)
-    return first_line(error) if is_refusal or env_id.startswith("hpamdp/") else None
 
 
 def _id_of(name: str) -> str:
