@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -12,9 +11,9 @@ from typing import Any
 
 from hpamdp.api.agent import Agent
 from hpamdp.api.arguments import Problem, choices_and_settings, flag, path_argument, problem_of
-from hpamdp.api.loading import check_problem, check_shared_names, loaded, torch_restored
+from hpamdp.api.loading import check_problem, loaded, torch_restored
 from hpamdp.config.command_line import SEARCH_PATH
-from hpamdp.config.compose import job_overrides, setting_of
+from hpamdp.config.compose import job_overrides
 from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.outside_jobs import check_no_sweep, composed, own_hydra, searching
 from hpamdp.config.schema import RESUME_AUTO, Config
@@ -27,9 +26,6 @@ from hpamdp.run.folder import locked
 from hpamdp.run.resume import resolve, saved_words
 from hpamdp.run.stopping import exits_explained
 from hpamdp.run.train import begin, check_callbacks
-
-# Values of the run that are of use only if the run writes files.
-_OF_FILES = ("checkpoint_every", "checkpoint_minutes", "film")
 
 
 def train(
@@ -88,13 +84,13 @@ def train(
     _check_what_needs_runs(settings, output_dir)
     if goes_on:
         settings = {**settings, "resume": None}
-    with _warned_if_concurrent(), torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
+    with torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
         with own_hydra(), composed(*_given(problem, settings, config_dirs)) as cfg:
             words = job_overrides()
             check_no_sweep(cfg, words)
             config, source = resolve(cfg, words, problem.objects)
             if output_dir is None:
-                _check_no_files(config, words)
+                _check_no_files(config)
             stack.enter_context(memory_errors_explained(config))
             if output_dir is not None:
                 stack.enter_context(_own_folder(output_dir))
@@ -129,18 +125,14 @@ def _check_what_needs_runs(settings: Mapping[str, Any], folder: Path | None) -> 
         raise ConfigError("trust=True: has no effect without a saved run; give resume, or leave it out")
 
 
-def _check_no_files(config: Config, words: Sequence[str]) -> None:
-    """Refuse settings that ask for files, for a run without a folder.
+def _check_no_files(config: Config) -> None:
+    """Refuse a logger that writes files, for a run without a folder.
 
     Raises:
-        ConfigError: there is such a setting.
+        ConfigError: there is such a logger.
     """
     if config.logger.name != "csv":
         raise ConfigError(f"{config.logger}: writes files, so give the run a folder")
-    for each in words:
-        name = setting_of(each)
-        if name in _OF_FILES and getattr(config.run, name):
-            raise ConfigError(f"{each}: writes files, so give the run a folder")
 
 
 def _given(
@@ -157,7 +149,6 @@ def _given(
     words = [*searching(config_dirs), *problem.words, *choices]
     if settings.get("resume") is not None:
         resumed, trust = str(settings["resume"]), ["trust=true"] if settings.get("trust") is True else []
-        check_shared_names(checkpoint.find(resumed, "resume"), words)
         words = [*saved_words(resumed, "resume", [*words, *trust]), *words]
         if not problem.words and not problem.objects:
             check_problem(checkpoint.find(resumed, "resume"), [*settings, *dict(problem.settings)], "resume")
@@ -184,22 +175,6 @@ def _checked_callbacks(given: Any) -> list[Callback]:
         raise ConfigError(f"callbacks={as_code(given)}: must be a list of objects of subclasses of hpamdp.Callback")
     check_callbacks(callbacks)
     return [*callbacks]
-
-
-_running = threading.Lock()  # held while a training of this process runs
-
-
-@contextmanager
-def _warned_if_concurrent() -> Iterator[None]:
-    """Warn if another training runs in this process."""
-    is_first = _running.acquire(blocking=False)
-    if not is_first:
-        warn("another training runs in this process; they share torch's random numbers, so no seed repeats them")
-    try:
-        yield
-    finally:
-        if is_first:
-            _running.release()
 
 
 @contextmanager
