@@ -415,9 +415,9 @@ def test_an_error_in_a_workers_environment_is_no_death(error, kind, text, tmp_pa
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (OSError(28, "No space left on device"), "shared memory is full (/dev/shm"),
+        (OSError(28, "No space left on device"), "shared memory is full (/dev/shm)"),
         (RuntimeError("unable to mmap 64 bytes from file </torch_1>: No space left on device (28)"), "--shm-size"),
-        (RuntimeError("can't start new thread"), "ulimit -u is"),
+        (RuntimeError("can't start new thread"), "raise ulimit -u"),
         (ValueError("No space left on device"), None),
     ],
 )

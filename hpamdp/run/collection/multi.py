@@ -10,7 +10,7 @@ from typing import Any
 from torchrl.collectors import MultiSyncCollector
 
 from hpamdp.config.schema import Config
-from hpamdp.limits import full_shared_memory
+from hpamdp.limits import SHARED_MEMORY
 from hpamdp.messages import warn
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.options import CARDS, WorkerOptions
@@ -67,5 +67,5 @@ class MultiCollection(WorkerCollection):
         if code is None:
             return None
         if code == -signal.SIGBUS:
-            return f"signal {signal.SIGBUS}, SIGBUS: {full_shared_memory()}"
+            return f"signal {signal.SIGBUS}, SIGBUS: {SHARED_MEMORY}"
         return f"exit code {code}" if code >= 0 else f"signal {-code}, {signal.Signals(-code).name}"
