@@ -156,14 +156,10 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
     """Run one job, and return its score if the job belongs to a sweep."""
     find_own_classes()  # in a worker of a launcher, too
     job = HydraConfig.get()
-    if job.job.chdir:
-        _stay(job.runtime.cwd)
     if job.mode == RunMode.MULTIRUN:
         return sweep.run_job(cfg, start)
 
     output_dir = Path(job.runtime.output_dir)
-    if output_dir.resolve() == Path(job.runtime.cwd):
-        _exit_with("hydra.run.dir: the working directory; give a folder of the run's own, or leave hydra.run.dir out")
     try:
         with locked(output_dir):
             config = _checked(cfg)
@@ -226,12 +222,6 @@ def _checked(cfg: DictConfig) -> Config | None:
     compatibility.check(config)
     compatibility.check_effects(config.run.mode, words)
     return config
-
-
-def _stay(directory: str) -> None:
-    """Go back to the working directory, so that relative paths in the command line and yaml files stay right."""
-    os.chdir(directory)
-    warn(f"hydra.job.chdir=true: the run stays in {directory}, so that relative paths stay right")
 
 
 def _exit_with(mistake: str, code: int = MISTAKE) -> NoReturn:

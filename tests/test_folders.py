@@ -196,8 +196,6 @@ def test_an_evaluation_never_touches_the_record_of_a_run(tmp_path, command, caps
     words = ["mode=eval", "checkpoint=run", "overwrite=true", "hydra.sweep.dir=.", "hydra.sweep.subdir=killed"]
     code, _, err = command("-m", *words)
     assert code == 2 and err.count("\n") == 1
-    code, _, err = command("mode=eval", "checkpoint=run", "hydra.run.dir=run", "hydra.output_subdir=.hydra")
-    assert code == 2 and err.count("\n") == 1
     after = contents(tmp_path)
     assert {name: after[name] for name in before} == before and {*after} - {*before} <= {"multirun.yaml", "report.csv"}
 

@@ -21,7 +21,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from hpamdp.config.compose import job_overrides, setting_of, words_in
+from hpamdp.config.compose import job_overrides
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.files import replacing
@@ -33,42 +33,24 @@ from hpamdp.shell import path_setting
 
 _PATIENCE_S = 30.0  # for the running batch, after the sweep's process was killed
 _LOCK_PATIENCE_S = 2 * _PATIENCE_S  # for jobs of a killed sweep, which still save
-# Settings of Hydra that only a sweep reads, and those that only a single run reads.
-_OF_SWEEPS = ("hydra.sweep.", "hydra.sweeper.", "hydra.launcher.", "hydra/sweeper", "hydra/launcher")
-_OF_RUNS = ("hydra.run.",)
 # States of a job. The first one holds until the job ends.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
 _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
 
 
 class SweepFolderCallback(Callback):
-    """Remember the sweep's folder, which Hydra gives only to callbacks, and keep Hydra from writing into runs."""
+    """Remember the sweep's folder, which Hydra gives only to callbacks."""
 
     path: ClassVar[Path | None] = None
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Refuse files of Hydra in the run's folder, and settings of sweeps."""
-        _check_output_subdir(config)
-        _check_effects(config, _OF_SWEEPS, "has no effect on a single run; add --multirun, or give hydra.run.dir")
+        """Refuse `resume=auto` without a fixed folder."""
         _check_fixed(config, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Remember the sweep's folder, and refuse what no sweep can do."""
-        _check_output_subdir(config)
-        _check_effects(config, _OF_RUNS, "has no effect on a sweep; give hydra.sweep.dir")
+        """Remember the sweep's folder, and refuse `resume=auto` if it is not fixed."""
         _check_fixed(config, "hydra.sweep.dir")
         SweepFolderCallback.path = Path(os.path.abspath(config.hydra.sweep.dir))
-        if os.path.realpath(SweepFolderCallback.path) == os.path.realpath(os.curdir):
-            warn("hydra.sweep.dir: the working directory; give a folder of its own, or leave hydra.sweep.dir out")
-            sys.exit(MISTAKE)
-
-
-def _check_effects(config: DictConfig, settings: tuple[str, ...], effect: str) -> None:
-    """Exit if the command line gives some of these settings of Hydra, which have no effect here."""
-    for word in words_in(config.hydra.overrides.hydra):
-        if setting_of(word).startswith(settings):
-            warn(one_line(f"{word}: {effect}"))
-            sys.exit(MISTAKE)
 
 
 def _check_fixed(config: DictConfig, name: str) -> None:
@@ -76,14 +58,6 @@ def _check_fixed(config: DictConfig, name: str) -> None:
     settings: Any = OmegaConf.to_container(OmegaConf.select(config, name.rpartition(".")[0]), resolve=False)
     if config.resume == RESUME_AUTO and "${now:" in str(settings["dir"]):
         warn(f"resume=auto: goes on with the run in a folder, so give {name}")
-        sys.exit(MISTAKE)
-
-
-def _check_output_subdir(config: DictConfig) -> None:
-    """Exit if Hydra is set to write its own files, because it would write before the run's folder is checked."""
-    given = config.hydra.output_subdir
-    if given is not None:
-        warn(f"hydra.output_subdir={given}: must be null; config.yaml in a run's folder has every value of the run")
         sys.exit(MISTAKE)
 
 
