@@ -49,12 +49,8 @@ def path_setting(name: str, path: Path) -> str:
 
 
 def for_shell(word: str) -> str:
-    """Return a word on one line, in a POSIX shell's quotes if it needs them."""
-    if word.isprintable():
-        return shlex.quote(word)
-    # ANSI-C quoting, which bash and zsh read.
-    letters = (letter if letter.isprintable() and letter not in "\\'" else _bytes_of(letter) for letter in word)
-    return f"$'{''.join(letters)}'"
+    """Return a word in a POSIX shell's quotes if it needs them."""
+    return shlex.quote(word)
 
 
 def for_hydra(text: str) -> str:
@@ -70,7 +66,3 @@ def escaped(text: str) -> str:
 
 def _trailing_backslashes(text: str) -> str:
     return text[len(text.rstrip("\\")) :]
-
-
-def _bytes_of(letter: str) -> str:
-    return "".join(f"\\x{byte:02x}" for byte in os.fsencode(letter))
