@@ -166,7 +166,10 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
             from hpamdp.run import train  # takes seconds, which a wrong setting need not wait for
 
             if cfg.resume == RESUME_AUTO:
-                code = _go_on(cfg, output_dir)
+                cfg.resume = None
+                score, _, code = train.go_on(cfg, output_dir, job_overrides(), f"resume=auto: {output_dir}")
+                if score is not None:
+                    say(f"{output_dir}: this run is finished, with score {score:.3f}")
             else:
                 code = train.run(cfg, output_dir, job_overrides(), config=config)
     except ConfigError as error:
@@ -181,28 +184,6 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
     if code:
         sys.exit(code)
     return None
-
-
-def _go_on(cfg: DictConfig, output_dir: Path) -> int:
-    """Continue the run in its folder, or start it there, and return the exit code.
-
-    Raises:
-        ConfigError: the folder holds the results of another run.
-    """
-    from hpamdp.run import train
-    from hpamdp.run.continuation import rest_of
-    from hpamdp.run.resume import resolve
-
-    cfg.resume = None
-    words = job_overrides()
-    config, start = resolve(cfg, words)
-    score, source = rest_of(config, output_dir, f"resume=auto: {output_dir}")
-    if score is not None:
-        say(f"{output_dir}: this run is finished, with score {score:.3f}")
-        return 0
-    if source is not None:
-        say(f"Going on from {source}")
-    return train.run(cfg, output_dir, words, source or start, config=config, may_overwrite=True)
 
 
 def _checked(cfg: DictConfig) -> Config | None:

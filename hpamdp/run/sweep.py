@@ -148,27 +148,19 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
 
 def _run_rest(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None, str]:
     """Run the rest of the job in a folder, and return the job's state, its score and the reason of a failure."""
-    # These imports take seconds, which --help need not wait for.
-    from hpamdp.run import train
-    from hpamdp.run.continuation import rest_of
-    from hpamdp.run.resume import resolve
+    from hpamdp.run import train  # takes seconds, which --help need not wait for
 
     if cfg.resume == RESUME_AUTO:  # as every sweep does
         cfg.resume = None
-    config, start = resolve(cfg, overrides)
-    done, source = rest_of(config, folder)
-    if done is not None:
-        return _SKIPPED, done, ""
-    (folder / ERROR_NAME).unlink(missing_ok=True)
-    if source is not None:
-        say(f"Going on from {source}")
     reasons: list[str] = []
-    code = train.run(cfg, folder, overrides, source or start, config=config, may_overwrite=True, tell=reasons.append)
+    score, is_resumed, code = train.go_on(cfg, folder, overrides, tell=reasons.append)
+    if score is not None:
+        return _SKIPPED, score, ""
     if code in (DIVERGED, FAILED):
         return _FAILED, None, one_line(" ".join(reasons))
     if code:
         return _STOPPED, None, ""
-    return (_FINISHED if source is None else _RESUMED), saved_summary(folder).get("score"), ""
+    return (_RESUMED if is_resumed else _FINISHED), saved_summary(folder).get("score"), ""
 
 
 @functools.cache  # once a process, which may run several jobs

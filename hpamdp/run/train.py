@@ -19,10 +19,12 @@ from hpamdp.run.callbacks import BestAgent, Callback, CallbackError
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import CollectionError
 from hpamdp.run.compatibility import check_effects_on, need_of_evaluations, settings_without_effect
+from hpamdp.run.continuation import rest_of
 from hpamdp.run.folder import check_no_training, check_unused
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.stopping import ProgramExitError, exits_explained
 from hpamdp.run.trainer import DivergedError, Trainer
+from hpamdp.run_files import ERROR_NAME
 from hpamdp.shell import path_setting, program
 
 
@@ -69,6 +71,35 @@ def run(
     except ProgramExitError as error:
         tell(str(error))
         return FAILED
+
+
+def go_on(
+    cfg: DictConfig, output_dir: Path, overrides: Sequence[str], name: str = "its folder", *, tell: Callable = warn
+) -> tuple[float | None, bool, int]:
+    """Continue the run in its folder, or start it there.
+
+    Args:
+        cfg: the composed config.
+        output_dir: folder of the run.
+        overrides: the command line's words.
+        name: name of the folder in errors.
+        tell: see `run`.
+
+    Returns:
+        The score of a run that was finished before, else None; whether the run was continued; the exit code of `run`.
+
+    Raises:
+        ConfigError: the folder holds the results of another run, or as for `run`.
+    """
+    config, start = resolve(cfg, overrides)
+    score, source = rest_of(config, output_dir, name)
+    if score is not None:
+        return score, False, 0
+    (output_dir / ERROR_NAME).unlink(missing_ok=True)
+    if source is not None:
+        say(f"Going on from {source}")
+    code = run(cfg, output_dir, overrides, source or start, config=config, may_overwrite=True, tell=tell)
+    return None, source is not None, code
 
 
 def begin(
