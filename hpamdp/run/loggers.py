@@ -91,8 +91,6 @@ class LenientLogger:
             f"logger={self._name}: {type(error).__name__}: {first_line(error)}; the run continues without this logger, "
             "and metrics.csv has all numbers"
         )
-        with suppress(Exception):
-            getattr(self._logger, "abandon", lambda: None)()
         self._logger = None
 
 
@@ -197,10 +195,8 @@ class WandbLogger:
 
         self.options: WandbOptions = WandbOptions.of(options, settings)
         project = self.options.project
-        self._teardown = wandb.teardown
         run_id = None if earlier is None else _wandb_id(earlier.folder)
         output_dir.mkdir(parents=True, exist_ok=True)  # if it is missing, wandb goes to a temporary folder
-        _check_wandb_mode()
         try:
             wandb_settings = wandb.Settings(
                 project=project,
@@ -210,7 +206,7 @@ class WandbLogger:
                 login_timeout=_WANDB_START,
                 finish_timeout=_WANDB_FINISH,
             )
-            server = _wandb_setup(wandb_settings).settings.base_url
+            server = wandb.setup(wandb_settings).settings.base_url
         except wandb.errors.UsageError as error:
             raise SettingError(f"project={project}: {first_line(error)}") from error
         except ValidationError as error:  # of what wandb reads from the environment and from its own files
@@ -286,22 +282,6 @@ class WandbLogger:
         """Wait until everything is sent, for a minute at most."""
         self._run.finish()
 
-    def abandon(self) -> None:
-        """Forget a service that has died, so that the next run of this process starts its own."""
-        self._teardown()
-
-
-def _wandb_setup(settings: Any) -> Any:
-    """Start wandb's service, or another one if an earlier run's service has died."""
-    import wandb
-
-    try:
-        return wandb.setup(settings)
-    except OSError:
-        with suppress(OSError):
-            wandb.teardown()
-        return wandb.setup(settings)
-
 
 def _wandb_id(folder: Path) -> str | None:
     """Return the id of the wandb run in a run's folder, or None if the folder has no wandb run."""
@@ -311,15 +291,11 @@ def _wandb_id(folder: Path) -> str | None:
     return ids[-1] if ids else None
 
 
-def _check_wandb_mode() -> None:
-    given = os.environ.get("WANDB_MODE")
-    if given and given not in get_args(WandbMode):
-        raise SettingError(f"WANDB_MODE={given}: must be one of {', '.join(get_args(WandbMode))}")
-
-
 def _wandb_mode(mode: str, server: str) -> WandbMode:
     if mode == "auto":
         mode = os.environ.get("WANDB_MODE") or ("online" if _has_wandb_key(server) else "offline")
+    if mode not in get_args(WandbMode):
+        raise SettingError(f"WANDB_MODE={mode}: must be one of {', '.join(get_args(WandbMode))}")
     if mode == "online" and not _has_wandb_key(server):
         warn("wandb has no API key (WANDB_API_KEY or netrc), so the run is logged offline")
         return "offline"
@@ -332,12 +308,7 @@ def _has_wandb_key(server: str) -> bool:
     host = urlsplit(server).netloc
     # Keys of wandb's own cloud may still be stored under its older name, and wandb finds them there.
     hosts = [host, "api.wandb.ai"] if host == "api.forge.coreweave.com" else [host]
-    files = [os.environ["NETRC"]] if "NETRC" in os.environ else [Path.home() / ".netrc", Path.home() / "_netrc"]
-    for file in files:
-        try:
-            logins = netrc.netrc(str(file))
-        except (OSError, netrc.NetrcParseError):
-            continue
-        if any(logins.authenticators(name) for name in hosts):
-            return True
+    with suppress(OSError, netrc.NetrcParseError):
+        logins = netrc.netrc(os.environ.get("NETRC", str(Path.home() / ".netrc")))
+        return any(logins.authenticators(name) for name in hosts)
     return False
