@@ -199,7 +199,6 @@ def _checked(cfg: DictConfig) -> Config | None:
     problem = compatibility.facts_of(config)
     if problem is not None:
         config = compatibility.with_selector(config, problem, words)
-        compatibility.check_effects_on(problem, config, words)
     compatibility.check(config)
     compatibility.check_effects(config.run.mode, words)
     return config

@@ -17,7 +17,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.limits import is_about_memory
 from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.checkpoint import progress_of
-from hpamdp.run.compatibility import check_effects_on, facts_of, settings_without_effect
+from hpamdp.run.compatibility import settings_without_effect
 from hpamdp.run.players import load_agent, split_words
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.train import run
@@ -367,42 +367,6 @@ def test_a_setting_that_counts_only_with_another_value_is_told(words, needs):
 def test_a_setting_without_effect_is_found_inside_a_mapping(word, expected):
     words = ["env=boatdock", "high=ucb", "low=random", word]
     assert settings_without_effect(read(composed(*words)), words) == expected
-
-
-BOTH_OPTIONS = "+low.per_option={run: random, jump: random}"
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        ("high=none low=hppo agent.practice=10", "env=platform has no options to choose"),
-        ("high=uniform +env.grouping=default low=hppo agent.practice=10", "high=uniform chooses uniformly"),
-        ("high=none low=hppo agent.sharing=shared", "env=platform has no options to choose"),
-        (f"high=ucb +env.grouping=default low=hppo {BOTH_OPTIONS} low.lr=0.5", "low.per_option names a learner for"),
-        ("high=none low=hppo total_frames=64 low.budget.total_frames=32", "beside total_frames=64"),
-        ("high=none low=hppo eval.every=64 low.budget.eval_every=32", "beside eval.every=64"),
-        ("mode=offline data=human env=boatdock high=human low=iql low.budget.num_envs=5", "with mode=offline"),
-    ],
-)
-def test_a_setting_that_others_leave_without_effect_is_refused_in_one_line(words, line, command):
-    given = re.findall(r"\+low\.per_option=\{.*?\}|\S+", words)
-    code, _, err = command("env=platform", *given, "film=false")
-    assert code == 2 and err.count("\n") == 1
-    assert err.startswith(f"{given[-1]}: has no effect") and line in err
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "high=none low=hppo agent.practice=0 agent.sharing=per_option",
-        "high=ucb +env.grouping=default low=hppo agent.practice=10 low.minibatch_size=16",
-        f"high=ucb +env.grouping=default low=hppo low.freeze=false {BOTH_OPTIONS}",
-    ],
-)
-def test_settings_with_an_effect_are_taken(words):
-    given = re.findall(r"\+low\.per_option=\{.*?\}|\S+", f"env=platform {words}")
-    config = read(composed(*given))
-    check_effects_on(facts_of(config), config, given)
 
 
 def test_a_grouping_that_leaves_actions_out_is_told(command):

@@ -7,7 +7,6 @@ to change. The first sentence is the refusal. Rules need no class, so they can b
 from __future__ import annotations
 
 import importlib.util
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,14 +15,13 @@ from hpamdp.cards import CallbackCard, SelectorCard
 from hpamdp.complaints import as_json
 from hpamdp.config.components import (
     GROUPS,
-    RUN_VALUES,
     Component,
     constructor_arguments,
     is_passed,
 )
 from hpamdp.config.compose import RECIPE, setting_of, settings_in
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.schema import BudgetConfig, Config, RunConfig
+from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.facts import ProblemFacts, ProblemOptions
 from hpamdp.pickling import why_unsendable
 from hpamdp.settings import OnlyWith, OwnSteps
@@ -77,7 +75,7 @@ def check(config: Config) -> None:
     """
     facts = facts_of(config)
     acting = config if facts is None else with_acting_learners(config, facts)
-    _refuse_first(_complaints(acting), config.run)
+    _refuse_first(_complaints(acting))
     if facts is not None:
         check_problem(config, facts)
 
@@ -113,45 +111,6 @@ def check_effects(mode: str, words: Sequence[str]) -> None:
         given = settings_in(word)
         if any(each == name or each.startswith(f"{name}.") for each in given for name in _WITHOUT_EFFECT[mode]):
             raise ConfigError(f"{word}: has no effect {_WHERE[mode]}; leave it out")
-    word_of = _words_by_setting(words)
-    for value in BudgetConfig.model_fields:
-        recommended, name = f"low.budget.{value}", "eval.every" if value == "eval_every" else value
-        if name in word_of and recommended in word_of:
-            raise ConfigError(f"{word_of[recommended]}: has no effect beside {word_of[name]}; leave it out")
-
-
-def _words_by_setting(words: Sequence[str]) -> dict[str, str]:
-    return {name: word for word in words for name in settings_in(word)}
-
-
-def check_effects_on(problem: ProblemFacts, config: Config, words: Sequence[str]) -> None:
-    """Refuse words of a command line that would change nothing on a problem.
-
-    Yaml files may set the same values, because they serve several selectors and learners.
-
-    Args:
-        problem: the facts about the problem.
-        config: config of the run, with its selector.
-        words: the words.
-
-    Raises:
-        ConfigError: there is such a word.
-    """
-    agent, has_choice = config.run.agent, _has_choice(config, problem)
-    is_low_unused = agent.sharing == "per_option" and with_acting_learners(config, problem) is not config
-    for name, word in _words_by_setting(words).items():
-        why = None
-        if name == "agent.practice" and agent.practice not in ("auto", 0):
-            if not has_choice:
-                why = f"{config.env} has no options to choose"
-            elif config.high.name == "uniform":
-                why = f"{config.high} chooses uniformly in all steps"
-        elif name == "agent.sharing" and agent.sharing == "shared" and not has_choice:
-            why = f"{config.env} has no options to choose"
-        elif is_low_unused and name.startswith("low.") and name.split(".")[1] not in RUN_VALUES["low"]:
-            why = "low.per_option names a learner for every option"
-        if why is not None:
-            raise ConfigError(f"{word}: has no effect, because {why}; leave it out")
 
 
 def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
@@ -206,7 +165,7 @@ def check_problem(config: Config, facts: ProblemFacts) -> None:
         ConfigError: a rule is broken; the message names the settings to change.
     """
     acting = with_acting_learners(config, facts)
-    _refuse_first(_complaints_about_problem(acting, facts), config.run)
+    _refuse_first(_complaints_about_problem(acting, facts))
 
 
 def with_acting_learners(config: Config, facts: ProblemFacts) -> Config:
@@ -252,16 +211,11 @@ def with_selector(config: Config, problem: ProblemFacts, words: Sequence[str] = 
     return replace(config, high=Component("high", "none", None, {}))
 
 
-def _refuse_first(complaints: Iterator[str], run: RunConfig) -> None:
+def _refuse_first(complaints: Iterator[str]) -> None:
     """Raise an error with the first complaint, if there is one."""
     complaint = next(complaints, None)
-    if complaint is None:
-        return
-    source = run.resume or run.checkpoint
-    if source and re.split("[.=:]", complaint)[0] in GROUPS_OF_AGENT:
-        where = "resume" if run.resume else "checkpoint"
-        complaint += f". But {where}={source} gives the agent, so change other settings"
-    raise ConfigError(complaint)
+    if complaint is not None:
+        raise ConfigError(complaint)
 
 
 def _complaints(config: Config) -> Iterator[str]:
@@ -367,8 +321,6 @@ def _about_batches(config: Config) -> Iterator[str]:
             f"steps_per_batch={run.steps_per_batch}: counts the steps of each of num_envs={run.num_envs}, so a batch "
             f"has {batch:,}, more than total_frames={run.total_frames}"
         )
-    if run.mode == "offline" and collector.card.has_workers:
-        yield f"{collector}: mode=offline takes no steps; use collector=single"
     package = collector.card.package
     if package is not None and importlib.util.find_spec(package) is None:
         yield f"{collector}: {package} is not installed; pip install hpamdp[{package}]"
@@ -597,10 +549,6 @@ def _about_pictures(config: Config, problem: ProblemFacts) -> Iterator[str]:
         yield f"{config.data}: {env} observes pictures, which data sets do not hold; use data=none"
     if not problem.has_pictures and encoder.name != AUTO_ENCODER:
         yield f"{encoder}: {env} observes no pictures; use encoder={AUTO_ENCODER}"
-    defaults = {} if encoder.model is None else encoder.model.model_fields
-    for name, value in encoder.settings.items():
-        if not problem.has_pictures and name in defaults and value != defaults[name].default:
-            yield f"encoder.{name}={as_json(value)}: {env} observes no pictures; leave it out"
 
 
 def _has_choice(config: Config, problem: ProblemFacts) -> bool:

@@ -14,11 +14,11 @@ from hpamdp.config.saved import needs_trust
 from hpamdp.config.schema import Config
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, say, warn
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import assemble, choose_selector, facts_about
+from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import CollectionError
-from hpamdp.run.compatibility import check_effects_on, need_of_evaluations, settings_without_effect
+from hpamdp.run.compatibility import need_of_evaluations, settings_without_effect
 from hpamdp.run.continuation import rest_of
 from hpamdp.run.folder import check_no_training, check_unused
 from hpamdp.run.resume import check_saved_options, resolve
@@ -138,8 +138,6 @@ def begin(
     parts = assemble(config)
     try:
         check_saved_options(config, parts.problem, source)
-        if is_training:
-            check_effects_on(facts_about(parts.env.base_env, config), config, overrides)
         trainer = Trainer(config, parts, output_dir, _all_callbacks(config, callbacks) if is_training else ())
         if source is not None:
             trainer.restore(source)
