@@ -1,4 +1,4 @@
-"""Word a user's mistakes in settings in one line: the given value, the allowed values and the place of the setting."""
+"""Word a user's mistakes in settings in one line: the given value, the allowed values and the class of the setting."""
 
 from __future__ import annotations
 

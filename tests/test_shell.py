@@ -40,7 +40,7 @@ def test_a_printed_setting_is_read_as_the_same_text_when_pasted():
 
 
 def test_a_text_outside_the_grammar_is_printed_as_it_must_be_typed(command):
-    for text in ("my runs/lr=0.1,seed=1", "a(b)", "a,b", "[32]", "{a: b}", "7", "true", "it's"):
+    for text in ("my runs/lr=0.1,seed=1", "a(b)", "a,b", "it's"):
         for name in ("resume", "low.checkpoint"):
             code, _, err = command(f"{name}={text}")
             assert code == 2 and err.count("\n") == 1, err

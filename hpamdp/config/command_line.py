@@ -12,16 +12,16 @@ from typing import Any, NoReturn
 
 import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Glob, Override, QuotedString, ValueType
+from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp import __version__
 from hpamdp.complaints import no_such
-from hpamdp.config.components import CALLBACK, GROUPS
+from hpamdp.config.components import CALLBACK
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.schema import RESUME_AUTO, RunConfig
+from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.config.yaml_files import SCHEME, completed_path
 from hpamdp.shell import for_hydra, setting
 
@@ -30,7 +30,6 @@ GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
 SEARCH_PATH = "hydra.searchpath"
 # The folder of conf/ with what `hpamdp tune` searches for each learner.
 SEARCH = "search"
-_SAVED_RUNS = ("resume", "checkpoint", "low.checkpoint")
 # Flags of Hydra, with their short forms and their arguments for argparse.
 _SWITCH: dict[str, Any] = {"action": "store_true"}
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -199,44 +198,18 @@ def parsed_words(words: Sequence[str]) -> tuple[Override, ...]:
 
 
 def _check_groups(line: CommandLine, conf: Path) -> None:
-    """Refuse a choice that is no name, such as `low=3`, for which Hydra prints a traceback."""
+    """Refuse words that Hydra would take, or answer without the choices that there are."""
     for override in line.overrides:
-        if not override.key_or_group or override.key_or_group == "hydra":
+        name = override.key_or_group
+        if not name or name == "hydra":
             raise ConfigError(f"{override.input_line}: {GRAMMAR}")
-        if override.is_delete() and override.key_or_group in GROUPS:
-            raise ConfigError(f"{override.key_or_group}: nothing chosen; set {override.key_or_group}=NAME")
-        if override.is_delete() and override.key_or_group.partition(".")[0] in (*GROUPS, *RunConfig.model_fields):
-            raise ConfigError(f"{override.input_line}: a setting cannot be removed; give it a value")
-        is_text = override.is_sweep_override() or isinstance(override.value(), str | None)
-        if override.key_or_group in _SAVED_RUNS and not override.is_delete() and not is_text:
-            raise ConfigError(f"{override.input_line}: must be a folder; write {as_text(override.input_line or '')}")
-        if override.key_or_group == SEARCH:
+        if name == SEARCH:
             raise ConfigError(f"{override.input_line}: a search is a command; write hpamdp tune low=LEARNER")
-        if override.key_or_group == CALLBACK:
+        if name == CALLBACK:
             raise ConfigError(f"{override.input_line}: a run has a list of callbacks; write callbacks=[NAME, ...]")
-        if override.is_add() and override.key_or_group in GROUPS:
-            raise ConfigError(f"{override.input_line}: {override.key_or_group} is always chosen; leave out the +")
-        _check_choice(override, conf / override.key_or_group)
-
-
-def _check_choice(override: Override, folder: Path) -> None:
-    is_group = os.path.isdir(folder)  # unlike `Path.is_dir` for any text
-    if override.value_type == ValueType.GLOB_CHOICE_SWEEP:  # it finds choices alone
-        if not is_group:
-            raise ConfigError(f"{override.input_line}: glob is for a group, as in low=glob(h*); list the values")
-        return
-    if not is_group or override.is_delete():
-        return
-    values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
-    if not all(_is_choice(value) for value in values):
-        wrong = no_such("choice", str(override.value()), choices_in(folder), where=f"conf/{folder.name}")
-        raise ConfigError(f"{override.input_line}: {wrong}")
-
-
-def _is_choice(value: object) -> bool:
-    """Return whether the value can name a yaml file in a group's folder, or in a folder there."""
-    value = value.text if isinstance(value, QuotedString) else value  # `sweep_iterator` leaves the quotes
-    return isinstance(value, str) and not set(value.split("/")) & {"", "..", "."}
+        if not override.is_delete() and override.value() is None and os.path.isdir(conf / name):
+            wrong = no_such("choice", "null", choices_in(conf / name), where=f"conf/{name}")
+            raise ConfigError(f"{override.input_line}: {wrong}")
 
 
 def as_text(word: str) -> str:

@@ -1,4 +1,4 @@
-"""Refuse a user's mistakes in one line: the given value, the allowed values and the place of the setting."""
+"""Refuse a user's mistakes in one line: the given value, the allowed values and the class of the setting."""
 
 from __future__ import annotations
 

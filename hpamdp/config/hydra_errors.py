@@ -58,7 +58,7 @@ def _missing_choice(file: str, there: Sequence[str], conf: Path) -> str:
         there = (*there, *_EXTRAS)
     if not group.startswith("hydra"):  # a folder of a group may be part of the choice
         group, _, name = file.partition("/")
-    if os.path.isdir(conf / group / name):
+    if name and os.path.isdir(conf / group / name):
         inside = [each for each in choices_in(conf / group) if each.startswith(f"{name}/")]
         return f"{group}={name}: a folder; choose one of {', '.join(inside)}"
     return f"{group}={name}: {no_such('choice', name, {*there, *choices_in(conf / group)}, where=f'conf/{group}')}"
@@ -68,8 +68,6 @@ def _first_lines(error: Exception, words: Sequence[str]) -> str:
     """Return the place of an error in a yaml file, or the messages of an error and its cause, in one line."""
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
-    if isinstance(error, UnicodeDecodeError):  # which does not name the file
-        return f"a yaml file that was chosen is not written in UTF-8 ({error})"
     if isinstance(error, OSError):
         return file_and_reason(error)
     if isinstance(error, RecursionError | ValueError) and not isinstance(error, OmegaConfBaseException):
