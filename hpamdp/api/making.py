@@ -104,10 +104,6 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
     """
     env_id = _id_of(name)
     own = without_env_prefix(settings)
-    elsewhere = {"id": "name", "num_envs": "num_envs"} | ({"problem": "name"} if env_id.startswith("hpamdp/") else {})
-    for each, argument in elsewhere.items():
-        if each in own:
-            raise ConfigError(f"{each}: no setting of the problem; give it as the argument {argument}")
     sizes: dict[str, Any] = {} if num_envs is None else {"num_envs": num_envs}
     if "device" in own and env_id.startswith("hpamdp/"):
         sizes["device"] = str(own["device"])
