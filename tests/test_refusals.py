@@ -53,9 +53,6 @@ REFUSED = [
     ("low=qpamdp low.features=[0,16]", "low: features=[0, 16]: name some of the observation's entries 0 to 15"),
     ("low=qpamdp low.phi_order=1000000", "low: phi_order=1000000, psi_order=3: the regression for the parameters"),
     ("high=linucb high.inputs=[1,1]", "high: inputs=[1, 1]: names an entry twice"),
-    # Budgets, of which the run may take nothing.
-    ("low.budget.num_envs=-1", "low.budget.num_envs=-1: must be greater than 0 (conf/low/hyar.yaml)"),
-    ("low.budget.foo=3", "low.budget.foo: no such value of low.budget (conf/low/hyar.yaml); it has eval_every, "),
     # Parts of another kind.
     ("low=random low._target_=hpamdp.policies.random_agent.random_agent", "there is no class random_agent in "),
     ("low._target_=hpamdp.policies.low_level.random.Random", " more like this"),

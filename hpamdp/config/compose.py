@@ -82,8 +82,8 @@ def read_run(cfg: DictConfig) -> tuple[RunConfig, tuple[str, ...]]:
     Raises:
         ConfigError: a value is wrong, or nothing is chosen for a group.
     """
-    given, names, folders = _as_plain_values(cfg, may_lack=True)
-    return check_run(given, names), folders
+    given, _, folders = _as_plain_values(cfg, may_lack=True)
+    return check_run(given), folders
 
 
 def _as_plain_values(
@@ -156,7 +156,7 @@ def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
     Raises:
         ConfigError: a value is wrong.
     """
-    run = check_run(given, names)
+    run = check_run(given)
     learners = _learners_of_options(run, names["env"])
     return checked_config(run, given, names, learners, listed_callbacks(run.callbacks, run.model_dump()))
 

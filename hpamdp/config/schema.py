@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeInt, PositiveInt
 
-from hpamdp.complaints import as_json
-from hpamdp.config.components import CALLBACK, GROUPS, TARGET, Component, check_base_class, component, file_of
+from hpamdp.config.components import CALLBACK, GROUPS, TARGET, Component, check_base_class, component
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.settings import FromList, NumAtOnce, Settings
 
@@ -106,15 +105,6 @@ class LowConfig(Settings):
     """Keep the learners as they are and train only the selector. Frames are then decisions."""
     per_option: dict[str, str | dict[str, Any]] | None = None
     """Learners of single options: `{OPTION: LEARNER}`, or `{OPTION: {name: LEARNER, SETTING: VALUE, ...}}`."""
-
-
-class BudgetConfig(Settings):
-    """Values of the run that a learner's yaml recommends."""
-
-    num_envs: PositiveInt | None = None
-    steps_per_batch: PositiveInt | None = None
-    total_frames: PositiveInt | None = None
-    eval_every: NonNegativeInt | None = None
 
 
 class OfflineConfig(Settings):
@@ -266,12 +256,11 @@ class Config:
         return yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True)
 
 
-def check_run(given: Mapping[str, Any], names: Mapping[str, str]) -> RunConfig:
+def check_run(given: Mapping[str, Any]) -> RunConfig:
     """Check the values of the run.
 
     Args:
         given: the values of the run, including its values in the groups `env` and `low`.
-        names: the name that was chosen for each group.
 
     Raises:
         ConfigError: a wrong value.
@@ -280,13 +269,7 @@ def check_run(given: Mapping[str, Any], names: Mapping[str, str]) -> RunConfig:
     own: dict[str, type[Settings]] = {"env": EnvConfig, "low": LowConfig}
     for group, entries in own.items():
         values[group] = {name: given[group][name] for name in entries.model_fields if name in given[group]}
-    run = validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
-    if "budget" in given["low"]:
-        file, budget = file_of("low", names["low"]), given["low"]["budget"]
-        if not isinstance(budget, dict):
-            raise ConfigError(f"low.budget={as_json(budget)}: must be a mapping ({file})")
-        validated(BudgetConfig, budget, "low.budget.", f"value of low.budget ({file})", file)
-    return run
+    return validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
 
 
 def checked_config(
