@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from hpamdp.messages import as_code
+from hpamdp.messages import as_code, first_line
 from hpamdp.settings import SettingError
 
 
@@ -20,17 +20,9 @@ def checked_device(owner: object, device: Any) -> torch.device:
     Raises:
         SettingError: it is no device of torch, or this machine does not have it.
     """
-    given = f"{type(owner).__name__}: device={as_code(str(device) if isinstance(device, torch.device) else device)}"
-    if isinstance(device, bool) or not isinstance(device, str | int | torch.device):
-        raise SettingError(f"{given}: must be cpu, cuda, cuda:N or another device of torch")
     try:
-        named = torch.device(device)
-    except RuntimeError as error:
-        raise SettingError(f"{given}: must be cpu, cuda, cuda:N or another device of torch") from error
-    try:
-        torch.empty(0, device=named, dtype=torch.float32)
-    except (RuntimeError, AssertionError) as error:  # torch without CUDA raises the latter
-        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        there = f"has CUDA devices 0 to {count - 1}" if count else "has no usable CUDA device"
-        raise SettingError(f"{given}: not on this machine, which {there}; use cpu") from error
-    return named
+        torch.empty(0, device=device, dtype=torch.float32)
+        return torch.device(device)
+    except (RuntimeError, AssertionError, TypeError) as error:  # of torch, which lists its kinds of devices
+        given = as_code(str(device) if isinstance(device, torch.device) else device)
+        raise SettingError(f"{type(owner).__name__}: device={given}: {first_line(error)}; use cpu or cuda:N") from error
