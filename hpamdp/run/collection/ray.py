@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import sys
-import threading
 import warnings
 from pathlib import Path
 from typing import Any, NoReturn
@@ -22,10 +20,6 @@ from hpamdp.run.collection.options import CARDS, RayOptions
 from hpamdp.run.collection.worker import EnvShard, RemoteShard, ShardCollector, WorkingDir
 from hpamdp.run.collection.workers import WorkerCollection, children_without
 from hpamdp.run.stopping import STOP_SIGNALS
-
-_CONNECT_S = 10.0  # until a cluster's address must have answered
-_SLOW_START_S = 120.0
-_SLOW = f"an actor has not started after {_SLOW_START_S:.0f} s; the run waits for it, see `ray status` and Ray's logs"
 
 
 class RayCollection(WorkerCollection):
@@ -46,23 +40,18 @@ class RayCollection(WorkerCollection):
 
     def _start(self, shard: EnvShard) -> RayCollector:
         remote = RemoteShard(WorkingDir(os.getcwd()), shard)
-        late = threading.Timer(_SLOW_START_S, warn, [f"{self.name}: {_SLOW}"])
-        late.start()
-        try:
-            return RayCollector(
-                [remote.make_env],
-                policy_factory=[remote.make_policy],
-                frames_per_batch=shard.num_envs * self._config.run.steps_per_batch,
-                total_frames=sys.maxsize,  # RayCollector cannot collect without an end
-                device="cpu",
-                remote_configs={"num_cpus": 1},
-                collector_class=ShardCollector,
-                collector_kwargs={"auto_register_policy_transforms": False},
-                weight_sync_schemes={},
-                sync=True,
-            )
-        finally:
-            late.cancel()
+        return RayCollector(
+            [remote.make_env],
+            policy_factory=[remote.make_policy],
+            frames_per_batch=shard.num_envs * self._config.run.steps_per_batch,
+            total_frames=sys.maxsize,  # RayCollector cannot collect without an end
+            device="cpu",
+            remote_configs={"num_cpus": 1},
+            collector_class=ShardCollector,
+            collector_kwargs={"auto_register_policy_transforms": False},
+            weight_sync_schemes={},
+            sync=True,
+        )
 
     def kill(self, worker: RayCollector) -> None:
         """End a worker at once."""
@@ -113,7 +102,6 @@ def _connect(address: str | None, num_workers: int) -> None:
     # A local Ray takes `num_cpus` as given; with fewer CPUs than actors some actors would wait forever.
     init: dict[str, Any] = {"address": "local", "num_cpus": num_workers, "include_dashboard": False}
     if address is not None:
-        check_answers(address)
         init = {"address": address}
     on_sigterm = signal.getsignal(signal.SIGTERM)  # which Ray replaces
     working_dir = os.getcwd()
@@ -133,21 +121,6 @@ def _connect(address: str | None, num_workers: int) -> None:
     num_cpus = int(ray.cluster_resources().get("CPU", 0))
     if num_cpus < num_workers:
         warn(f"collector.num_workers={num_workers}: the cluster has {num_cpus} CPUs; the run waits until more join it")
-
-
-def check_answers(address: str) -> None:
-    """Check that a server answers at an address of the form `HOST:PORT` or `ray://HOST:PORT`.
-
-    Raises:
-        CollectionError: no server answers.
-    """
-    place = re.fullmatch(r"(?:ray://)?\[?([^\[\]/]+?)\]?:(\d+)", address)
-    if place is None:
-        return
-    try:
-        socket.create_connection((place.group(1), int(place.group(2))), timeout=_CONNECT_S).close()
-    except (OSError, OverflowError) as error:
-        raise CollectionError(f"{_named(address)}: does not answer ({one_line(error)})") from error
 
 
 def _named(address: str | None) -> str:
