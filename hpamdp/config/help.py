@@ -34,31 +34,19 @@ Groups and their choices
 {values}
 
 Examples
-  {program} low=pdqn --help
-      explains the settings of a choice, too
-  {program} high=ucb low=hyar
-      trains; the results go to a folder of their own in outputs/
-  {program} mode=eval checkpoint=outputs/2025-01-31/12-00-00 eval.layouts=5000
-      scores the agent of an earlier run
-  {program} --multirun high=ucb,uniform seed=0,1,2 eval.every=50000
-      six runs one after another, in multirun/; with hydra.sweep.dir=FOLDER a second start does what is left
-  {program} --multirun high=ucb,uniform seed=0,1,2 hydra/launcher=joblib hydra.launcher.n_jobs=2
-      the same, two at a time; needs hpamdp[joblib]
+  {program} low=pdqn --help                         explains the settings of a choice, too
+  {program} high=ucb low=hyar                       trains; the results go to a folder of their own in outputs/
+  {program} mode=eval checkpoint=FOLDER             scores the agent of an earlier run
+  {program} --multirun high=ucb,uniform seed=0,1    four runs one after another, in multirun/; docs/sweeps.md has more
+  {program} low=hyar --cfg job                      shows every value and setting without running
+  {program} --hydra-help                            shows Hydra's own flags
 
-  {program} play
-      lets you play the problem yourself; see {program} play --help
-  {program} watch FOLDER
-      films the agent of a run; see {program} watch --help
-  {program} report FOLDER
-      compares the runs in a folder by their means over seeds; see {program} report --help
-  {program} judge FOLDER... data=human
-      orders agents by recorded actions, without their problem; see {program} judge --help
-  {program} tune low=hppo
-      searches for good settings with Optuna; see {program} tune --help
-  {program} low=hyar --cfg job
-      shows every value and setting without running
-  {program} --hydra-help
-      shows Hydra's own flags
+Further commands, each with its own --help
+  {program} play            lets you play the problem yourself
+  {program} watch FOLDER    films the agent of a run
+  {program} report FOLDER   compares the runs in a folder by their means over seeds
+  {program} judge FOLDER... orders agents by recorded actions, without their problem
+  {program} tune low=hppo   searches for good settings with Optuna
 """
 
 
