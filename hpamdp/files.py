@@ -15,15 +15,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-_KINDS = {
-    stat.S_IFDIR: "is a folder",
-    stat.S_IFIFO: "is a named pipe",
-    stat.S_IFSOCK: "is a socket",
-    stat.S_IFCHR: "is a device",
-    stat.S_IFBLK: "is a device",
-    stat.S_IFLNK: "is a link",
-}
-
 _ABANDONED_S = 3600.0  # after which nobody still writes to a file
 
 
@@ -43,7 +34,7 @@ def replacing(path: Path) -> Iterator[Path]:
     with suppress(FileNotFoundError):
         kind = stat.S_IFMT(path.lstat().st_mode)
         if kind not in (stat.S_IFREG, stat.S_IFLNK):
-            raise _not_regular(path, kind)
+            raise _not_regular(path)
     start = f".{path.name[:40]}."
     for leftover in path.parent.glob(f"{glob.escape(start)}*.partial{glob.escape(path.suffix)}"):
         with suppress(OSError):
@@ -77,20 +68,19 @@ def remove_link(path: Path) -> None:
             path.unlink()
 
 
-def _not_regular(path: Path, kind: int) -> OSError:
-    return OSError(errno.EINVAL, f"{_KINDS.get(kind, 'is no file')}, but must be a regular file", str(path))
+def _not_regular(path: Path) -> OSError:
+    return OSError(errno.EINVAL, "is a folder, a pipe or a device, but must be a regular file", str(path))
 
 
 def regular_size(path: Path, *, follow_links: bool = True) -> int:
     """Return the size of a regular file in bytes.
 
     Raises:
-        OSError: the file is missing or not regular; `strerror` says what it is.
+        OSError: the file is missing or not regular; `strerror` says which.
     """
     found = os.stat(path, follow_symlinks=follow_links)
-    kind = stat.S_IFMT(found.st_mode)
-    if kind != stat.S_IFREG:
-        raise _not_regular(path, kind)
+    if not stat.S_ISREG(found.st_mode):
+        raise _not_regular(path)
     return found.st_size
 
 

@@ -232,7 +232,7 @@ def test_a_checkpoint_that_may_not_be_opened_or_is_no_file_is_named_with_the_rea
     with pytest.raises(ConfigError) as error:
         checkpoint.find(tmp_path / "run", "resume")
     found = f"resume={tmp_path / 'run/checkpoint.safetensors'}"
-    assert str(error.value) == f"{found}: is a folder, but must be a regular file"
+    assert str(error.value) == f"{found}: is a folder, a pipe or a device, but must be a regular file"
     (tmp_path / "own").write_bytes(b"")
 
     def closed(self, *_):

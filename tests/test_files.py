@@ -106,8 +106,8 @@ def test_a_named_pipe_and_a_socket_are_never_replaced_by_a_file(tmp_path):
     agent = hpamdp.load("hppo_platform")
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(listening))
-        for path, kind in ((pipe, "named pipe"), (listening, "socket")):
-            with pytest.raises(OSError, match=rf"is a {kind}, but must be a regular file: '{path}'$"):
+        for path in (pipe, listening):
+            with pytest.raises(OSError, match=rf"must be a regular file: '{path}'$"):
                 agent.save(path)
     assert stat.S_ISFIFO(pipe.stat().st_mode) and stat.S_ISSOCK(listening.stat().st_mode)
     assert {*tmp_path.iterdir()} == {pipe, listening}
@@ -118,7 +118,7 @@ def test_a_named_pipe_and_a_socket_are_never_replaced_by_a_file(tmp_path):
     [
         ("nowhere/x.safetensors", "No such file or directory"),
         ("file/x.safetensors", "Not a directory"),
-        (".", "is a folder, but must be a regular file"),
+        (".", "is a folder, a pipe or a device, but must be a regular file"),
         ("x" * 300, "File name too long"),
         pytest.param(
             "closed/x.safetensors",

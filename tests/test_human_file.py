@@ -91,7 +91,7 @@ def test_a_file_that_is_not_the_released_one_is_refused_by_its_checksum(tmp_path
     path = synthetic_human.write(tmp_path / "people.mat")
     assert re.search(r"people.mat: SHA-256 .* but the released file has 9de16874b43d", refusal(path))
     assert "there is no such file; set HPAMDP_HUMAN_DATA" in refusal(tmp_path / "none.mat")
-    assert "is a folder, but must be a regular file" in refusal(tmp_path)
+    assert "is a folder, a pipe or a device, but must be a regular file" in refusal(tmp_path)
 
 
 def test_default_path_is_that_of_the_environment_variable_or_in_the_cache(monkeypatch, tmp_path):

@@ -180,10 +180,10 @@ def test_a_file_of_another_form_is_refused_in_one_line(content, message, tmp_pat
 def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path, message in (
-        (tmp_path / "pipe", "is a named pipe"),
-        (tmp_path, "is a folder"),
+        (tmp_path / "pipe", "a pipe or a device, but must be a regular file"),
+        (tmp_path, "is a folder, "),
         (tmp_path / "gone.json", "there is no such file; use simple, hard or the path of a JSON file"),
-        ("/dev/zero", "is a device"),
+        ("/dev/zero", "or a device"),
     ):
         with pytest.raises(SettingError, match=message):
             PinballEnv(1, map=str(path))

@@ -171,8 +171,8 @@ def changed(episode, **fields):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda path: path.mkdir(), "is a folder, but must be a regular file"),
-        (lambda path: path.symlink_to("/dev/zero"), "is a device, but must be a regular file"),
+        (lambda path: path.mkdir(), "is a folder, a pipe or a device, but must be a regular file"),
+        (lambda path: path.symlink_to("/dev/zero"), "is a folder, a pipe or a device, but must be a regular file"),
         (lambda path: os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), 2**33), "may have at most"),
     ],
 )
