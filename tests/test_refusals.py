@@ -84,7 +84,6 @@ REFUSED = [
     ("low=hppo mode=offline data=human", "low=hppo learns from its own steps only; use data=none"),
     ("low=iql mode=offline", "mode=offline: data=none leaves nothing to learn from; choose a data set"),
     ("low=iql high=none env=platform mode=offline data=human", "people docked boats; use env=boatdock"),
-    ("low=iql data=human mode=offline collector=multi", "mode=offline takes no steps"),
     # Explorations.
     ("low=random exploration=held", "exploration=held: changes actions, which low=random does not take; use "),
     ("low=bc mode=offline data=human exploration=held", "exploration=held: mode=offline takes no steps"),
@@ -100,7 +99,6 @@ REFUSED = [
     ),
     (PICTURE + "low=hyar", "low=hyar: env=catch_point_picture observes pictures"),
     ("high=none env=goal low=hppo encoder=cnn", "encoder=cnn: env=goal observes no pictures; use encoder=auto"),
-    ("high=none env=goal low=hppo encoder.channels=[8,8,8]", "encoder.channels=[8, 8, 8]: env=goal observes no"),
     (PICTURE + "low=hppo encoder.net=nature encoder.num_features=0", "encoder.num_features=0"),
     # Memories.
     ("low=hppo low.memory=gru low.vector_products=true", "vector_products=true: does not go with memory"),

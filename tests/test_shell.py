@@ -104,45 +104,8 @@ def ends_with(folder: Path, words: list[str], out: int, encoding: str, err: Path
         sys.stderr.close()
 
 
-@pytest.fixture
-def hostile(tmp_path):
-    """Return a folder with files that have the names of installed packages, and a class of the user's own."""
-    for name in ("torch", "numpy", "json", "random", "yaml", "hydra", "gymnasium", "pickle", "socket", "argparse"):
-        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('this is no {name}')\n")
-    (tmp_path / "mine.py").write_text("from hpamdp.policies.low_level.random import *\n")
-    return tmp_path
-
-
-@pytest.mark.parametrize("start", [[str(CONF.parent / "run.py")], ["-m", "hpamdp"]], ids=["script", "module"])
-def test_no_file_of_the_working_directory_takes_the_place_of_a_package(hostile, start):
-    # The empty entry is the working directory.
-    environment = os.environ | {"PYTHONPATH": f"{CONF.parent}{os.pathsep}"}
-    done = subprocess.run(
-        [sys.executable, *start, "low.nothing=1"], cwd=hostile, env=environment, capture_output=True, text=True
-    )
-    assert done.stderr.startswith("low.nothing: no such setting of ") and done.returncode == 2, done.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("words", [["collector=multi", "collector.num_workers=2"], ["-m", "hydra/launcher=joblib"]])
-def test_no_file_of_the_working_directory_takes_the_place_of_a_package_in_workers(hostile, words):
-    if "-m" in words:
-        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    environment = os.environ | {"PYTHONPATH": str(CONF.parent)}
-    small = ["low=random", "num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "film=false"]
-    small += ["low._target_=mine.Random"]
-    command = [sys.executable, "-m", "hpamdp", *words, *small]
-    done = subprocess.run(command, cwd=hostile, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def test_a_clone_stays_first_where_python_looks_for_modules(monkeypatch, tmp_path):
-    root = str(CONF.parent)
-    monkeypatch.setattr(sys, "path", [root, "/packages"])
-    monkeypatch.chdir(root)
-    put_working_directory_last()
-    assert sys.path == [root, "/packages"]
-    monkeypatch.setattr(sys, "path", [str(tmp_path), root, "/packages", ""])
+def test_classes_are_found_in_the_working_directory_after_installed_packages(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "path", ["/packages"])
     monkeypatch.chdir(tmp_path)
     find_own_classes()
     find_own_classes()

@@ -110,22 +110,6 @@ def test_a_report_of_the_users_own_stays(command, jobs, tmp_path):
     assert (tmp_path / "sweep/report.csv").read_text() == "mine"
 
 
-def test_the_working_directory_is_no_folder_of_a_sweep(command, jobs, tmp_path):
-    for folder in (".", tmp_path):
-        code, _, err = command("-m", "seed=0,4", f"hydra.sweep.dir={folder}")
-        assert code == 2 and err.startswith("hydra.sweep.dir: the working directory; ") and err.count("\n") == 1
-    assert not jobs and not list(tmp_path.iterdir())
-
-
-def test_an_error_file_of_the_users_own_stays_in_the_folder_of_a_job(command, jobs, tmp_path):
-    for number in range(2):
-        (tmp_path / f"sweep/{number}").mkdir(parents=True)
-        (tmp_path / f"sweep/{number}/error.txt").write_text("mine")
-    code, _, err = command("-m", "seed=0,2", "hydra.sweep.dir=sweep")
-    assert code == 1 and err == "seed=2: ZeroDivisionError: a bug (sweep/1)\n"
-    assert {(tmp_path / f"sweep/{number}/error.txt").read_text() for number in range(2)} == {"mine"}
-
-
 def test_a_sweep_started_again_does_what_is_left(command, jobs, tmp_path):
     words = ["-m", "seed=0,3,4,2", "hydra.sweep.dir=sweep"]
     code, out, _ = command(*words)
