@@ -344,7 +344,6 @@ WITHOUT_FOLDER = {"folder": None}
         ({"folder": "file"}, "folder="),
         ({"resume": "auto", **WITHOUT_FOLDER}, "so give folder"),
         ({"logger": "wandb", **WITHOUT_FOLDER}, "writes files, so give the run a folder"),
-        ({"overwrite": True, **WITHOUT_FOLDER}, "overwrite=True: has no effect without a folder; give folder, or"),
         ({"low": {"name": "hppo", "gamma": 0.9}, "low.gamma": 0.9}, "low.gamma: given twice, as 0.9 and as 0.9"),
     ],
 )

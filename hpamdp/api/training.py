@@ -81,7 +81,6 @@ def train(
     callbacks = _checked_callbacks(callbacks)
     problem = problem_of(env)
     goes_on = settings.get("resume") == RESUME_AUTO
-    _check_what_needs_runs(settings, output_dir)
     if goes_on:
         settings = {**settings, "resume": None}
     with torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
@@ -90,7 +89,7 @@ def train(
             check_no_sweep(cfg, words)
             config, source = resolve(cfg, words, problem.objects)
             if output_dir is None:
-                _check_no_files(config)
+                _check_without_folder(config, goes_on=goes_on)
             stack.enter_context(memory_errors_explained(config))
             if output_dir is not None:
                 stack.enter_context(_own_folder(output_dir))
@@ -111,26 +110,14 @@ def train(
     return Agent(config, parts.agent, parts.problem, trainer.progress(), trainer.recorder.metrics.rows())
 
 
-def _check_what_needs_runs(settings: Mapping[str, Any], folder: Path | None) -> None:
-    """Refuse settings about the run in a folder, or about a saved run, if there is none.
+def _check_without_folder(config: Config, *, goes_on: bool) -> None:
+    """Refuse what needs a folder, for a run without one.
 
     Raises:
-        ConfigError: there is such a setting.
+        ConfigError: the run has a logger that writes files, or is to go on with the run in a folder.
     """
-    if folder is None and settings.get("resume") == RESUME_AUTO:
+    if goes_on:
         raise ConfigError("resume=auto: goes on with the run in a folder, so give folder")
-    if folder is None and settings.get("overwrite") is True:
-        raise ConfigError("overwrite=True: has no effect without a folder; give folder, or leave it out")
-    if settings.get("trust") is True and settings.get("resume") is None:
-        raise ConfigError("trust=True: has no effect without a saved run; give resume, or leave it out")
-
-
-def _check_no_files(config: Config) -> None:
-    """Refuse a logger that writes files, for a run without a folder.
-
-    Raises:
-        ConfigError: there is such a logger.
-    """
     if config.logger.name != "csv":
         raise ConfigError(f"{config.logger}: writes files, so give the run a folder")
 

@@ -242,8 +242,8 @@ def completed(line: CommandLine, conf: Path) -> CommandLine:
     """Add what the words stand for: a folder's experiments, the choices of globs, and the sweep's folder.
 
     Raises:
-        ConfigError: a glob matches nothing. Or the experiments of a sweep have different folders, or choose other
-            problems than the command line.
+        ConfigError: a glob matches nothing. Or the experiments of a sweep have different folders, or a word chooses
+            their problem.
     """
     line = _with_globs_written_out(_with_experiments_of_a_folder(line, conf), conf)
     return line.with_words(_sweep_folder(line, conf))
@@ -286,33 +286,26 @@ def _sweep_folder(line: CommandLine, conf: Path) -> list[str]:
     Hydra reads a sweep's folder from the config without swept groups, so from none of the experiments.
 
     Raises:
-        ConfigError: they name different ones, or one chooses another problem than the command line, under whose name
-            its runs would be saved.
+        ConfigError: they name different ones. Or a word chooses the problem, although the folders of runs are named
+            after those of the experiments.
     """
     given = line.given()
-    experiments, env = given.get("experiment"), given.get("env")
+    experiments = given.get("experiment")
     if experiments is None or not (line.is_multirun and experiments.is_discrete_sweep()):
         return []
-    try:
-        with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-            default, *composed = (
-                hydra.compose("config", [*choice, *line.search_path], return_hydra_config=True).hydra
-                for choice in ([], *([each] for each in written_out(experiments)))
-            )
-    except (HydraException, OmegaConfBaseException):
-        return []  # which Hydra will report
-    if env is not None:
-        allowed = {default.runtime.choices.env, *(word.partition("=")[2] for word in written_out(env))}
-        for choice, own in zip(written_out(experiments), composed, strict=True):
-            problem = own.runtime.choices.env
-            if problem not in allowed:
-                raise ConfigError(
-                    f"{env.input_line}: {choice} chooses env={problem} itself; leave {env.input_line} out"
-                )
+    if "env" in given:
+        raise ConfigError(f"{given['env'].input_line}: the experiments of a sweep choose env themselves; leave it out")
     if "hydra.sweep.dir" in given:
         return []
-    settings: list[Any] = [OmegaConf.to_container(own.sweep, resolve=False) for own in composed]
-    folders = list(dict.fromkeys(each["dir"] for each in settings))
+    folders: dict[str, None] = {}
+    try:
+        with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+            for choice in written_out(experiments):
+                cfg = hydra.compose("config", [choice, *line.search_path], return_hydra_config=True)
+                settings: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
+                folders[settings["dir"]] = None
+    except (HydraException, OmegaConfBaseException):
+        return []  # which Hydra will report
     if len(folders) > 1:
         different = f"their sweeps have different folders, {' and '.join(folders)}"
         raise ConfigError(f"{experiments.input_line}: {different}; set hydra.sweep.dir")
