@@ -75,6 +75,14 @@ def test_the_statistics_of_rewards_are_saved_and_restored():
     assert all(torch.equal(column, one.env_state()[name]) for name, column in other.env_state().items())
 
 
+def test_a_reward_that_comes_once_in_a_long_episode_is_clipped_only_by_the_limit_that_is_given():
+    for clip, least in ((10.0, 10.0), (100.0, 15.0)):
+        scaling = RewardScaling(1, 0.9, clip)
+        for reward in [0.0] * 399 + [1.0]:
+            seen = scaling.scaled(np.array([reward]), np.ones(1, bool))
+        assert least <= seen[0] <= clip
+
+
 @pytest.mark.parametrize("reward", [float("inf"), float("nan"), 1e300])
 def test_a_reward_that_cannot_be_scaled_is_refused(reward):
     scaling = RewardScaling(2, 0.9)

@@ -137,7 +137,7 @@ class GymnasiumEnv(PAMDPEnv):
         self.observation_entries = self._copies.observations.entries(2 * self._copies.layout.num_bounded)
         self.bounds_place = self._copies.layout.dim if self._copies.layout.num_bounded else None
         gamma = options.reward_scaling
-        self._reward_scaling = None if gamma is None else RewardScaling(num_envs, gamma)
+        self._reward_scaling = None if gamma is None else RewardScaling(num_envs, gamma, options.reward_clip)
         if gamma is not None:
             self.result_keys = (_SUCCESS, _RETURN)
         self._make_specs()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from pydantic import NonNegativeInt, PositiveInt
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
 from hpamdp.cards import ProblemCard
 from hpamdp.env.facts import SOURCE_SETTINGS, ProblemFacts, ProblemOptions
@@ -67,6 +67,11 @@ class GymnasiumOptions(Settings):
     """Divide rewards in training by the running standard deviation of the return with this discount.
 
     If null, rewards are not scaled.
+    """
+    reward_clip: PositiveFloat = 10.0
+    """Largest absolute value of a scaled reward.
+
+    A reward that comes once in an episode of T steps is about sqrt(T) deviations. A lower limit hides how large it is.
     """
     out_of_bounds: OutOfBounds = "refuse"
     """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""

@@ -129,11 +129,12 @@ class RewardScaling:
 
     Differs from the source:
     - a return starts again at 0 with every episode, also after a time limit;
-    - a deviation below 1e-6 counts as 1, and scaled rewards are clipped to [-10, 10].
+    - a deviation below 1e-6 counts as 1, and scaled rewards are clipped.
 
     Args:
         num: number of environments.
         gamma: discount of the return.
+        clip: largest absolute value of a scaled reward.
 
     Attributes:
         statistics: of all discounted returns so far.
@@ -141,11 +142,12 @@ class RewardScaling:
         is_off: whether rewards stay as they are, as in evaluations.
     """
 
-    def __init__(self, num: int, gamma: float) -> None:
+    def __init__(self, num: int, gamma: float, clip: float = _CLIP) -> None:
         self.statistics = RunningStatistics(1, "return")
         self.totals = np.zeros(num)
         self.is_off = False
         self._gamma = gamma
+        self._clip = clip
         self._returns = np.zeros(num)
 
     def begin(self, is_reset: np.ndarray) -> None:
@@ -172,7 +174,7 @@ class RewardScaling:
             self._returns = np.where(is_stepped, self._gamma * self._returns + rewards, self._returns)
             self.statistics.update(self._returns[is_stepped, None])
         deviation = float(np.sqrt(self.statistics.var[0]))
-        return (rewards / (deviation if deviation > _SMALLEST else 1.0)).clip(-_CLIP, _CLIP)
+        return (rewards / (deviation if deviation > _SMALLEST else 1.0)).clip(-self._clip, self._clip)
 
 
 class RunningStatistics(RunningMeanStd):
