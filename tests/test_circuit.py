@@ -10,7 +10,6 @@ import pytest
 import torch
 from batched_players import action, random_player, restart
 from scipy.optimize import minimize
-from test_batched_kernels import play as compare_with_rules
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
@@ -93,7 +92,7 @@ def act(env: CircuitEnv, number: Tensor | int, angle: Tensor | float = 0.0, opti
 
 @pytest.mark.parametrize("task", TASKS)
 def test_random_circuits_score_as_a_simulator_of_tensor_products_says(task):
-    env = CircuitEnv(40, task=task, seed=3)
+    env = CircuitEnv(40, task=task, seed=3, observe_depth=True)
     env.reset()
     targets = targets_of(env)
     n, limit = TASK_OF[task].n, TASK_OF[task].depth
@@ -117,6 +116,8 @@ def test_random_circuits_score_as_a_simulator_of_tensor_products_says(task):
             made = reading[keys.OBSERVATION][row, : 2 * env.design.num_numbers].numpy()
             real, imaginary = made.reshape(2, -1, env.design.num_columns)
             np.testing.assert_allclose(real + 1j * imaginary, circuit.operator[:, : real.shape[1]], atol=1e-5)
+            depths = limit * reading[keys.OBSERVATION][row, 4 * env.design.num_numbers :]
+            assert depths.tolist() == pytest.approx(circuit.depths, abs=1e-4)
     assert all(has_ended)
 
 
@@ -166,10 +167,8 @@ def test_a_circuit_without_gates_has_the_known_score(task, mean):
 
 
 @pytest.mark.parametrize("gate_set", ["choose", "superconducting", "ion"])
-def test_the_kernel_does_what_the_rules_say_of_native_gates(gate_set):
+def test_all_tensors_of_native_gates_are_as_the_specs_say(gate_set):
     check_env_specs(CircuitEnv(3, task="bell", gate_set=gate_set, oracle=True), return_contiguous=True)
-    env = CircuitEnv(500, task="random_state", gate_set=gate_set, reward="progress", seed=3, first_env=2)
-    assert compare_with_rules(env, 12, 1e-5)[1] <= 3
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -187,7 +186,6 @@ def test_learners_see_the_sources_actions_and_observations(task):
 @pytest.mark.parametrize(("task", "floor"), [("random_state", None), ("toffoli", None), ("toffoli", 0.1)])
 def test_gain_is_how_much_the_final_score_exceeds_the_floor_and_never_negative(task, floor):
     gaining = {"task": task, "reward": "gain", "floor": floor, "max_steps": 3}
-    assert compare_with_rules(CircuitEnv(200, **gaining), 6, 1e-5)[1] <= 3
     final, gain = CircuitEnv(400, task=task, max_steps=3), CircuitEnv(400, **gaining)
     returns = []
     for env in (final, gain):
@@ -207,7 +205,6 @@ def test_gain_is_how_much_the_final_score_exceeds_the_floor_and_never_negative(t
 @pytest.mark.parametrize("task", CIRCUITS)
 def test_training_may_begin_within_the_known_circuit_and_evaluation_begins_without_gates(task):
     env = CircuitEnv(200, task=task, begin="known")
-    assert compare_with_rules(env, 3, 1e-5)[1] == 0
     circuit = CIRCUITS[task]
     begun = env.reset()[keys.OBSERVATION]
     made = Circuit(TASK_OF[task].n)
@@ -225,7 +222,6 @@ def test_training_may_begin_within_the_known_circuit_and_evaluation_begins_witho
 
 def test_training_begins_with_one_gate_less_of_the_known_circuit_after_as_many_episodes_as_are_said():
     env = CircuitEnv(2000, task="ghz", begin="known", begin_episodes=2)
-    assert compare_with_rules(CircuitEnv(100, task="ghz", begin="known", begin_episodes=2), 12, 1e-5)[1] == 0
     circuits = env.design.beginnings[0]
     for episode in range(9):
         env.reset()
@@ -280,7 +276,6 @@ def test_the_closing_table_has_the_score_of_no_gates_for_the_target_at_hand():
 
 @pytest.mark.parametrize("task", ["random_state", "toffoli"])
 def test_training_may_begin_as_many_gates_from_the_target_as_are_said_and_evaluation_begins_without_gates(task):
-    assert compare_with_rules(CircuitEnv(60, task=task, begin="near_target"), 3, 1e-5)[1] == 0
     env = CircuitEnv(60, task=task, begin="near_target", begin_gates=1)
     env.reset()
     made, target = (matrices.to(torch.complex128) for matrices in rules.circuit_and_target(env.state, env.design))

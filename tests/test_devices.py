@@ -27,10 +27,8 @@ from hpamdp.env.batched_env import Action
 from hpamdp.env.boatdock import episode
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
-from hpamdp.env.circuit.environment import CircuitEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
-from hpamdp.env.office.environment import OfficeEnv
 from hpamdp.policies.low_level.hyar import LATENT
 from hpamdp.policies.low_level.paddpg import SCORES
 from hpamdp.policies.shared.gradients import gradients_of
@@ -116,9 +114,9 @@ def test_losses_and_their_gradients_stay_on_their_device(name):
         assert {gradient.device for gradient in gradients if gradient is not None} == {META}
 
 
-@pytest.mark.parametrize("problem", [CatchPointEnv, CircuitEnv, HardMoveEnv, MovingEnv, OfficeEnv, SlidingEnv])
+@pytest.mark.parametrize("problem", [CatchPointEnv, HardMoveEnv, MovingEnv, SlidingEnv])
 def test_rules_stay_on_their_device(problem):
-    # Not those of Goal and Platform, whose ticks go on for as long as a tensor says so.
+    # Not those of Goal, whose ticks go on for as long as a tensor says so.
     env = problem(4)
     if problem is HardMoveEnv:
         env.motions = env.motions.to(META)

@@ -17,6 +17,7 @@ from torchrl.envs.utils import check_env_specs
 
 import hpamdp
 from hpamdp import keys
+from hpamdp.env import counter_rng
 from hpamdp.env.decisions import with_decisions
 from hpamdp.env.office import player, rules
 from hpamdp.env.office.environment import OfficeEnv
@@ -140,6 +141,32 @@ def test_moves_from_anywhere_follow_the_rules_step_by_step_in_float64(chooses_go
         assert state.outcome.tolist() == [int(is_over) for _, is_over in expected]
         met |= {each for each, _ in expected}
         assert (state.steps > 0).all()
+    assert met == {-2.0, -1.0, 0.0, 1000.0}
+
+
+@pytest.mark.parametrize("chooses_goal", [False, True])
+def test_the_kernel_moves_as_the_rules_say(chooses_goal):
+    num, slip, seed = 2_000, 0.3, 5
+    env = OfficeEnv(num, slip=slip, chooses_goal=chooses_goal, seed=seed)
+    td, environment = env.reset(), torch.arange(num, dtype=torch.int32)
+    generator, met = torch.Generator().manual_seed(1), set()
+    for _ in range(12):
+        # Near a place every time, so that all is met.
+        near = torch.tensor(rules.PLACES)[torch.randint(3, (num,), generator=generator)]
+        x, y = (near + 0.2 * torch.rand(num, 2, generator=generator) - 0.1).clamp(0.02, 0.98).unbind(-1)
+        env.state = before = env.state._replace(x=x, y=y)
+        rng = counter_rng.rng_key(counter_rng.seed_tensor(seed), counter_rng.NOISE, environment, before.episode)
+        taken = env.rand_action(td)
+        discrete, option = taken[keys.DISCRETE], taken[keys.OPTION] if chooses_goal else None
+        length = taken[keys.PARAMETERS].gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
+        slips = counter_rng.uniform(rng, before.steps) < slip
+        expected, reward = rules.act(before, discrete, length, slips, option)
+        goes_on = before.outcome == rules.ON_THE_WAY
+        td = env.step(taken)["next"]
+        got = [*env.state, td[keys.REWARD].squeeze(-1)]
+        same = torch.stack([torch.isclose(*pair) for pair in zip(got, [*expected, reward], strict=True)]).all(0)
+        assert (~same & goes_on).sum() <= 1, "where a threshold is met to within rounding"
+        met |= {*reward[goes_on].tolist()}
     assert met == {-2.0, -1.0, 0.0, 1000.0}
 
 

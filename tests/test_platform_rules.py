@@ -1,104 +1,32 @@
-"""Actions in PlatformEnv follow the published rules, which are written down here for one agent, tick by tick."""
+"""Actions in PlatformEnv follow the published rules, which a study writes down for one agent, tick by tick."""
 
 from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from platform_players import COURSE, act, action, place, random_action, random_columns, rule
+from scripts import load_script
 from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.platform.environment import PlatformEnv
-from hpamdp.env.platform.rules import ARRIVED, FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN
+from hpamdp.env.platform.rules import ARRIVED, FELL, LEAP, MET_ENEMY, ON_THE_WAY
 
 NUMBERS = 512  # random numbers of each action
+REPLAY = Path(__file__).resolve().parent.parent / "experiments" / "domains" / "replay.py"
 
 
-class ScalarCourse:
-    """The published rules for one agent, tick by tick and in double precision."""
-
-    PLATFORMS = ((0.0, 250.0), (475.0, 750.0), (985.0, 1035.0))
-    TOP, WIDTH, HEIGHT, TICK = 40.0, 20.0, 30.0, 0.05
-
-    def __init__(self, x: float, speed: float, enemy_x: float, enemy_speed: float) -> None:
-        self.x = x
-        self.y = self.TOP
-        self.speed = speed
-        self.rise = 0.0
-        self.enemies = [[230.0, -30.0], [730.0, -30.0]]
-        self.enemies[x > 475.0] = [enemy_x, enemy_speed]
-
-    @property
-    def enemy(self) -> list[float]:
-        return self.enemies[self.x > 475.0]
-
-    def stands(self) -> bool:
-        return self.y == self.TOP and any(left - self.WIDTH <= self.x <= right for left, right in self.PLATFORMS)
-
-    def act(self, discrete: int, parameter: float, numbers: list[float]) -> tuple[float, int]:
-        """Return reward and outcome.
-
-        `numbers` are normal: two for a jump, then one for the agent and one for the enemy each tick.
-        """
-        start = self.x
-        tick = 0
-        time_left = 1.0
-        while True:
-            self._choose(discrete, parameter, numbers, tick)
-            self._patrol(numbers[3 + 2 * tick])
-            self._move()
-            outcome = self._outcome()
-            tick = tick + 1
-            time_left = time_left - self.TICK
-            if outcome != ON_THE_WAY or (time_left <= 0.0 if discrete == RUN else self.stands()):
-                return (self.x - start) / COURSE, outcome
-
-    def _choose(self, discrete: int, parameter: float, numbers: list[float], tick: int) -> None:
-        on_ground = self.stands()
-        across, up = 0.0, -9.8
-        if on_ground and discrete == RUN:
-            across = parameter / self.TICK
-            up = 0.0
-        elif on_ground:
-            rise = 35.0 if discrete == HOP else 25.0
-            change = min(max(parameter / (2.0 * rise / 9.8 + 1.0) - self.speed, -600.0), 200.0 - rise)
-            across = (change - abs(numbers[0])) / self.TICK
-            up = (rise - abs(numbers[1])) / self.TICK
-        self.speed += min(max(across, -600.0), 600.0) * self.TICK - abs(0.025 * numbers[2 + 2 * tick])
-        self.speed = min(max(self.speed, 0.0), 70.0 if on_ground else 100.0)
-        self.rise = min(max(self.rise + min(max(up, -4000.0), 4000.0) * self.TICK, -200.0), 200.0)
-
-    def _patrol(self, number: float) -> None:
-        enemy = self.enemy
-        left = self.PLATFORMS[self.x > 475.0][0]
-        right = self.PLATFORMS[self.x > 475.0][1] - self.WIDTH
-        if not left < enemy[0] < right:
-            enemy[1] = -enemy[1]
-        enemy[1] = min(max(enemy[1] + 0.025 * number, -30.0), 30.0)
-        enemy[0] = min(max(enemy[0] + enemy[1] * self.TICK, left), right)
-
-    def _move(self) -> None:
-        self.x = min(max(self.x + self.speed * self.TICK, 0.0), COURSE)
-        self.y += self.rise * self.TICK
-        self.speed *= 0.99
-        for left, right in self.PLATFORMS:
-            if left - self.WIDTH < self.x < right and -self.HEIGHT < self.y < self.TOP:
-                self.speed = 0.0
-                aside = left - self.WIDTH if self.x < left else right if self.x > right - self.WIDTH else None
-                if aside is not None and abs(self.x - aside) < self.TOP - self.y:
-                    self.x = aside
-                else:
-                    self.y = self.TOP
-                    self.rise = 0.0
-
-    def _outcome(self) -> int:
-        if self.x >= COURSE:
-            return ARRIVED
-        if any(abs(self.x - x) < self.WIDTH and abs(self.y - self.TOP) < self.HEIGHT for x, _ in self.enemies):
-            return MET_ENEMY
-        return FELL if self.y < self.TOP else ON_THE_WAY
+@pytest.fixture(scope="module")
+def scalar_course():
+    """Return the published rules for one agent, which the study compares with recordings of the published code."""
+    load_script(REPLAY)  # it finds the adapters
+    return importlib.import_module("adapters.platform").ScalarCourse
 
 
 def numbers_of_next_action(env: PlatformEnv, seed: int) -> list[list[float]]:
@@ -111,7 +39,7 @@ def numbers_of_next_action(env: PlatformEnv, seed: int) -> list[list[float]]:
 
 
 def compare(
-    env: PlatformEnv, courses: list[ScalarCourse], actions: TensorDict, seed: int, noise: float
+    env: PlatformEnv, courses: list[Any], actions: TensorDict, seed: int, noise: float
 ) -> tuple[Tensor, list[int]]:
     """Take one action in the environments and by the published rules, and compare the results where no episode is over.
 
@@ -140,7 +68,7 @@ def compare(
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_actions_from_anywhere_follow_the_published_rules(noise):
+def test_actions_from_anywhere_follow_the_published_rules(noise, scalar_course):
     num = 500
     seed = 5
     generator = torch.Generator().manual_seed(1)
@@ -148,20 +76,20 @@ def test_actions_from_anywhere_follow_the_published_rules(noise):
     place(env, **random_columns(num, generator))
     state = env.env_state()
     columns = (state[name].tolist() for name in ("x", "speed", "enemy_x", "enemy_speed"))
-    courses = [ScalarCourse(*column) for column in zip(*columns, strict=True)]
+    courses = [scalar_course(*column) for column in zip(*columns, strict=True)]
     outcomes = []
     for _ in range(3):
         outcomes += compare(env, courses, random_action(env, generator), seed, noise)[1]
     assert min(outcomes.count(outcome) for outcome in (ON_THE_WAY, ARRIVED, FELL, MET_ENEMY)) > 50
 
 
-def test_episodes_from_start_to_end_follow_the_published_rules():
+def test_episodes_from_start_to_end_follow_the_published_rules(scalar_course):
     num = 100
     seed = 2**40 + 7
     generator = torch.Generator().manual_seed(2)
     env = PlatformEnv(num, seed=seed)
     observation = env.reset()[keys.OBSERVATION]
-    courses = [ScalarCourse(0.0, 0.0, 230.0, -30.0) for _ in range(num)]
+    courses = [scalar_course(0.0, 0.0, 230.0, -30.0) for _ in range(num)]
     ends = []
     for _ in range(12):
         careless = torch.rand(num, 1, generator=generator) < 0.1

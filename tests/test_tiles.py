@@ -9,16 +9,12 @@ from torchrl.envs import EnvBase
 
 import hpamdp
 from hpamdp import keys
-from hpamdp.env.tiles import tiles_of
 
 
-def test_tiles_say_where_a_place_is():
-    x, y = torch.tensor([[0.5, 0.98], [0.075, 0.31]], dtype=torch.float64)
-    of_x, of_y = tiles_of(x, y, 20).split(20, -1)
-    torch.testing.assert_close(of_x[0, 9:11], torch.full((2,), 0.5, dtype=torch.float64))
-    assert of_y[0, 1].item() == pytest.approx(1.0)
-    middles = (torch.arange(20, dtype=torch.float64) + 0.5) / 20
-    assert (of_y @ middles).tolist() == pytest.approx([0.075, 0.31])
+def tiles_of(place: Tensor, num: int) -> Tensor:
+    """Return the tiles of x, then those of y, of places `[N, 2]`: 1 in the middle of a tile, 0 in that of the next."""
+    middle = (torch.arange(num) + 0.5) / num
+    return (1.0 - num * (place.unsqueeze(-1) - middle).abs()).clamp(min=0.0).flatten(1)
 
 
 def after_random_steps(env: EnvBase) -> Tensor:
@@ -32,6 +28,6 @@ def test_tiles_stand_behind_what_is_observed_anyway(problem):
     seen, expected = (after_random_steps(each) for each in (env, plain))
     assert (env.position[:, 0] - env.position[:, 1]).abs().min() > 0.01
     assert torch.equal(seen[:, :4], expected)
-    torch.testing.assert_close(seen[:, 4:], tiles_of(*env.position.unbind(-1), 20))
+    torch.testing.assert_close(seen[:, 4:], tiles_of(env.position, 20))
     assert env.observation_names[3:6] == (plain.observation_names[3], "x_0", "x_1")
     assert env.observation_names[-1] == "y_19" and env.observation_spec[keys.OBSERVATION].is_in(seen)

@@ -121,6 +121,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     - if a subclass overrides one of the three;
     - after the first action whose parameters require gradients.
 
+    `KernelEnv` is for problems whose rules are a kernel alone.
+
     The scripted action of `oracle` is always a tensor function. It is one plan, or one for each option that the agent
     chooses (P plans).
 
@@ -226,12 +228,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         return ()
 
     def _use_kernel(self) -> None:
-        """Let the kernel move the environments on the CPU, unless rules are compiled or replaced by a subclass."""
-        is_on_cpu = self.device is None or self.device.type == "cpu"
-        if self.row_kernel is None or not is_on_cpu or self._is_compiled:
-            return
-        owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
-        if any(getattr(type(self), name) is not getattr(owner, name) for name in ("start", "act", "observe")):
+        """Let the kernel move the environments, if it may."""
+        if self.row_kernel is None or not self._may_use_kernel():
             return
         bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
         state = self._columns
@@ -242,12 +240,22 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             num_columns=(len(state._fields) - num_integers, num_integers),
             reading_dims=(len(self.observation_names), len(self.extra_names)),
             parameter_dims=self.parameter_dims,
-            bounds=torch.stack([bounds.low.reshape(-1), bounds.high.reshape(-1)]).numpy(),
+            bounds=torch.stack([bounds.low.reshape(-1), bounds.high.reshape(-1)]).numpy(force=True),
             settings=[self.max_steps, len(self.option_names) if self._chooses else 0, *self.kernel_settings()],
             first_env=int(self._environment[0]),
         )
         self.rows.set_seed(int(self._seed), self._streams)
         self._state = state
+
+    def _may_use_kernel(self) -> bool:
+        """Return whether the tensors are on the CPU, and rules neither compiled nor replaced by a subclass."""
+        owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
+        are_its_own = all(getattr(type(self), name) is getattr(owner, name) for name in ("start", "act", "observe"))
+        return self._is_on_cpu and not self._is_compiled and are_its_own
+
+    @property
+    def _is_on_cpu(self) -> bool:
+        return self.device is None or self.device.type == "cpu"
 
     def leave_kernel(self) -> None:
         """Let the tensor functions move the environments from here on."""
@@ -258,14 +266,19 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         """The columns; a kernel changes them in place."""
         if self.rows is None:
             return self._columns
-        return from_arrays(type(self._columns), (*self.rows.floats, *self.rows.integers))
+        shared = self._shared_columns(self.rows)
+        return shared if self._is_on_cpu else type(shared)(*(column.to(self.device) for column in shared))
 
     @_state.setter
     def _state(self, state: EpisodeState) -> None:
         if self.rows is None:
             self._columns = state
         else:
-            overwrite(self._state, state)
+            overwrite(self._shared_columns(self.rows), state)
+
+    def _shared_columns(self, rows: KernelRows) -> EpisodeState:
+        """Return the kernel's columns, which share its memory."""
+        return from_arrays(type(self._columns), (*rows.floats, *rows.integers))
 
     @abstractmethod
     def start(self, episode: Tensor, rng: RngKey) -> EpisodeState:
@@ -567,7 +580,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         given = self._given_columns(tensordict)
         results = None
         if self.rows is not None:
-            results = self.rows.restart(mask.numpy())
+            results = self.rows.restart(mask.numpy(force=True))
         else:
             self._state = self._pure_reset(self._state, mask)
         if given:
@@ -703,6 +716,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             leaves[name] = torch.from_numpy(results.extras[number, place]).unsqueeze(-1).to(dtype)
         if has_reward:
             leaves[keys.REWARD] = torch.from_numpy(results.rewards).unsqueeze(-1)
+        if not self._is_on_cpu:
+            leaves = {name: leaf.to(self.device) for name, leaf in leaves.items()}
         # The checks of the constructor would take longer than a hundred rows.
         return self._with_knowledge(TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=self.device))
 
@@ -719,5 +734,34 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         return seen
 
 
+class KernelEnv(BatchedEnv[EpisodeState]):
+    """A `BatchedEnv` whose rules are its `row_kernel` alone, which runs on the CPU whatever the device.
+
+    Actions move to the CPU, and what is observed to the device. Nothing has gradients.
+    """
+
+    state_type: type[EpisodeState]
+    num_columns: tuple[int, int]  # of the state: float32 columns, which come first, and int32 columns
+
+    def start(self, episode: Tensor, rng: RngKey) -> EpisodeState:
+        """Return columns of zeros, which the first reset replaces."""
+        zeros, (num_floats, num_integers) = torch.zeros_like(episode), self.num_columns
+        return self.state_type(*[zeros.float()] * num_floats, *[zeros] * (num_integers - 1), episode)
+
+    def act(self, state: EpisodeState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[EpisodeState, Tensor]:
+        """Refuse: the kernel acts."""
+        raise NotImplementedError
+
+    def observe(self, state: EpisodeState) -> Tensor:
+        """Refuse: the kernel observes."""
+        raise NotImplementedError
+
+    def _may_use_kernel(self) -> bool:
+        return True
+
+    def leave_kernel(self) -> None:
+        """Do nothing: the kernel has the rules."""
+
+
 def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
+    return tensor.detach().cpu().contiguous().numpy()

@@ -10,21 +10,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from hpamdp.env.kernels import HALF, ONE, ZERO, part
 
 
-def tiles_of(x: Tensor, y: Tensor, tiles: int) -> Tensor:
-    """Return the tiles of x, then those of y, `[N, 2 tiles]`, for coordinates `[N]`."""
-    middle = torch.arange(tiles, dtype=x.dtype, device=x.device) + 0.5
-    return torch.cat([(1.0 - (at.unsqueeze(-1) * tiles - middle).abs()).clamp(min=0.0) for at in (x, y)], -1)
-
-
 @part
 def write_tiles(x: Any, y: Any, tiles: Any, observation: Any, first: Any) -> None:
-    """Write what `tiles_of` returns for one row into its observation, from the entry `first` on."""
+    """Write the tiles of x, then those of y, into a row's observation, from the entry `first` on."""
     for tile in range(tiles):
         middle = np.float32(tile) + HALF
         observation[first + tile] = max(ONE - abs(x * np.float32(tiles) - middle), ZERO)
@@ -37,5 +29,5 @@ def bounds_with_tiles(num: int, tiles: int) -> tuple[Sequence[float], Sequence[f
 
 
 def tile_names(tiles: int) -> tuple[str, ...]:
-    """Return the names of the entries of `tiles_of`."""
+    """Return the names of the tiles, in their order."""
     return tuple(f"{axis}_{number}" for axis in "xy" for number in range(tiles))

@@ -18,13 +18,12 @@ from torchrl.data import Bounded, TensorSpec
 from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.base import Metric
-from hpamdp.env.batched_env import Action, BatchedEnv
+from hpamdp.env.batched_env import KernelEnv
 from hpamdp.env.circuit import gates, kernel, rules
 from hpamdp.env.circuit.known_circuits import CIRCUITS
 from hpamdp.env.circuit.options import CARDS, NATIVE_SETS, CircuitOptions
 from hpamdp.env.circuit.oracle import CircuitOracle, beginnings, best_scores
 from hpamdp.env.circuit.rules import TASK_OF, CircuitState, Design
-from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry
 from hpamdp.settings import SettingError
@@ -45,7 +44,7 @@ _PUBLISHED = {
 _NOTHING = {"random_state": 0.25, "random_unitary": 0.2187}
 
 
-class CircuitEnv(BatchedEnv[CircuitState]):
+class CircuitEnv(KernelEnv[CircuitState]):
     """Design `num_envs` circuits of quantum gates at once.
 
     Action leaves:
@@ -95,11 +94,12 @@ class CircuitEnv(BatchedEnv[CircuitState]):
             reward=options.reward,
             floor=options.floor,
             observes_depth=options.observe_depth,
-            max_steps=self.max_steps,
             beginnings=beginnings(options.task) if options.begin == "known" else None,
             begin_episodes=options.begin_episodes if options.begin == "known" else 0,
             begin_gates=options.begin_gates if options.begin == "near_target" else 0,
         )
+        self.state_type = self.design.state_type
+        self.num_columns = len(self.design.entry_names) + 3, task.n + 5
         depths = [f"depth_{wire}" for wire in range(task.n)] if options.observe_depth else []
         self.observation_names = (*self.design.entry_names, *depths)
         of_each = [*zip(*self.design.gate_sets, strict=True)]
@@ -144,22 +144,6 @@ class CircuitEnv(BatchedEnv[CircuitState]):
         """Return the spec of similarity and cost, float32 `[N, 1]`."""
         highest = self.max_steps if name == _COST else 1.0
         return Bounded(0.0, highest, shape=(self.num_envs, 1), device=self.device, dtype=torch.float32)
-
-    def start(self, episode: Tensor, rng: RngKey) -> CircuitState:
-        """Return circuits without gates or, in training, what `begin` says."""
-        return rules.start(episode, rng, self.design, is_training=self._streams[0] == counter_rng.TRAINING)
-
-    def act(self, state: CircuitState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[CircuitState, Tensor]:
-        """Return the states after one gate, and the rewards `[N]`."""
-        return rules.act(state, action.option, action.discrete, action.parameters.squeeze(-1), self.design)
-
-    def observe(self, state: CircuitState) -> Tensor:
-        """Return the observations `[N, D]`."""
-        return rules.observe(state, self.design)
-
-    def extras(self, state: CircuitState) -> Sequence[Tensor]:
-        """Return similarity and cost."""
-        return state.similarity, state.cost
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `similarity`, `cost`, their difference `score`, and `success` `[M]` of circuits."""

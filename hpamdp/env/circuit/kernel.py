@@ -1,7 +1,6 @@
 """The rules of circuit design for one row, and the loop over all rows that Numba compiles.
 
-It states what `rules` says of columns, for the CPU alone; a test compares the two. A gate changes the amplitudes in
-pairs, by the bits of their indices, where the rules multiply matrices.
+A gate changes the amplitudes in pairs, by the bits of their indices.
 """
 
 from __future__ import annotations
@@ -95,7 +94,7 @@ def _apply(entries: Any, kind: Any, flipped: Any, control: Any, angle: Any, num_
 
 @part
 def _similarity(entries: Any, num_rows: Any, num_columns: Any) -> Any:
-    """Return how well the circuit of a row matches its target: `rules.similarity`."""
+    """Return how well the circuit of a row matches its target; see `rules.similarity`."""
     num = num_rows * num_columns
     if num_columns == 1:
         real, imaginary = ZERO, ZERO
@@ -129,13 +128,13 @@ def _similarity_without_gates(entries: Any, num_rows: Any, num_columns: Any) -> 
 
 @part
 def _depth_cost(depth: Any, limit: Any) -> Any:
-    """Return the cost of a depth: `rules.depth_cost`."""
+    """Return the cost of a depth: a third of the limit is free."""
     return max(_F(depth) - limit / _F(3.0), ZERO) / (_F(1.5) * limit)
 
 
 @part
 def _draw_target(entries: Any, bits: Any, step: Any, num_rows: Any, num_columns: Any, drawn: Any) -> None:
-    """Write a random target into a row: `rules.random_target`.
+    """Write a random target into a row; see `rules.random_target`.
 
     Args:
         drawn: room for the real and imaginary parts, float64 `[2, 8, 8]`.
@@ -175,7 +174,11 @@ def _below(uniform: Any, num: Any) -> Any:
 
 @part
 def _begin_near_target(entries: Any, bits: Any, step: Any, settings: Any, num_rows: Any, num_columns: Any) -> None:
-    """Write a circuit near its target into a row without gates: `rules.near_target`."""
+    """Write a circuit near its target into a row without gates.
+
+    The circuit is its target after 0 to `begin_gates` random gates with random angles. The same gates with the opposite
+    angles, the last one first, make the target again. If no gate is drawn, the circuit begins without gates.
+    """
     num, num_gates = num_rows * num_columns, int(settings[NUM_GATES]) - 1
     number = _below(kernels.uniform(bits, step, rules.NEAR_TARGET), int(settings[BEGIN_GATES]) + 1)
     if number == 0:
@@ -192,7 +195,11 @@ def _begin_near_target(entries: Any, bits: Any, step: Any, settings: Any, num_ro
 
 @part
 def _start(entries: Any, integers: Any, row: Any, bits: Any, step: Any, settings: Any, drawn: Any) -> None:
-    """Begin a circuit in a row: `rules.start`."""
+    """Begin a circuit in a row, without gates or, in training, as the design says.
+
+    A later one of its `beginnings` lacks fewer gates. With `begin_episodes`, training comes to the earlier ones
+    gradually.
+    """
     num_wires, num_columns, limit = int(settings[WIRES]), int(settings[COLUMNS]), _F(settings[DEPTH])
     num_rows = 1 << num_wires
     num = num_rows * num_columns
@@ -230,7 +237,10 @@ def _start(entries: Any, integers: Any, row: Any, bits: Any, step: Any, settings
 
 @part
 def _act(entries: Any, integers: Any, row: Any, option: Any, action: Any, given: Any, settings: Any) -> Any:
-    """Take an action in a row and return outcome and reward: `rules.act`."""
+    """Take an action in a row and return outcome and reward.
+
+    The option counts at the first action of an episode. A gate stands one level above the highest gate on its wires.
+    """
     num_wires, num_columns, limit = int(settings[WIRES]), int(settings[COLUMNS]), _F(settings[DEPTH])
     num_rows = 1 << num_wires
     num = num_rows * num_columns
@@ -278,7 +288,7 @@ def _act(entries: Any, integers: Any, row: Any, option: Any, action: Any, given:
 
 @part
 def _observe(entries: Any, integers: Any, row: Any, settings: Any, observation: Any) -> None:
-    """Write what is observed of a row: `rules.observe`."""
+    """Write what is observed of a row: circuit and target and, if so set, the wires' depths as parts of the limit."""
     num_wires = int(settings[WIRES])
     num = 4 * (1 << num_wires) * int(settings[COLUMNS])
     for place in range(num):

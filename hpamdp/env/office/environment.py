@@ -15,9 +15,7 @@ from torch import Tensor
 from torchrl.data import Binary, TensorSpec
 
 from hpamdp import keys
-from hpamdp.env import counter_rng
-from hpamdp.env.batched_env import Action, BatchedEnv
-from hpamdp.env.counter_rng import RngKey
+from hpamdp.env.batched_env import KernelEnv
 from hpamdp.env.office import kernel, player, rendering, rules
 from hpamdp.env.office.options import CARDS, GOALS, OfficeOptions
 from hpamdp.env.office.rules import OfficeState
@@ -28,7 +26,7 @@ from hpamdp.env.tiles import bounds_with_tiles, tile_names
 _PLAYER = {"score": 956.4, "success": 1.0}
 
 
-class OfficeEnv(BatchedEnv[OfficeState]):
+class OfficeEnv(KernelEnv[OfficeState]):
     """Fetch coffee and mail and deliver both in `num_envs` offices at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 up, 1 down, 2 left, 3 right; `("action", "parameters")`
@@ -52,6 +50,8 @@ class OfficeEnv(BatchedEnv[OfficeState]):
     parameter_low = rules.PARAMETER_LOW
     parameter_high = rules.PARAMETER_HIGH
     row_kernel = staticmethod(kernel.advance)
+    state_type = OfficeState
+    num_columns = (2, 5)
 
     def _prepare(self) -> None:
         self.observation_names = rules.OBSERVATION_NAMES + tile_names(self.options.tiles)
@@ -64,19 +64,6 @@ class OfficeEnv(BatchedEnv[OfficeState]):
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
         """The lowest and the highest observation, `[4 + 2 tiles]` each."""
         return bounds_with_tiles(len(rules.OBSERVATION_NAMES), self.options.tiles)
-
-    def start(self, episode: Tensor, rng: RngKey) -> OfficeState:
-        """Return the states at the start, with neither coffee nor mail; nothing about them is random."""
-        return rules.start(episode)
-
-    def act(self, state: OfficeState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[OfficeState, Tensor]:
-        """Return the states after one move and the rewards `[N]`."""
-        slips = counter_rng.uniform(rng, state.steps) < self.options.slip
-        return rules.act(state, action.discrete, action.parameters.squeeze(-1), slips, action.option)
-
-    def observe(self, state: OfficeState) -> Tensor:
-        """Return the observations `[N, 4 + 2 tiles]`."""
-        return rules.observe(state, self.options.tiles)
 
     def scripted_action(self, state: OfficeState) -> tuple[Tensor, Tensor]:
         """Return the move and the length of the player that knows the map, `[N, 1]` each, or `[N, 3]` with options."""

@@ -1,6 +1,6 @@
 """The rules of Office for one row, and the loop over all rows that Numba compiles.
 
-It states what `rules` says of columns, for the CPU alone; a test compares the two.
+`rules` states a move for columns, too, because the player that knows the map plans with it. A test compares the two.
 """
 
 from __future__ import annotations

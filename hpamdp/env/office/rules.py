@@ -1,4 +1,4 @@
-"""The rules of Office as pure functions on columns, in the dtype of the state.
+"""The numbers of Office, and a move as pure functions on columns, in the dtype of the state.
 
 Source: the Office domain of PEARL, AAAI 2026, arXiv:2512.20831, with the map, constants and rules of its code.
 
@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 from hpamdp.env.office.options import GOALS
-from hpamdp.env.tiles import tiles_of
 
 UP, DOWN, LEFT, RIGHT = range(4)
 ACTIONS = ("up", "down", "left", "right")
@@ -58,13 +57,6 @@ class OfficeState(NamedTuple):
     steps: Tensor
     outcome: Tensor
     episode: Tensor
-
-
-def start(episode: Tensor) -> OfficeState:
-    """Return the initial states of the episodes with these numbers, int32 `[N]`."""
-    zeros = torch.zeros_like(episode, dtype=torch.float32)
-    none = torch.zeros_like(episode)
-    return OfficeState(zeros + START[0], zeros + START[1], none, none, none, none, episode)
 
 
 def act(
@@ -136,13 +128,3 @@ def goal_in_mind(is_open: Tensor, option: Tensor) -> Tensor:
     """
     is_possible = is_open.gather(-1, option.unsqueeze(-1)).squeeze(-1)
     return torch.where(is_possible, option, is_open.int().argmax(-1))
-
-
-def observe(state: OfficeState, tiles: int = 0) -> Tensor:
-    """Return the observation `[N, 4 + 2 tiles]`.
-
-    It has the entries OBSERVATION_NAMES, scaled to [-1, 1], then x and y again as tiles, see `hpamdp.env.tiles`.
-    """
-    flags = (state.coffee.to(state.x.dtype), state.mail.to(state.x.dtype))
-    seen = 2.0 * torch.stack([state.y, state.x, *flags], -1) - 1.0
-    return torch.cat([seen, tiles_of(state.x, state.y, tiles)], -1)

@@ -13,10 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hpamdp.env import counter_rng
-from hpamdp.env.batched_env import Action, BatchedEnv
-from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.pinball import kernel, maps, rendering, rules
+from hpamdp.env.batched_env import KernelEnv
+from hpamdp.env.pinball import maps, rendering, rules
 from hpamdp.env.pinball.options import CARDS, SOURCE_MAPS, PinballOptions
 from hpamdp.env.pinball.planner import Planner
 from hpamdp.env.pinball.rules import PinballState
@@ -27,7 +25,7 @@ _GRID = 100  # places in a row from which a ball may start anywhere
 _SCRIPTED = {"simple": 9_837.0, "hard": 9_404.0}  # returns of the hand-written player from the start of the map
 
 
-class PinballEnv(BatchedEnv[PinballState]):
+class PinballEnv(KernelEnv[PinballState]):
     """Push a ball into the hole on `num_envs` tables at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 right, 1 up, 2 left, 3 down, 4 none; `("action",
@@ -50,7 +48,9 @@ class PinballEnv(BatchedEnv[PinballState]):
     parameter_dims = rules.PARAMETER_DIMS
     parameter_low = rules.PARAMETER_LOW
     parameter_high = rules.PARAMETER_HIGH
-    row_kernel = staticmethod(kernel.advance)
+    row_kernel = staticmethod(rules.advance)
+    state_type = PinballState
+    num_columns = (4, 3)
     seconds_per_step: ClassVar[float] = 0.04
 
     def _prepare(self) -> None:
@@ -62,7 +62,6 @@ class PinballEnv(BatchedEnv[PinballState]):
         except maps.MapError as error:
             raise SettingError(f"map={self.options.map!r}: {error}") from error
         self.observation_names = rules.OBSERVATION_NAMES + tile_names(self.options.tiles)
-        self._table = rules.make_table(self.map, (self._training_places, self._places), self.device)
 
     @property
     def training_begins_elsewhere(self) -> bool:
@@ -71,7 +70,7 @@ class PinballEnv(BatchedEnv[PinballState]):
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the tiles and the map in numbers."""
-        return kernel.settings_of(self.map, (self._training_places, self._places), self.options.tiles)
+        return rules.settings_of(self.map, (self._training_places, self._places), self.options.tiles)
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
@@ -84,18 +83,6 @@ class PinballEnv(BatchedEnv[PinballState]):
             return {}
         checksum = zlib.crc32(self.map.model_dump_json().encode())
         return {"map_checksum": torch.tensor([checksum], dtype=torch.int64, device=self.device)}
-
-    def start(self, episode: Tensor, rng: RngKey) -> PinballState:
-        """Return states with the balls at rest where episodes begin."""
-        return rules.start(episode, rng, self._table, is_training=self._streams[0] == counter_rng.TRAINING)
-
-    def act(self, state: PinballState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[PinballState, Tensor]:
-        """Return the states after one step and the rewards `[N]`."""
-        return rules.act(state, action.discrete, action.parameters.squeeze(-1), self._table)
-
-    def observe(self, state: PinballState) -> Tensor:
-        """Return the observations `[N, 4 + 2 tiles]`."""
-        return rules.observe(state, self.options.tiles)
 
     def scripted_action(self, state: PinballState) -> tuple[Tensor, Tensor]:
         """Return the action of the hand-written player and its strength, `[N]` each."""

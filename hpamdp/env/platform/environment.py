@@ -6,22 +6,19 @@ Source: Masson, Ranchod & Konidaris 2016, arXiv:1509.01644; see `hpamdp.env.plat
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hpamdp.env import counter_rng
-from hpamdp.env.batched_env import Action, BatchedEnv
-from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.platform import kernel, rendering, rules
+from hpamdp.env.batched_env import KernelEnv
+from hpamdp.env.platform import rendering, rules
 from hpamdp.env.platform.options import CARDS, PlatformOptions
 from hpamdp.env.platform.rules import PlatformState
 
 
-class PlatformEnv(BatchedEnv[PlatformState]):
+class PlatformEnv(KernelEnv[PlatformState]):
     """Cross the platforms in `num_envs` courses at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 run, 1 hop, 2 leap; `("action", "parameters")` float32
@@ -44,7 +41,9 @@ class PlatformEnv(BatchedEnv[PlatformState]):
     parameter_dims = (1, 1, 1)
     parameter_low = (0.0, 0.0, 0.0)
     parameter_high = rules.PARAMETER_HIGH
-    row_kernel = staticmethod(kernel.advance)
+    row_kernel = staticmethod(rules.advance)
+    state_type = PlatformState
+    num_columns = (4, 3)
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the factor on the noise."""
@@ -64,22 +63,6 @@ class PlatformEnv(BatchedEnv[PlatformState]):
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
         """The lowest and the highest observation, `[9]` each."""
         return [-1.0] * len(self.observation_names), [1.0] * len(self.observation_names)
-
-    def start(self, episode: Tensor, rng: RngKey) -> PlatformState:
-        """Return the states at the beginning of the course; nothing about them is random."""
-        return rules.start(episode)
-
-    def act(self, state: PlatformState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[PlatformState, Tensor]:
-        """Return the states after one action, and the distances covered as fractions of the course, `[N]`."""
-        # Rows that do not move simulate a run, which is shorter than a jump.
-        simulated = torch.where(is_idle, rules.RUN, action.discrete)
-        normal = partial(counter_rng.normal, rng)
-        after = rules.act(state, simulated, action.parameters.squeeze(-1), normal, self.options.noise)
-        return after, (after.x - state.x) / rules.END
-
-    def observe(self, state: PlatformState) -> Tensor:
-        """Return the observations `[N, 9]`."""
-        return rules.observe(state)
 
     def draw(self, track: Sequence[PlatformState]) -> np.ndarray:
         """Return a picture of the course, uint8 `[480, 480, 3]`."""

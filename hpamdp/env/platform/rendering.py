@@ -50,7 +50,7 @@ def _enemies(track: Sequence[PlatformState]) -> list[float]:
     """
     on_first = [state for state in track if float(state.x) <= rules.LEFT[1]]
     if len(on_first) == len(track):
-        return [float(track[-1].enemy_x), rules._SECOND_START]
+        return [float(track[-1].enemy_x), rules.SECOND_START]
     return [*(float(state.enemy_x) for state in on_first[-1:]), float(track[-1].enemy_x)]
 
 

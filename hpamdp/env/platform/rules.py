@@ -1,4 +1,4 @@
-"""The rules of the Platform domain as pure functions on columns: the course, its agents and its enemies.
+"""The rules of the Platform domain for one row, and the loop over all rows that Numba compiles.
 
 Source: Masson, Ranchod & Konidaris 2016, arXiv:1509.01644, section on the Platform domain. Constants, bounds and rules
 as in gym-platform, the version of Bester, James & Konidaris 2019, arXiv:1905.04388.
@@ -10,11 +10,14 @@ Differs from the source:
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
-import torch
+import numpy as np
 from torch import Tensor
+
+from hpamdp.env import kernels
+from hpamdp.env.kernels import EPISODE_ROW, ONE, OUTCOME_ROW, STEPS_ROW, TWO, ZERO, inlined, kernel, part
 
 RUN, HOP, LEAP = range(3)
 ACTIONS = ("run", "hop", "leap")
@@ -40,26 +43,40 @@ OBSERVATION_NAMES = (
 LEFT, RIGHT = (0.0, 475.0, 985.0), (250.0, 750.0, 1035.0)
 END = RIGHT[2]
 BODY_WIDTH, BODY_HEIGHT = 20.0, 30.0
-_TICK = 0.05
-_GRAVITY = 9.8
-_MAX_SPEED = 70.0  # px/s
-_MAX_PUSH = 30.0  # px/s, largest change of the speed by an action in one tick
-_DECAY = 0.99  # factor on the speed after each tick
-_RUN_TICKS = 20.0
-_HOP_RISE, _LEAP_RISE = 35.0, 25.0  # vertical speed at the start of a jump, px/s
-_ENEMY_SPEED = 30.0
-_FIRST_START, _SECOND_START = RIGHT[0] - BODY_WIDTH, RIGHT[1] - BODY_WIDTH  # where the enemies start and turn
-_JUMP_NOISE = 1.0  # standard deviation of the speeds at the start of a jump, px/s
-_TICK_NOISE = 0.5 * _TICK  # standard deviation of the change of speed in a tick, px/s
+FIRST_START, SECOND_START = RIGHT[0] - BODY_WIDTH, RIGHT[1] - BODY_WIDTH  # where the enemies start and turn
+
+_F = np.float32
+_LEFTS, _RIGHTS = np.array(LEFT, np.float32), np.array(RIGHT, np.float32)
+_END, _WIDTH, _HEIGHT, _LENGTH = _F(END), _F(BODY_WIDTH), _F(BODY_HEIGHT), _F(END + BODY_WIDTH)
+_SECOND_EDGE, _THIRD_EDGE = _F(LEFT[1] - BODY_WIDTH), _F(LEFT[2] - BODY_WIDTH)
+_FIRST_START, _SECOND_START = _F(FIRST_START), _F(SECOND_START)
+_TICK = _F(0.05)
+_GRAVITY = _F(9.8)
+_FALL = _F(0.5 * 9.8 * 0.05)  # of the vertical speed in half a tick
+_MAX_SPEED = _F(70.0)  # px/s
+_MAX_PUSH = _F(30.0)  # px/s, largest change of the speed by an action in one tick
+_DECAY = _F(0.99)  # factor on the speed after each tick
+_RUN_TICKS = 20
+_HOP_RISE, _LEAP_RISE = _F(35.0), _F(25.0)  # vertical speed at the start of a jump, px/s
+_ENEMY = _F(30.0)  # largest speed of an enemy
+_JUMP_NOISE = _F(1.0)  # standard deviation of the speeds at the start of a jump, px/s
+_TICK_NOISE = _F(0.5 * 0.05)  # standard deviation of the change of speed in a tick, px/s
+_HUNDRED = _F(100.0)
 # Normal random numbers that each action of an episode may use: two for a jump, then two per tick. A hop has 144 ticks.
 _NUMBERS_PER_ACTION = 512
 # Observed features of each platform: its width, the next platform's width, the gap and its left edge, all in [0, 1],
 # and the next platform's height.
-_PLATFORM_FEATURES = (
-    (250 / 275, 275 / 275, 225 / 235, LEFT[0] / END, 0.0),
-    (275 / 275, 50 / 275, 235 / 235, LEFT[1] / END, 0.0),
-    (50 / 275, 0.0, 0.0, LEFT[2] / END, 0.0),
+_FEATURES = np.array(
+    (
+        (250 / 275, 275 / 275, 225 / 235, LEFT[0] / END, 0.0),
+        (275 / 275, 50 / 275, 235 / 235, LEFT[1] / END, 0.0),
+        (50 / 275, 0.0, 0.0, LEFT[2] / END, 0.0),
+    ),
+    np.float32,
 )
+
+NOISE = kernels.OWN  # the problem's own setting
+_X, _SPEED, _ENEMY_X, _ENEMY_SPEED = range(4)  # rows of the floats
 
 
 class PlatformState(NamedTuple):
@@ -77,163 +94,158 @@ class PlatformState(NamedTuple):
     episode: Tensor
 
 
-def start(episode: Tensor) -> PlatformState:
-    """Return the initial states of the episodes with these numbers, int32 `[N]`."""
-    zeros = torch.zeros_like(episode, dtype=torch.float32)
-    integer_zeros = torch.zeros_like(episode)
-    return PlatformState(
-        x=zeros,
-        speed=zeros,
-        enemy_x=zeros + _FIRST_START,
-        enemy_speed=zeros - _ENEMY_SPEED,
-        steps=integer_zeros,
-        outcome=integer_zeros + ON_THE_WAY,
-        episode=episode,
-    )
-
-
-def act(
-    state: PlatformState, discrete: Tensor, parameter: Tensor, normal: Callable[[Tensor], Tensor], noise: float
-) -> PlatformState:
-    """Return the states after one action in every environment.
-
-    The action is simulated at full length, `[T, N]`, and then cut off at the first event that ends it.
+@part
+def _patrol(before: Any, after: Any, x: Any, speed: Any, gust: Any) -> Any:
+    """Return position and speed of the enemy after a tick. It turns at the edges of its platform.
 
     Args:
-        state: states before the action.
-        discrete: RUN, HOP or LEAP, `[N]`.
-        parameter: parameter of the chosen action, within its bounds, `[N]`.
-        normal: maps indices, int32 `[N]` or `[T, N]`, to standard normal numbers of the episodes.
-        noise: factor on the published noise.
+        before, after: the agent's positions before and after the tick.
+        x, speed: of the enemy.
+        gust: px/s added to its speed.
     """
-    edge = torch.where(state.x < LEFT[2] - BODY_WIDTH, RIGHT[1], RIGHT[2])
-    edge = torch.where(state.x < LEFT[1] - BODY_WIDTH, RIGHT[0], edge)
-    is_jump = (discrete != RUN) & (state.x <= edge)  # an agent beyond the edge falls, whatever the action
-    first = first_number(state)
-    rise = torch.where(discrete == HOP, _HOP_RISE, _LEAP_RISE).to(state.x.dtype)
-    push = parameter / (2.0 * rise / _GRAVITY + 1.0) - state.speed
-    push = push - noise * _JUMP_NOISE * normal(first).abs()
-    rise = rise - noise * _JUMP_NOISE * normal(first + 1).abs()
-    speed = state.speed + torch.where(is_jump, push.clamp(-_MAX_PUSH, _MAX_PUSH), 0.0)
-    # Tick k of a jump, counted from 0, ends at the height (k + 1) (rise - k fall) _TICK.
-    fall = 0.5 * _GRAVITY * _TICK
-    length = torch.where(is_jump, (rise / fall).floor().clamp(min=-1.0) + 2.0, _RUN_TICKS)
-    tick = torch.arange(int(length.max()), dtype=torch.int32, device=state.x.device).unsqueeze(-1)
-    index = first + 2 + 2 * tick
-    drag = noise * _TICK_NOISE * normal(index).abs()
-    gust = noise * _TICK_NOISE * normal(index + 1)
-
-    before, x, speed = _move(state.x, speed, edge, torch.where(is_jump, 0.0, parameter), drag)
-    enemy_x, enemy_speed = _patrol(before, x, state.enemy_x, state.enemy_speed, gust)
-    height = torch.where(is_jump, (tick + 1) * (rise - tick * fall) * _TICK, 0.0)
-    has_met = ((x - enemy_x).abs() < BODY_WIDTH) & (height < BODY_HEIGHT)
-    is_off = ~is_jump & (before > edge)
-    is_end = has_met | is_off | (x >= END) | (tick == length - 1.0)
-    end = torch.where(is_end, tick, len(tick)).amin(0, keepdim=True).long()
-    x, speed, enemy_x, enemy_speed, height, has_met, is_off = (
-        trace.gather(0, end).squeeze(0) for trace in (x, speed, enemy_x, enemy_speed, height, has_met, is_off)
-    )
-
-    is_down = height < 0.0
-    landed_x, stands = _land(x, -height)
-    is_stopped = is_down & (stands | (landed_x != x))
-    x = torch.where(is_down, landed_x, x)
-    outcome = torch.where(is_off | (is_down & ~stands), FELL, ON_THE_WAY)
-    outcome = torch.where(has_met, MET_ENEMY, outcome)
-    outcome = torch.where(x >= END, ARRIVED, outcome).to(torch.int32)
-    speed = torch.where(is_stopped, 0.0, speed)
-    return PlatformState(x, speed, enemy_x, enemy_speed, state.steps + 1, outcome, state.episode)
+    is_second = before > _LEFTS[1]
+    low = _LEFTS[1] if is_second else _LEFTS[0]
+    high = _SECOND_START if is_second else _FIRST_START
+    fastest = _ENEMY
+    if after > _LEFTS[1] and not is_second:
+        # When the agent reaches the second platform, that platform's enemy takes over from its start.
+        low, high, fastest = _SECOND_START, _SECOND_START, -_ENEMY
+    if not ((low < x) & (x < high)):
+        speed = -speed
+    speed = min(max(speed + gust, -_ENEMY), fastest)
+    return min(max(x + _TICK * speed, low), high), speed
 
 
-def first_number(state: PlatformState) -> Tensor:
-    """Return the index `[N]` of the first random number of the next action."""
-    return state.steps * _NUMBERS_PER_ACTION
-
-
-def _move(x: Tensor, speed: Tensor, edge: Tensor, power: Tensor, drag: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the agents' positions before and after each tick, and their speeds after it, `[T, N]` each.
-
-    Args:
-        x, speed: positions and speeds of the agents, `[N]`.
-        edge: right edges of their platforms, `[N]`. Beyond the edge, `power` has no effect.
-        power: px/s that a run adds to the speed in each tick, `[N]`.
-        drag: px/s subtracted from the speed in each tick, `[T, N]`.
-    """
-    xs = [x]
-    speeds = []
-    no_power = torch.zeros_like(power)
-    for loss in drag.unbind():
-        speed = (speed + torch.where(x <= edge, power, no_power) - loss).clamp(0.0, _MAX_SPEED)
-        x = torch.add(x, speed, alpha=_TICK)
-        speed = speed * _DECAY
-        xs.append(x)
-        speeds.append(speed)
-    trace = torch.stack(xs).clamp(max=END)
-    return trace[:-1], trace[1:], torch.stack(speeds)
-
-
-def _patrol(before: Tensor, after: Tensor, x: Tensor, speed: Tensor, gust: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the enemies' positions and speeds after each tick, `[T, N]` each.
-
-    An enemy turns at the edges of its platform.
-
-    Args:
-        before, after: the agents' positions before and after each tick, `[T, N]`.
-        x, speed: positions and speeds of the enemies, `[N]`.
-        gust: px/s added to the enemies' speeds in each tick, `[T, N]`.
-    """
-    is_second = before > LEFT[1]
-    left = torch.where(is_second, LEFT[1], LEFT[0]).to(gust.dtype)
-    right = torch.where(is_second, _SECOND_START, _FIRST_START).to(gust.dtype)
-    slowest = torch.full_like(gust, -_ENEMY_SPEED)
-    fastest = torch.full_like(gust, _ENEMY_SPEED)
-    # When the agent reaches the second platform, that platform's enemy replaces the first one. Equal bounds put the
-    # enemy at its start.
-    is_reached = (after > LEFT[1]) & ~is_second
-    left = left.masked_fill(is_reached, _SECOND_START)
-    right = right.masked_fill(is_reached, _SECOND_START)
-    fastest = fastest.masked_fill(is_reached, -_ENEMY_SPEED)
-    ticks = zip(left.unbind(), right.unbind(), slowest.unbind(), fastest.unbind(), gust.unbind(), strict=True)
-    xs = []
-    speeds = []
-    for low, high, slow, fast, change in ticks:
-        speed = torch.where((low < x) & (x < high), speed, -speed)
-        speed = (speed + change).clamp(slow, fast)
-        x = torch.add(x, speed, alpha=_TICK).clamp(low, high)
-        xs.append(x)
-        speeds.append(speed)
-    return torch.stack(xs), torch.stack(speeds)
-
-
-def _land(x: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the positions of agents after a platform has pushed them out, and whether they stand on it, `[N]` each.
+@part
+def _land(x: Any, depth: Any) -> Any:
+    """Return where an agent ends up that has come down, and whether it stands on a platform.
 
     A platform pushes an overlapping agent out by the shorter way: up, or over the platform's edge.
 
     Args:
-        x: positions of the agents, `[N]`.
-        depth: px by which the agents are below the top of the platforms, `[N]`.
+        x: position of the agent.
+        depth: px by which it is below the top of the platforms.
     """
-    landed = x
-    stands = torch.zeros_like(x, dtype=torch.bool)
-    for left, right in zip(LEFT, RIGHT, strict=True):
-        from_left = x - (left - BODY_WIDTH)
-        from_right = right - x
-        inside = torch.minimum(from_left, from_right)
-        stands = stands | (inside >= depth)
-        aside = torch.where(from_left < from_right, left - BODY_WIDTH, right)
-        landed = torch.where((inside > 0.0) & (inside < depth), aside, landed)
+    landed, stands = x, False
+    for platform in range(3):
+        from_left, from_right = x - (_LEFTS[platform] - _WIDTH), _RIGHTS[platform] - x
+        inside = min(from_left, from_right)
+        stands |= inside >= depth
+        if ZERO < inside < depth:
+            landed = _LEFTS[platform] - _WIDTH if from_left < from_right else _RIGHTS[platform]
     return landed, stands
 
 
-def observe(state: PlatformState) -> Tensor:
-    """Return the observation `[N, 9]` with the entries OBSERVATION_NAMES, scaled to [-1, 1]."""
-    basic = [
-        (state.x + BODY_WIDTH) / (END + BODY_WIDTH),
-        state.speed / 100.0,
-        state.enemy_x / END,
-        (state.enemy_speed + _ENEMY_SPEED) / (2.0 * _ENEMY_SPEED),
-    ]
-    platform = (state.x >= LEFT[1]).long() + (state.x >= LEFT[2])
-    features = torch.tensor(_PLATFORM_FEATURES, dtype=state.x.dtype, device=state.x.device)[platform]
-    return 2.0 * torch.cat([torch.stack(basic, -1), features], -1) - 1.0
+@inlined
+def _edge(x: Any) -> Any:
+    """Return the right edge of the platform that an agent is on."""
+    return _RIGHTS[0] if x < _SECOND_EDGE else (_RIGHTS[1] if x < _THIRD_EDGE else _RIGHTS[2])
+
+
+@part
+def _act(floats: Any, row: Any, action: Any, given: Any, first: Any, bits: Any, step: Any, noise: Any) -> Any:
+    """Take an action in a row and return its outcome.
+
+    Args:
+        floats, row: the state and the place in it.
+        action: RUN, HOP or LEAP.
+        given: its parameter.
+        first: index of the first random number of the action.
+        bits, step: of the row's random numbers.
+        noise: factor on the published noise.
+    """
+    x, speed = floats[_X, row], floats[_SPEED, row]
+    enemy_x, enemy_speed = floats[_ENEMY_X, row], floats[_ENEMY_SPEED, row]
+    edge = _edge(x)
+    is_jump = (action != RUN) & (x <= edge)  # an agent beyond the edge falls, whatever the action
+    power, rise = given, ZERO
+    length = _RUN_TICKS
+    if is_jump:
+        power = ZERO
+        rise = _HOP_RISE if action == HOP else _LEAP_RISE
+        push = given / (TWO * rise / _GRAVITY + ONE) - speed
+        push -= noise * _JUMP_NOISE * abs(kernels.normal(bits, step, first))
+        rise -= noise * _JUMP_NOISE * abs(kernels.normal(bits, step, first + 1))
+        speed += min(max(push, -_MAX_PUSH), _MAX_PUSH)
+        length = int(max(math.floor(rise / _FALL), -1) + 2)
+    height, has_met, is_off = ZERO, False, False
+    for tick in range(max(length, 1)):
+        drag = noise * _TICK_NOISE * abs(kernels.normal(bits, step, first + 2 + 2 * tick))
+        gust = noise * _TICK_NOISE * kernels.normal(bits, step, first + 3 + 2 * tick)
+        before = x
+        speed = min(max(speed + (power if x <= edge else ZERO) - drag, ZERO), _MAX_SPEED)
+        x = min(x + _TICK * speed, _END)
+        speed *= _DECAY
+        enemy_x, enemy_speed = _patrol(before, x, enemy_x, enemy_speed, gust)
+        if is_jump:  # tick k, counted from 0, ends at the height (k + 1) (rise - k fall) _TICK
+            height = _F(tick + 1) * (rise - _F(tick) * _FALL) * _TICK
+        has_met = (abs(x - enemy_x) < _WIDTH) & (height < _HEIGHT)
+        is_off = (not is_jump) & (before > edge)
+        if has_met or is_off or x >= _END:
+            break
+    outcome = FELL if is_off else ON_THE_WAY
+    if height < ZERO:
+        landed, stands = _land(x, -height)
+        if stands or landed != x:
+            speed = ZERO
+        x = landed
+        if not stands:
+            outcome = FELL
+    if has_met:
+        outcome = MET_ENEMY
+    if x >= _END:
+        outcome = ARRIVED
+    floats[_X, row], floats[_SPEED, row] = x, speed
+    floats[_ENEMY_X, row], floats[_ENEMY_SPEED, row] = enemy_x, enemy_speed
+    return outcome
+
+
+@part
+def _start(floats: Any, row: Any) -> None:
+    """Put agent and enemy where an episode begins."""
+    floats[_X, row], floats[_SPEED, row] = ZERO, ZERO
+    floats[_ENEMY_X, row], floats[_ENEMY_SPEED, row] = _FIRST_START, -_ENEMY
+
+
+@part
+def _observe(floats: Any, row: Any, observation: Any) -> None:
+    """Write what is observed of a row, scaled to [-1, 1]."""
+    x = floats[_X, row]
+    observation[0] = (x + _WIDTH) / _LENGTH
+    observation[1] = floats[_SPEED, row] / _HUNDRED
+    observation[2] = floats[_ENEMY_X, row] / _END
+    observation[3] = (floats[_ENEMY_SPEED, row] + _ENEMY) / (TWO * _ENEMY)
+    platform = int(x >= _LEFTS[1]) + int(x >= _LEFTS[2])
+    for i in range(5):
+        observation[4 + i] = _FEATURES[platform, i]
+    for i in range(9):
+        observation[i] = TWO * observation[i] - ONE
+
+
+@kernel
+def advance(
+    state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
+) -> int:
+    """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
+    floats, integers = state
+    observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
+    noise = _F(settings[NOISE])
+    for row in range(len(mask)):
+        was_over = integers[OUTCOME_ROW, row] != ON_THE_WAY
+        if mode != kernels.RESTART and mask[row] and not was_over:
+            action, steps, before = discrete[row], integers[STEPS_ROW, row], floats[_X, row]
+            given = kernels.parameter(parameters, row, 0, action)
+            bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
+            outcome = _act(floats, row, action, given, steps * _NUMBERS_PER_ACTION, bits, step, noise)
+            kernels.end_step(integers, row, outcome, len(OUTCOMES), settings)
+            rewards[row] = (floats[_X, row] - before) / _END
+        for reading in range(len(observations)):
+            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
+                kernels.new_episode(integers, row, settings)
+                _start(floats, row)
+            _observe(floats, row, observations[reading, row])
+            kernels.report(integers[OUTCOME_ROW, row], len(OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1
