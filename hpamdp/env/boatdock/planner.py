@@ -347,22 +347,11 @@ def best_plans(layout: Layout, keymap: Tensor) -> Plan:
     return Plan(*(field.unflatten(0, (len(keymap), num_options)) for field in plan))
 
 
-class OptionPlans(NamedTuple):
-    """The best plan of each option, with the fields of `Plan` `[N, num_options, ...]`.
+def plans_of_options(rules: Rules, state: BoatState) -> Plan:
+    """Return the best plan of each option from the boats' current places of rest, fields `[N, num_options, ...]`.
 
     A plan may begin with a press of 0 s: the option then does nothing with its own controller. This happens with a
     `switch_cost`, and if one of the `boats` cannot reach the dock.
-    """
-
-    boats: Tensor  # [N, num_options, 3] int64, the controller of each press
-    keys: Tensor
-    durations: Tensor
-    num_presses: Tensor
-    score: Tensor
-
-
-def plans_of_options(rules: Rules, state: BoatState) -> OptionPlans:
-    """Return the best plan of each option from the boats' current places of rest.
 
     If the agent does not choose, the only option is the controller that each row has. With a `switch_cost`, the plan of
     an option begins with that option's controller, and may change it before each later press.
@@ -374,15 +363,11 @@ def plans_of_options(rules: Rules, state: BoatState) -> OptionPlans:
         if has_choice:
             return plans
         own = state.controller.long()
-        return OptionPlans(*(field[torch.arange(len(own), device=own.device), own].unsqueeze(1) for field in plans))
+        return Plan(*(field[torch.arange(len(own), device=own.device), own].unsqueeze(1) for field in plans))
     numbers = range(len(CONTROLLERS)) if has_choice else (None,)
     controllers = [state.controller if each is None else torch.full_like(state.controller, each) for each in numbers]
     found = [best_plan(*position, controller, state.keymap) for controller in controllers]
-    boats = [
-        controller.long().unsqueeze(-1).expand_as(plan.keys)
-        for controller, plan in zip(controllers, found, strict=True)
-    ]
-    return OptionPlans(torch.stack(boats, 1), *(torch.stack(fields, 1) for fields in zip(*found, strict=True)))
+    return Plan(*(torch.stack(fields, 1) for fields in zip(*found, strict=True)))
 
 
 def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
@@ -396,7 +381,7 @@ def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
     return _plans_with_boats(rules, *layout, fuel, torch.full_like(keymap, NOT_CHOSEN), keymap).score
 
 
-def better_option(plans: Plan | OptionPlans) -> Tensor:
+def better_option(plans: Plan) -> Tensor:
     """Return the option with the highest score, int64 `[N]`, given plans `[N, num_options]`.
 
     The first of equally good options wins. An option that begins with a press of 0 s, to change the controller
@@ -417,7 +402,7 @@ _FEWER = 1e-4  # seconds by which a plan with more presses must be better
 
 def _plans_with_boats(
     rules: Rules, x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, fuel: Tensor, held: Tensor, keymap: Tensor
-) -> OptionPlans:
+) -> Plan:
     """Return the best plan that begins with each controller, for any number of controllers and with changes at a cost.
 
     Controllers that push in the same directions with other keys are of one kind and share a search.
@@ -456,15 +441,14 @@ def _plans_with_boats(
         is_solved = left >= 0.0
         is_press = (torch.arange(MAX_PRESSES, device=x.device) < num_presses[:, None]) & is_solved[:, None]
         plans.append(
-            OptionPlans(
-                boats=torch.where(is_press, boats, boat),
+            Plan(
                 keys=torch.where(is_press, keys, 0),
                 durations=torch.where(is_press, durations, 0.0),
                 num_presses=is_press.sum(1),
                 score=score_of(is_solved, fuel_fraction(left)),
             )
         )
-    return OptionPlans(*(torch.stack(fields, 1) for fields in zip(*plans, strict=True)))
+    return Plan(*(torch.stack(fields, 1) for fields in zip(*plans, strict=True)))
 
 
 def _plans_of_kind(
