@@ -262,7 +262,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
 
     def trip_ends(self, rows: StateArrays) -> np.ndarray:
         """Return whether a trip ended with the last press, bool `[N]`."""
-        return rows.integers[kernel.TRIP_ENDED] != 0
+        return rows.integers[kernel.AT.trip_ended] != 0
 
     def describe(self) -> dict[str, Tensor]:
         """Return `optimum` `[N, trips]` of the sessions that have just begun: the best score of a plan in each trip.
@@ -277,7 +277,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
     def final_infos(self, rows: StateArrays) -> dict[str, np.ndarray]:
         """Return `score` and `success`, the fraction of trips that docked, of sessions `[N]`."""
         trips = np.float32(self.options.trips)
-        return {"score": rows.floats[kernel.TOTAL_SCORE] / trips, "success": rows.integers[kernel.DOCKED] / trips}
+        return {"score": rows.floats[kernel.AT.total_score] / trips, "success": rows.integers[kernel.AT.docked] / trips}
 
     def played(self) -> dict[str, Tensor]:
         """Return `trip_score` and `trip_presses` `[N, trips]` of the sessions of an evaluation."""

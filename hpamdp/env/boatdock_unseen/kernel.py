@@ -39,26 +39,8 @@ from hpamdp.env.kernels import (
 )
 from hpamdp.env.rng_streams import EVALUATION, TRAINING
 
-# Rows of the state's two arrays, in the order of SessionState.
-(
-    START_X,
-    START_Y,
-    GOAL_X,
-    GOAL_Y,
-    X,
-    Y,
-    VELOCITY_X,
-    VELOCITY_Y,
-    FUEL,
-    MOVED_X,
-    MOVED_Y,
-    LAST_DURATION,
-    LAST_SCORE,
-    TOTAL_SCORE,
-    FRAME_X,
-    FRAME_Y,
-) = range(16)
-FIRST_BOAT, SECOND_BOAT, BOAT, LAST_BOAT, LAST_KEY, TRIP, PRESSES, DOCKED, TRIP_ENDED = range(9)
+# Where each column of the state is: its row of the float32 array or of the int32 array.
+AT: Any = rules.SessionState._make((*range(16), *range(9), STEPS_ROW, OUTCOME_ROW, EPISODE_ROW))
 
 # Places of the sessions' own settings.
 (
@@ -86,7 +68,7 @@ _NEAREST = _F(task.DOCK_RADIUS / task.HARBOUR_RADIUS)
 _SHORTEST_AXIS = _F(rules._SHORTEST_AXIS)
 
 # Places in the observation. It begins as the state does, with the coordinates of start, goal and boat.
-_NUM_COORDINATES = Y + 1
+_NUM_COORDINATES = AT.y + 1
 _TO_GOAL, _VELOCITY, _MOVED = (rules.OBSERVATION_NAMES.index(f"{name}_x") for name in ("to_goal", "velocity", "moved"))
 _FUEL, _DISTANCE, _TRIP, _BOAT, _LAST_KEY, _LAST_DURATION, _LAST_SCORE = (
     rules.OBSERVATION_NAMES.index(name)
@@ -155,30 +137,30 @@ def _begin_trip(floats: Any, integers: Any, row: Any, trip: Any, settings: Any) 
     """Put the boat at the start of a trip with a full tank."""
     bits = _session_hash(settings, row, integers[EPISODE_ROW, row], int32(trip))
     start_x, start_y, goal_x, goal_y = boats.layout(bits, stream_step(int32(settings[EPISODE_STREAM])))
-    floats[START_X, row], floats[START_Y, row] = start_x, start_y
-    floats[GOAL_X, row], floats[GOAL_Y, row] = goal_x, goal_y
-    floats[X, row], floats[Y, row], floats[FUEL, row] = start_x, start_y, _TANK
-    integers[BOAT, row] = task.NOT_CHOSEN if settings[kernels.NUM_OPTIONS] > 0 else 0
-    integers[TRIP, row], integers[PRESSES, row] = trip, 0
+    floats[AT.start_x, row], floats[AT.start_y, row] = start_x, start_y
+    floats[AT.goal_x, row], floats[AT.goal_y, row] = goal_x, goal_y
+    floats[AT.x, row], floats[AT.y, row], floats[AT.fuel, row] = start_x, start_y, _TANK
+    integers[AT.boat, row] = task.NOT_CHOSEN if settings[kernels.NUM_OPTIONS] > 0 else 0
+    integers[AT.trip, row], integers[AT.presses, row] = trip, 0
 
 
 @inlined
 def _start(floats: Any, integers: Any, row: Any, settings: Any) -> None:
     """Begin a session in a row, as `rules.start` does for columns."""
     kernels.new_episode(integers, row, settings)
-    for column in range(VELOCITY_X, FRAME_Y + 1):
+    for column in range(AT.velocity_x, AT.frame_y + 1):
         floats[column, row] = ZERO
     first, second = _draw_boats(settings, row, integers[EPISODE_ROW, row])
-    integers[FIRST_BOAT, row], integers[SECOND_BOAT, row] = first, second
-    integers[LAST_BOAT, row], integers[LAST_KEY, row] = task.NOT_CHOSEN, -1
-    integers[DOCKED, row], integers[TRIP_ENDED, row] = 0, 0
+    integers[AT.first_boat, row], integers[AT.second_boat, row] = first, second
+    integers[AT.last_boat, row], integers[AT.last_key, row] = task.NOT_CHOSEN, -1
+    integers[AT.docked, row], integers[AT.trip_ended, row] = 0, 0
     _begin_trip(floats, integers, row, 0, settings)
 
 
 @inlined
 def _act(floats: Any, integers: Any, row: Any, option: Any, key: Any, duration: Any, settings: Any) -> Any:
     """Press a key in a row, as `rules.act` does for columns, and return the reward."""
-    boat = integers[BOAT, row]
+    boat = integers[AT.boat, row]
     if boat == task.NOT_CHOSEN:
         boat = int32(option)
     steps, noise = integers[STEPS_ROW, row], _F(settings[MOTOR_NOISE])
@@ -186,15 +168,15 @@ def _act(floats: Any, integers: Any, row: Any, option: Any, key: Any, duration: 
         bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
         drawn = normal(bits, step, steps * (rules.NUMBERS_PER_PRESS // 2) + rules.MOTOR)
         duration = min(duration * _F(math.exp(noise * drawn)), _LONGEST)
-    own = integers[SECOND_BOAT, row] if boat == 1 else integers[FIRST_BOAT, row]
+    own = integers[AT.second_boat, row] if boat == 1 else integers[AT.first_boat, row]
     dir_x, dir_y = _direction(own, int32(key), settings)
     strength, glide = _strength_and_glide(own, settings)
-    x, y, goal_x, goal_y = floats[X, row], floats[Y, row], floats[GOAL_X, row], floats[GOAL_Y, row]
-    start_x, start_y = floats[START_X, row], floats[START_Y, row]
+    x, y, goal_x, goal_y = floats[AT.x, row], floats[AT.y, row], floats[AT.goal_x, row], floats[AT.goal_y, row]
+    start_x, start_y = floats[AT.start_x, row], floats[AT.start_y, row]
     new_x, new_y, left, speed, outcome = boats.press(
         x,
         y,
-        floats[FUEL, row],
+        floats[AT.fuel, row],
         goal_x,
         goal_y,
         dir_x,
@@ -204,7 +186,7 @@ def _act(floats: Any, integers: Any, row: Any, option: Any, key: Any, duration: 
         _GLIDE * glide,
         ONE + _GLIDE * glide,
     )
-    presses = integers[PRESSES, row] + 1
+    presses = integers[AT.presses, row] + 1
     if presses >= task.MAX_PRESSES and outcome == task.SAILING:
         outcome = int32(task.TIME_LIMIT)
     docks, ends = outcome == task.SUCCESS, outcome != task.SAILING
@@ -216,26 +198,26 @@ def _act(floats: Any, integers: Any, row: Any, option: Any, key: Any, duration: 
         failed = (outcome > task.SUCCESS) & (outcome < task.TIME_LIMIT)
         at_start = math.sqrt((goal_x - start_x) ** 2 + (goal_y - start_y) ** 2)
         reward = (before - after) / at_start + (_FAILURE if failed else final)
-    floats[X, row], floats[Y, row], floats[FUEL, row] = new_x, new_y, left
-    floats[VELOCITY_X, row], floats[VELOCITY_Y, row] = speed * dir_x, speed * dir_y
-    floats[MOVED_X, row], floats[MOVED_Y, row] = new_x - x, new_y - y
-    floats[LAST_DURATION, row] = duration
-    if integers[LAST_KEY, row] < 0:
-        floats[FRAME_X, row], floats[FRAME_Y, row] = new_x - x, new_y - y
+    floats[AT.x, row], floats[AT.y, row], floats[AT.fuel, row] = new_x, new_y, left
+    floats[AT.velocity_x, row], floats[AT.velocity_y, row] = speed * dir_x, speed * dir_y
+    floats[AT.moved_x, row], floats[AT.moved_y, row] = new_x - x, new_y - y
+    floats[AT.last_duration, row] = duration
+    if integers[AT.last_key, row] < 0:
+        floats[AT.frame_x, row], floats[AT.frame_y, row] = new_x - x, new_y - y
         if settings[SENSOR_NOISE] > 0.0:
             bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
             index = (steps + 1) * (rules.NUMBERS_PER_PRESS // 2) + rules.SENSOR + 6
-            floats[FRAME_X, row] += _F(settings[SENSOR_NOISE]) * normal(bits, step, index)
-            floats[FRAME_Y, row] += _F(settings[SENSOR_NOISE]) * normal(bits, step, index + 1)
-    integers[BOAT, row], integers[LAST_BOAT, row], integers[LAST_KEY, row] = boat, boat, int32(key)
-    integers[PRESSES, row], integers[STEPS_ROW, row] = presses, steps + 1
-    integers[TRIP_ENDED, row] = int32(ends)
+            floats[AT.frame_x, row] += _F(settings[SENSOR_NOISE]) * normal(bits, step, index)
+            floats[AT.frame_y, row] += _F(settings[SENSOR_NOISE]) * normal(bits, step, index + 1)
+    integers[AT.boat, row], integers[AT.last_boat, row], integers[AT.last_key, row] = boat, boat, int32(key)
+    integers[AT.presses, row], integers[STEPS_ROW, row] = presses, steps + 1
+    integers[AT.trip_ended, row] = int32(ends)
     if ends:
         score = final if docks else _FAILURE
-        floats[LAST_SCORE, row] = score
-        floats[TOTAL_SCORE, row] += score
-        integers[DOCKED, row] += int32(docks)
-        trip = integers[TRIP, row] + 1
+        floats[AT.last_score, row] = score
+        floats[AT.total_score, row] += score
+        integers[AT.docked, row] += int32(docks)
+        trip = integers[AT.trip, row] + 1
         if trip < settings[TRIPS]:
             _begin_trip(floats, integers, row, trip, settings)
         else:
@@ -248,8 +230,8 @@ def _observe(floats: Any, integers: Any, row: Any, settings: Any, observation: A
     """Write the observation of a row, as `rules.observe` does for columns."""
     for place in range(_NUM_COORDINATES):
         observation[place] = floats[place, row]
-    observation[_MOVED], observation[_MOVED + 1] = floats[MOVED_X, row], floats[MOVED_Y, row]
-    noise, last_key = _F(settings[SENSOR_NOISE]), integers[LAST_KEY, row]
+    observation[_MOVED], observation[_MOVED + 1] = floats[AT.moved_x, row], floats[AT.moved_y, row]
+    noise, last_key = _F(settings[SENSOR_NOISE]), integers[AT.last_key, row]
     if noise > ZERO:
         bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
         index = integers[STEPS_ROW, row] * (rules.NUMBERS_PER_PRESS // 2) + rules.SENSOR
@@ -263,31 +245,32 @@ def _observe(floats: Any, integers: Any, row: Any, settings: Any, observation: A
     observation[_MOVED] *= _UNIT
     observation[_MOVED + 1] *= _UNIT
     observation[_VELOCITY], observation[_VELOCITY + 1] = (
-        floats[VELOCITY_X, row] * _SPEED,
-        floats[VELOCITY_Y, row] * _SPEED,
+        floats[AT.velocity_x, row] * _SPEED,
+        floats[AT.velocity_y, row] * _SPEED,
     )
     if settings[HAS_OWN_FRAME] != 0.0:
-        axis_x, axis_y = floats[FRAME_X, row], floats[FRAME_Y, row]
+        axis_x, axis_y = floats[AT.frame_x, row], floats[AT.frame_y, row]
         if axis_x == ZERO and axis_y == ZERO:
-            axis_x, axis_y = observation[GOAL_X] - observation[START_X], observation[GOAL_Y] - observation[START_Y]
+            axis_x = observation[AT.goal_x] - observation[AT.start_x]
+            axis_y = observation[AT.goal_y] - observation[AT.start_y]
         length = max(math.sqrt(axis_x * axis_x + axis_y * axis_y), _SHORTEST_AXIS)
         cosine, sine = axis_x / length, axis_y / length
-        for place in (START_X, GOAL_X, X, _VELOCITY, _MOVED):
+        for place in (AT.start_x, AT.goal_x, AT.x, _VELOCITY, _MOVED):
             across, along = observation[place], observation[place + 1]
             observation[place] = across * cosine + along * sine
             observation[place + 1] = along * cosine - across * sine
-    to_goal_x, to_goal_y = observation[GOAL_X] - observation[X], observation[GOAL_Y] - observation[Y]
-    across, along = observation[GOAL_X] - observation[START_X], observation[GOAL_Y] - observation[START_Y]
+    to_goal_x, to_goal_y = observation[AT.goal_x] - observation[AT.x], observation[AT.goal_y] - observation[AT.y]
+    across, along = observation[AT.goal_x] - observation[AT.start_x], observation[AT.goal_y] - observation[AT.start_y]
     at_start = max(math.sqrt(across * across + along * along), _NEAREST)
     observation[_TO_GOAL], observation[_TO_GOAL + 1] = to_goal_x, to_goal_y
-    observation[_FUEL] = floats[FUEL, row] / _TANK
+    observation[_FUEL] = floats[AT.fuel, row] / _TANK
     observation[_DISTANCE] = math.sqrt(to_goal_x * to_goal_x + to_goal_y * to_goal_y) / at_start
-    observation[_TRIP] = _F(integers[TRIP, row]) / _F(settings[TRIPS])
-    observation[_BOAT], observation[_BOAT + 1] = _F(integers[BOAT, row]), _F(integers[LAST_BOAT, row])
+    observation[_TRIP] = _F(integers[AT.trip, row]) / _F(settings[TRIPS])
+    observation[_BOAT], observation[_BOAT + 1] = _F(integers[AT.boat, row]), _F(integers[AT.last_boat, row])
     for key in range(task.NUM_KEYS):
         observation[_LAST_KEY + key] = ONE if last_key == key else ZERO
-    observation[_LAST_DURATION] = floats[LAST_DURATION, row] / _LONGEST
-    observation[_LAST_SCORE] = floats[LAST_SCORE, row] / _SUCCESS
+    observation[_LAST_DURATION] = floats[AT.last_duration, row] / _LONGEST
+    observation[_LAST_SCORE] = floats[AT.last_score, row] / _SUCCESS
 
 
 @kernel
@@ -310,8 +293,8 @@ def advance(
             if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
                 _start(floats, integers, row, settings)
             _observe(floats, integers, row, settings, observations[reading, row])
-            extras[reading, 0, row] = _F(integers[TRIP_ENDED, row])
-            extras[reading, 1, row] = floats[TOTAL_SCORE, row] / trips
-            extras[reading, 2, row] = _F(integers[DOCKED, row]) / trips
+            extras[reading, 0, row] = _F(integers[AT.trip_ended, row])
+            extras[reading, 1, row] = floats[AT.total_score, row] / trips
+            extras[reading, 2, row] = _F(integers[AT.docked, row]) / trips
             kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
     return -1

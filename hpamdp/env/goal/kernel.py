@@ -36,24 +36,9 @@ NOISE, IS_SCALED, KICKS_TO_POINT, REPAIRS_DISTANCE, REPAIRS_PROJECTION, HAS_MIDD
     kernels.OWN, kernels.OWN + 7
 )
 
-# Rows of the state, and the first columns of the lanes.
-(
-    _PLAYER_X,
-    _PLAYER_Y,
-    _KEEPER_X,
-    _KEEPER_Y,
-    _BALL_X,
-    _BALL_Y,
-    _PLAYER_VX,
-    _PLAYER_VY,
-    _KEEPER_VX,
-    _KEEPER_VY,
-    _BALL_VX,
-    _BALL_VY,
-    _PLAYER_ANGLE,
-    _KEEPER_ANGLE,
-) = range(14)
-_NUM_COLUMNS = _KEEPER_ANGLE + 1
+# Where each column of the state is: its row, and the place among the first columns of the lanes.
+AT: Any = rules.GoalState._make((*range(14), STEPS_ROW, OUTCOME_ROW, EPISODE_ROW))
+_NUM_COLUMNS = len(rules.COLUMNS)
 
 _LANES = 16  # as many as the widest vectors have float32
 # Further columns of the lanes' float32: where the action aims, and the random numbers of a tick.
@@ -131,11 +116,11 @@ def _draw(lanes: Any, numbers: Any, j: Any, step: Any) -> None:
 def _play(lanes: Any, j: Any, noise: Any) -> None:
     """Let the players move: `rules._play`."""
     player_noise, ball_noise = noise * _PLAYER_NOISE, noise * _BALL_NOISE
-    player_x, player_y = lanes[_PLAYER_X * _LANES + j], lanes[_PLAYER_Y * _LANES + j]
-    player_vx, player_vy = lanes[_PLAYER_VX * _LANES + j], lanes[_PLAYER_VY * _LANES + j]
-    ball_vx, ball_vy = lanes[_BALL_VX * _LANES + j], lanes[_BALL_VY * _LANES + j]
-    angle = lanes[_PLAYER_ANGLE * _LANES + j]
-    to_x, to_y = lanes[_BALL_X * _LANES + j] - player_x, lanes[_BALL_Y * _LANES + j] - player_y
+    player_x, player_y = lanes[AT.player_x * _LANES + j], lanes[AT.player_y * _LANES + j]
+    player_vx, player_vy = lanes[AT.player_vx * _LANES + j], lanes[AT.player_vy * _LANES + j]
+    ball_vx, ball_vy = lanes[AT.ball_vx * _LANES + j], lanes[AT.ball_vy * _LANES + j]
+    angle = lanes[AT.player_angle * _LANES + j]
+    to_x, to_y = lanes[AT.ball_x * _LANES + j] - player_x, lanes[AT.ball_y * _LANES + j] - player_y
     distance = _length(to_x, to_y)
     turn = atan2(to_y, to_x) - angle
     turn -= TURN * _F(np.rint(_TURNS * turn))
@@ -160,20 +145,20 @@ def _play(lanes: Any, j: Any, noise: Any) -> None:
         _BALL_SPEED if in_reach else _PLAYER_SPEED,
     )
     turned = angle + turn / (ONE + _FIVE * _length(player_vx, player_vy))
-    lanes[_PLAYER_VX * _LANES + j] = pushed_x if is_dash else player_vx
-    lanes[_PLAYER_VY * _LANES + j] = pushed_y if is_dash else player_vy
-    lanes[_BALL_VX * _LANES + j] = pushed_x if in_reach else ball_vx
-    lanes[_BALL_VY * _LANES + j] = pushed_y if in_reach else ball_vy
-    lanes[_PLAYER_ANGLE * _LANES + j] = turned if is_turn else angle
+    lanes[AT.player_vx * _LANES + j] = pushed_x if is_dash else player_vx
+    lanes[AT.player_vy * _LANES + j] = pushed_y if is_dash else player_vy
+    lanes[AT.ball_vx * _LANES + j] = pushed_x if in_reach else ball_vx
+    lanes[AT.ball_vy * _LANES + j] = pushed_y if in_reach else ball_vy
+    lanes[AT.player_angle * _LANES + j] = turned if is_turn else angle
 
 
 @inlined
 def _keep(lanes: Any, j: Any, noise: Any) -> None:
     """Let the keepers move: `rules._keep`."""
     keeper_noise = noise * _PLAYER_NOISE
-    keeper_x, keeper_y = lanes[_KEEPER_X * _LANES + j], lanes[_KEEPER_Y * _LANES + j]
-    ball_x, ball_y = lanes[_BALL_X * _LANES + j], lanes[_BALL_Y * _LANES + j]
-    roll_x, roll_y = _COASTED * lanes[_BALL_VX * _LANES + j], _COASTED * lanes[_BALL_VY * _LANES + j]
+    keeper_x, keeper_y = lanes[AT.keeper_x * _LANES + j], lanes[AT.keeper_y * _LANES + j]
+    ball_x, ball_y = lanes[AT.ball_x * _LANES + j], lanes[AT.ball_y * _LANES + j]
+    roll_x, roll_y = _COASTED * lanes[AT.ball_vx * _LANES + j], _COASTED * lanes[AT.ball_vy * _LANES + j]
     end_x, end_y = ball_x + roll_x, ball_y + roll_y
     # The height at which the ball meets the goal line, times `roll_x`, which is positive if `end_x` is beyond it.
     height = ball_y * roll_x + roll_y * (_LENGTH - ball_x)
@@ -183,8 +168,8 @@ def _keep(lanes: Any, j: Any, noise: Any) -> None:
     after_x, after_y = end_x - keeper_x, end_y - keeper_y
     angle = atan2(across_y if is_shot else after_y, across_x if is_shot else after_x)
     keeper_vx, keeper_vy = _pushed(
-        lanes[_KEEPER_VX * _LANES + j],
-        lanes[_KEEPER_VY * _LANES + j],
+        lanes[AT.keeper_vx * _LANES + j],
+        lanes[AT.keeper_vy * _LANES + j],
         _SAVE if is_shot else _FOLLOW,
         angle,
         lanes[(_DRAWN + 3) * _LANES + j],
@@ -193,8 +178,8 @@ def _keep(lanes: Any, j: Any, noise: Any) -> None:
         keeper_noise,
         _PLAYER_SPEED,
     )
-    lanes[_KEEPER_VX * _LANES + j], lanes[_KEEPER_VY * _LANES + j] = keeper_vx, keeper_vy
-    lanes[_KEEPER_ANGLE * _LANES + j] = angle
+    lanes[AT.keeper_vx * _LANES + j], lanes[AT.keeper_vy * _LANES + j] = keeper_vx, keeper_vy
+    lanes[AT.keeper_angle * _LANES + j] = angle
 
 
 @inlined
@@ -234,10 +219,10 @@ def _collide(lanes: Any, j: Any, one: Any, other: Any, one_v: Any, other_v: Any,
 @inlined
 def _end(lanes: Any, j: Any, is_kick: Any) -> Any:
     """Return the outcome after a tick: PLAYING where only the action is over, _GOING where it goes on."""
-    x, y = lanes[_BALL_X * _LANES + j], lanes[_BALL_Y * _LANES + j]
-    to_keeper = _squared(lanes[_KEEPER_X * _LANES + j] - x, lanes[_KEEPER_Y * _LANES + j] - y)
-    to_player = _squared(lanes[_PLAYER_X * _LANES + j] - x, lanes[_PLAYER_Y * _LANES + j] - y)
-    speed = _squared(lanes[_BALL_VX * _LANES + j], lanes[_BALL_VY * _LANES + j])
+    x, y = lanes[AT.ball_x * _LANES + j], lanes[AT.ball_y * _LANES + j]
+    to_keeper = _squared(lanes[AT.keeper_x * _LANES + j] - x, lanes[AT.keeper_y * _LANES + j] - y)
+    to_player = _squared(lanes[AT.player_x * _LANES + j] - x, lanes[AT.player_y * _LANES + j] - y)
+    speed = _squared(lanes[AT.ball_vx * _LANES + j], lanes[AT.ball_vy * _LANES + j])
     end = int32(rules.PLAYING) if is_kick & (speed <= _STILL_2) & (to_player <= _REACH_WITH_SLACK_2) else _GOING
     # Asked this way round, a position that is not finite ends the episode.
     is_inside = (x >= ZERO) & (x <= _LENGTH) & (abs(y) <= _HALF_WIDTH)
@@ -254,18 +239,18 @@ def _tick(lanes: Any, numbers: Any, step: Any, noise: Any) -> Any:
         _draw(lanes, numbers, j, step)
         _play(lanes, j, noise)
         _keep(lanes, j, noise)
-        _roll(lanes, j, _PLAYER_X, _PLAYER_VX, _PLAYER_DECAY)
-        _roll(lanes, j, _KEEPER_X, _KEEPER_VX, _PLAYER_DECAY)
-        _roll(lanes, j, _BALL_X, _BALL_VX, _BALL_DECAY)
-        touch = _overlap(lanes, j, _PLAYER_X, _KEEPER_X, _PLAYERS)
-        touch |= _overlap(lanes, j, _PLAYER_X, _BALL_X, _PLAYER_BALL)
-        touch |= _overlap(lanes, j, _KEEPER_X, _BALL_X, _KEEPER_BALL)
+        _roll(lanes, j, AT.player_x, AT.player_vx, _PLAYER_DECAY)
+        _roll(lanes, j, AT.keeper_x, AT.keeper_vx, _PLAYER_DECAY)
+        _roll(lanes, j, AT.ball_x, AT.ball_vx, _BALL_DECAY)
+        touch = _overlap(lanes, j, AT.player_x, AT.keeper_x, _PLAYERS)
+        touch |= _overlap(lanes, j, AT.player_x, AT.ball_x, _PLAYER_BALL)
+        touch |= _overlap(lanes, j, AT.keeper_x, AT.ball_x, _KEEPER_BALL)
         num_touching = int32(num_touching + int32(touch & (numbers[_ROW * _LANES + j] >= 0)))
     if num_touching > 0:  # this changes nothing in the other lanes
         for j in range(_LANES):
-            _collide(lanes, j, _PLAYER_X, _KEEPER_X, _PLAYER_VX, _KEEPER_VX, _PLAYERS)
-            _collide(lanes, j, _PLAYER_X, _BALL_X, _PLAYER_VX, _BALL_VX, _PLAYER_BALL)
-            _collide(lanes, j, _KEEPER_X, _BALL_X, _KEEPER_VX, _BALL_VX, _KEEPER_BALL)
+            _collide(lanes, j, AT.player_x, AT.keeper_x, AT.player_vx, AT.keeper_vx, _PLAYERS)
+            _collide(lanes, j, AT.player_x, AT.ball_x, AT.player_vx, AT.ball_vx, _PLAYER_BALL)
+            _collide(lanes, j, AT.keeper_x, AT.ball_x, AT.keeper_vx, AT.ball_vx, _KEEPER_BALL)
     num_over = int32(0)
     for j in range(_LANES):
         end = _end(lanes, j, numbers[_IS_KICK * _LANES + j] != 0)
@@ -293,11 +278,11 @@ def _aim(action: Any, first: Any, second: Any, settings: Any) -> Any:
 
 @part
 def _goal_distance(body: Any, is_repaired: Any) -> Any:
-    beside, depth = abs(body[_BALL_Y]) - _POST, _LENGTH - body[_BALL_X]
+    beside, depth = abs(body[AT.ball_y]) - _POST, _LENGTH - body[AT.ball_x]
     if depth > ZERO:
         return _length(depth, beside) if beside > ZERO else depth
-    if not is_repaired and body[_BALL_Y] < -_POST:
-        return _POST - body[_BALL_Y]
+    if not is_repaired and body[AT.ball_y] < -_POST:
+        return _POST - body[AT.ball_y]
     return max(beside, ZERO)
 
 
@@ -309,28 +294,28 @@ def _start(floats: Any, row: Any, bits: Any, step: Any) -> None:
     ball_x, ball_y = _REACH * math.cos(angle), y + _REACH * math.sin(angle)
     keeper_y = ball_y * (_LENGTH - _KEEPER_START) / (_LENGTH - ball_x)
     floats[:, row] = ZERO
-    floats[_PLAYER_Y, row], floats[_PLAYER_ANGLE, row] = y, angle
-    floats[_BALL_X, row], floats[_BALL_Y, row] = ball_x, ball_y
-    floats[_KEEPER_X, row], floats[_KEEPER_Y, row] = _KEEPER_START, keeper_y
-    floats[_KEEPER_ANGLE, row] = math.atan2(ball_y - keeper_y, ball_x - _KEEPER_START)
+    floats[AT.player_y, row], floats[AT.player_angle, row] = y, angle
+    floats[AT.ball_x, row], floats[AT.ball_y, row] = ball_x, ball_y
+    floats[AT.keeper_x, row], floats[AT.keeper_y, row] = _KEEPER_START, keeper_y
+    floats[AT.keeper_angle, row] = math.atan2(ball_y - keeper_y, ball_x - _KEEPER_START)
 
 
 @part
 def _observe(body: Any, settings: Any, observation: Any) -> None:
     """Write what is observed of a row: `rules.observe`."""
-    across, along = body[_BALL_Y] - body[_KEEPER_Y], body[_BALL_X] - body[_KEEPER_X]
+    across, along = body[AT.ball_y] - body[AT.keeper_y], body[AT.ball_x] - body[AT.keeper_x]
     distance = max(_length(along, across), _TINY)
     top = _POST if settings[REPAIRS_PROJECTION] != 0.0 else TWO * _POST
     if along == ZERO:
         shadow = -_POST if across > ZERO else _POST
     else:
-        shadow = min(max(body[_BALL_Y] + across / along * (_LENGTH - body[_BALL_X]), -_POST), top)
-    observation[0], observation[1] = body[_PLAYER_X], body[_PLAYER_Y]
-    observation[2], observation[3], observation[4] = body[_PLAYER_VX], body[_PLAYER_VY], body[_PLAYER_ANGLE]
-    observation[5], observation[6] = body[_KEEPER_X], body[_KEEPER_Y]
-    observation[7], observation[8], observation[9] = body[_KEEPER_VX], body[_KEEPER_VY], body[_KEEPER_ANGLE]
-    observation[10], observation[11] = body[_BALL_X], body[_BALL_Y]
-    observation[12], observation[13] = body[_BALL_VX], body[_BALL_VY]
+        shadow = min(max(body[AT.ball_y] + across / along * (_LENGTH - body[AT.ball_x]), -_POST), top)
+    observation[0], observation[1] = body[AT.player_x], body[AT.player_y]
+    observation[2], observation[3], observation[4] = body[AT.player_vx], body[AT.player_vy], body[AT.player_angle]
+    observation[5], observation[6] = body[AT.keeper_x], body[AT.keeper_y]
+    observation[7], observation[8], observation[9] = body[AT.keeper_vx], body[AT.keeper_vy], body[AT.keeper_angle]
+    observation[10], observation[11] = body[AT.ball_x], body[AT.ball_y]
+    observation[12], observation[13] = body[AT.ball_vx], body[AT.ball_vy]
     observation[14], observation[15], observation[16] = along / distance, across / distance, shadow
     if settings[IS_SCALED] != 0.0:
         for i in range(17):

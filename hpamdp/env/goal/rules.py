@@ -48,22 +48,6 @@ _KEEPER_MARGIN = 2.0  # the keeper defends shots up to this far beside the goal
 _STILL = 0.1  # a kick is over when the ball is this slow
 _COAST = 1.0 - _BALL_DECAY  # a ball rolls another velocity / _COAST before it stops
 
-COLUMNS = (
-    "player_x",
-    "player_y",
-    "keeper_x",
-    "keeper_y",
-    "ball_x",
-    "ball_y",
-    "player_vx",
-    "player_vy",
-    "keeper_vx",
-    "keeper_vy",
-    "ball_vx",
-    "ball_vy",
-    "player_angle",
-    "keeper_angle",
-)
 OBSERVATION_NAMES = (
     "player_x",
     "player_y",
@@ -135,6 +119,9 @@ class GoalState(NamedTuple):
     steps: Tensor
     outcome: Tensor
     episode: Tensor
+
+
+COLUMNS = GoalState._fields[:14]  # what moves
 
 
 class Aim(NamedTuple):
