@@ -13,6 +13,7 @@ from PIL import Image
 
 from hpamdp.analysis import film
 from hpamdp.env.primitives import players
+from hpamdp.env.primitives.manipulation import Manipulation
 from hpamdp.run import watch
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -49,8 +50,16 @@ EPISODES = {"boatdock_unseen": "1", "traffic": "1", "circuit": "1", "rddl": "1"}
 
 def film_primitives(to: Path) -> None:
     """Film the hand-written player of one task; MuJoCo needs a display, or MUJOCO_GL=egl."""
-    pictures = players.film("assembly", seed=900)
-    small = [np.array(Image.fromarray(picture).resize((200, 200))) for picture in pictures]
+    env = Manipulation("assembly", render_mode="rgb_array")
+    observation, _ = env.reset(seed=900)
+    pictures = [env.render()]
+    env.on_low_level_step = lambda: pictures.append(env.render())
+    is_over = False
+    while not is_over:
+        choice = players.choose("assembly", observation)
+        observation, _, is_over, _, _ = env.step(players.as_action(env, choice))
+    env.close()
+    small = [np.array(Image.fromarray(picture).resize((200, 200))) for picture in pictures[::10]]
     film.write(to, small, fps=10.0)
 
 

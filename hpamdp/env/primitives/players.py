@@ -110,27 +110,6 @@ def as_action(env: Manipulation, choice: Choice) -> tuple[np.int64, tuple[np.nda
     return np.int64(number), tuple(parameters)
 
 
-def film(task: Task, seed: int, every: int = 10) -> list[np.ndarray]:
-    """Return pictures of an episode, uint8 `[320, 320, 3]` each, after every so many low-level steps."""
-    env = Manipulation(task, render_mode="rgb_array")
-    observation, _ = env.reset(seed=seed)
-    pictures = [env.render()]
-    num_steps = 0
-
-    def draw() -> None:
-        nonlocal num_steps
-        num_steps += 1
-        if num_steps % every == 0:
-            pictures.append(env.render())
-
-    env.on_low_level_step = draw
-    is_over = False
-    while not is_over:
-        observation, _, is_over, _, _ = env.step(as_action(env, choose(task, observation)))
-    env.close()
-    return [picture for picture in pictures if picture is not None]
-
-
 def measure(task: Task, seeds: Iterable[int], reward: Reward = "sparse") -> dict[str, float]:
     """Play one episode for each seed and return the mean return, success and number of low-level steps."""
     env = Manipulation(task, reward=reward)
