@@ -59,10 +59,42 @@ class ParameterMap:
     is_many: np.ndarray
     is_whole: np.ndarray
 
+    @classmethod
+    def joined(cls, maps: Sequence[ParameterMap]) -> ParameterMap:
+        """Return the map of all parameters, side by side."""
+        columns = zip(*(vars(each).values() for each in maps), strict=True)
+        return cls(*map(np.concatenate, columns)) if maps else cls(*[np.zeros(0)] * 3, *[np.zeros(0, bool)] * 3)
+
     @property
     def is_identity(self) -> bool:
         """Whether the agent's parameters are the numbers of the space."""
         return not (self.is_unit.any() or self.shift.any())
+
+    @property
+    def is_integer(self) -> np.ndarray:
+        """Which of the agent's parameters are integers, bool `[num_parameters]`."""
+        return self.is_whole & ~self.is_many
+
+    @property
+    def agent_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of the agent's parameters, float64 `[num_parameters]` each."""
+        return np.where(self.is_unit, -1.0, self.low - self.shift), np.where(self.is_unit, 1.0, self.high - self.shift)
+
+    def numbers(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the space's numbers, given the agent's parameters, `[*M, num_parameters]`."""
+        fraction = 0.5 * (np.clip(parameters.astype(np.float64), -1.0, 1.0) + 1.0)
+        width = self.high - self.low
+        offset = np.where(self.is_many, np.floor(fraction * (width + 1.0)), fraction * width)
+        shifted = np.where(self.shift != 0.0, parameters + self.shift, parameters)
+        return np.where(self.is_unit, self.low + offset, shifted)
+
+    def parameters(self, numbers: np.ndarray) -> np.ndarray:
+        """Return the agent's parameters, float64, given the space's numbers, `[*M, num_parameters]`."""
+        half_cell = np.where(self.is_many, 0.5, 0.0)
+        width = np.maximum(self.high - self.low + 2.0 * half_cell, np.finfo(float).tiny)
+        with np.errstate(invalid="ignore"):
+            unit = 2.0 * (numbers - self.low + half_cell) / width - 1.0
+        return np.where(self.is_unit, unit, numbers - self.shift)
 
 
 class GymnasiumForm(ABC):

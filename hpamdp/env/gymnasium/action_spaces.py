@@ -80,6 +80,7 @@ class ActionSpace:
         integer_parameters: which of the agent's parameters are integers; empty if all are real numbers.
         starts: number of the first discrete action of each component in the space.
         low, high: bounds of the agent's parameters, float32 `[sum(parameter_dims)]`.
+        map: how the agent's parameters become the space's own.
         own_low, own_high: bounds of the space's own parameters, float64 `[sum(parameter_dims)]`.
         is_whole: which of the space's own parameters are integers, bool `[sum(parameter_dims)]`.
 
@@ -102,15 +103,11 @@ class ActionSpace:
         self.component_sizes = sizes if len(sizes) > 1 else ()
         self.starts = self._part.starts
         self.parameter_dims = self._part.parameter_dims
-        trees = self._part.trees
-        self._trees = trees
-        self.low = np.concatenate([np.zeros(0), *(tree.low for tree in trees)]).astype(np.float32)
-        self.high = np.concatenate([np.zeros(0), *(tree.high for tree in trees)]).astype(np.float32)
-        is_integer = [flag for tree in trees for flag in tree.is_integer.tolist()]
-        self.integer_parameters = tuple(is_integer) if any(is_integer) else ()
-        self.own_low = np.concatenate([np.zeros(0), *(tree.own_bounds[0] for tree in trees)])
-        self.own_high = np.concatenate([np.zeros(0), *(tree.own_bounds[1] for tree in trees)])
-        self.is_whole = np.concatenate([np.zeros(0, bool), *(tree.is_whole for tree in trees)])
+        self.map = ParameterMap.joined([tree.map for tree in self._part.trees])
+        self.low, self.high = (side.astype(np.float32) for side in self.map.agent_bounds)
+        is_integer = self.map.is_integer
+        self.integer_parameters = tuple(is_integer.tolist()) if is_integer.any() else ()
+        self.own_low, self.own_high, self.is_whole = self.map.low, self.map.high, self.map.is_whole
         self._choice = self._part if isinstance(self._part, Choice) else None
 
     def _read(self, parameter_dims: Sequence[int] | None, form: ActionForm) -> Part:
@@ -141,19 +138,6 @@ class ActionSpace:
         if self._choice is not None:
             return self._choice.chosen_natives(discrete, parameters, bounds)
         return self._part.natives(discrete.reshape(len(discrete), -1), parameters, bounds)
-
-    def to_agent(self, own: np.ndarray) -> np.ndarray:
-        """Return the agent's parameters, float64, given the space's own, `[M, sum(parameter_dims)]`."""
-        ends = np.cumsum([tree.size for tree in self._trees])[:-1]
-        parts = np.split(own, ends, axis=-1) if self._trees else []
-        of_trees = [tree.to_agent(part) for tree, part in zip(self._trees, parts, strict=True)]
-        return np.concatenate([np.zeros((*own.shape[:-1], 0)), *of_trees], axis=-1)
-
-    def parameter_map(self) -> ParameterMap:
-        """Return how all parameters become the space's own."""
-        maps = [vars(tree.parameter_map()) for tree in self._trees]
-        joined = {name: np.concatenate([each[name] for each in maps]) for name in (maps[0] if maps else ())}
-        return ParameterMap(**joined) if joined else ParameterMap(*[np.zeros(0)] * 3, *[np.zeros(0, bool)] * 3)
 
     def read_mask(self, given: Any) -> np.ndarray:
         """Return a mask as bool, with an entry for each discrete action of all components.

@@ -245,7 +245,7 @@ class GymnasiumEnv(PAMDPEnv):
         rows, actions = rows.clone(), self._copies.actions
         for name in (keys.OBSERVATION, ("next", keys.OBSERVATION)):
             rows[name] = torch.from_numpy(self.scaling.rescaled(rows[name].double().numpy()))
-        rows[keys.PARAMETERS] = torch.from_numpy(actions.to_agent(rows[keys.PARAMETERS].double().numpy())).float()
+        rows[keys.PARAMETERS] = torch.from_numpy(actions.map.parameters(rows[keys.PARAMETERS].double().numpy())).float()
         starts = torch.tensor(actions.starts)
         rows[keys.DISCRETE] = rows[keys.DISCRETE] - (starts if self.component_sizes else starts[0])
         return rows

@@ -81,8 +81,7 @@ class NativeForm(GymnasiumForm):
 
     def parameter_map(self) -> ParameterMap | None:
         """Return how parameters become the numbers of the action space; None if they are these numbers."""
-        found = self._actions.parameter_map()
-        return None if found.is_identity else found
+        return None if self._actions.map.is_identity else self._actions.map
 
     def starts(self) -> tuple[tuple[int, ...], int]:
         """Return the number of each component's first discrete action, and that of the first option."""

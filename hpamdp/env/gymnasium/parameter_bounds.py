@@ -133,7 +133,7 @@ def agent_bounds(actions: ActionSpace, low: np.ndarray, high: np.ndarray) -> tup
         the smallest one above the lower bound. Last, all lower and all upper bounds as the agent observes them, float32
         `[N, 2 num_parameters]`: scaled so that the bounds of the space are -1 and 1.
     """
-    exact = actions.to_agent(low), actions.to_agent(high)
+    exact = actions.map.parameters(low), actions.map.parameters(high)
     width = actions.high.astype(np.float64) - actions.low
     lowest, highest = (side.astype(np.float32) for side in exact)
     lowest = np.where(lowest < exact[0], np.nextafter(lowest, np.float32(np.inf)), lowest)

@@ -79,8 +79,7 @@ class ParameterTree:
 
     Attributes:
         size: number of parameters.
-        low, high: bounds of the agent's parameters, float64 `[size]`.
-        is_integer: which of the agent's parameters are integers, bool `[size]`.
+        map: how the agent's parameters become the space's own.
 
     Raises:
         NotAcceptedError: the tree has a space of another kind, or bounds that are not finite.
@@ -90,27 +89,20 @@ class ParameterTree:
         self.size = 0
         self._entries: list[_Entry] = []
         self._build, self._fill = self._read(space)
-        self._lows = self._joined("low")
-        self._highs = self._joined("high")
+        low, high = self._joined("low"), self._joined("high")
         is_float = self._spread(lambda entry: entry.is_float)
         is_precise = self._spread(lambda entry: entry.is_float and np.dtype(entry.space.dtype).itemsize > 4)
         with np.errstate(over="ignore"):
             floats = {np.dtype(entry.space.dtype) for entry in self._entries if entry.is_float}
-            self._bounds = {dtype: (self._lows.astype(dtype), self._highs.astype(dtype)) for dtype in floats}
+            self._bounds = {dtype: (low.astype(dtype), high.astype(dtype)) for dtype in floats}
         if len(floats) == 0 or not all(entry.is_float for entry in self._entries):
-            self._bounds[_WHOLE] = (self._lows, self._highs)
-        is_many = ~is_float & (self._highs - self._lows >= _MOST_EXACT)
-        largest = np.maximum(np.abs(self._lows), np.abs(self._highs))
-        # The agent's parameter lies in [-1, 1].
-        self._is_unit = (is_precise & ~_is_resolved(self._lows, self._highs)) | is_many
-        # Integers with too many values for float32, which have cells in [-1, 1].
-        self._is_many = is_many
+            self._bounds[_WHOLE] = (low, high)
+        is_many = ~is_float & (high - low >= _MOST_EXACT)
+        is_unit = (is_precise & ~_is_resolved(low, high)) | is_many
         # Lower bounds of integers that float32 holds only if they are counted from there.
-        self._shift = np.where(~is_float & ~is_many & (largest > _MOST_EXACT), self._lows, 0.0)
-        self._is_mapped = bool(self._is_unit.any() or self._shift.any())
-        self.low = np.where(self._is_unit, -1.0, self._lows - self._shift)
-        self.high = np.where(self._is_unit, 1.0, self._highs - self._shift)
-        self.is_integer = ~is_float & ~is_many
+        shift = np.where(~is_float & ~is_many & (np.maximum(np.abs(low), np.abs(high)) > _MOST_EXACT), low, 0.0)
+        self.map = ParameterMap(low, high, shift, is_unit, is_many, ~is_float)
+        self._is_mapped = not self.map.is_identity
 
     def natives(self, parameters: np.ndarray, bounds: tuple[np.ndarray, np.ndarray] | None = None) -> list[Any]:
         """Return values of the space.
@@ -121,7 +113,7 @@ class ParameterTree:
             bounds: narrower bounds of the space's own parameters, float64 `[M, size]` each.
         """
         if self._is_mapped:
-            parameters = self._mapped(parameters)
+            parameters = self.map.numbers(parameters)
         # Clipped in the space's own precision: its bounds may differ from the float32 ones by rounding. fmax skips NaN.
         clipped = {}
         for dtype, (low, high) in self._bounds.items():
@@ -133,36 +125,6 @@ class ParameterTree:
                 low, high = (low, high) if bounds is None else (_cast(bounds[0], dtype), _cast(bounds[1], dtype))
             clipped[dtype] = np.fmin(np.fmax(values, low), high)
         return self._build(clipped)
-
-    def _mapped(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the space's own parameters, given the agent's, `[M, size]`."""
-        fraction = 0.5 * (np.clip(parameters.astype(np.float64), -1.0, 1.0) + 1.0)
-        width = self._highs - self._lows
-        offset = np.where(self._is_many, np.floor(fraction * (width + 1.0)), fraction * width)
-        shifted = np.where(self._shift != 0.0, parameters + self._shift, parameters)
-        return np.where(self._is_unit, self._lows + offset, shifted)
-
-    def to_agent(self, own: np.ndarray) -> np.ndarray:
-        """Return the agent's parameters, float64, given the space's own, `[*M, size]`."""
-        half_cell = np.where(self._is_many, 0.5, 0.0)
-        width = np.maximum(self._highs - self._lows + 2.0 * half_cell, np.finfo(float).tiny)
-        with np.errstate(invalid="ignore"):
-            unit = 2.0 * (own - self._lows + half_cell) / width - 1.0
-        return np.where(self._is_unit, unit, own - self._shift)
-
-    @property
-    def own_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bounds of the space's own parameters, float64 `[size]` each."""
-        return self._lows, self._highs
-
-    def parameter_map(self) -> ParameterMap:
-        """Return what `natives` does with parameters, apart from clipping and rounding to the space's dtype."""
-        return ParameterMap(self._lows, self._highs, self._shift, self._is_unit, self._is_many, self.is_whole)
-
-    @property
-    def is_whole(self) -> np.ndarray:
-        """Which of the space's own parameters are integers, bool `[size]`."""
-        return self.is_integer | self._is_many
 
     def fill(self, given: Any, numbers: np.ndarray) -> None:
         """Write numbers that are given in the structure of the space into a vector of the space's own parameters.
