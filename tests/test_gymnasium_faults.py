@@ -41,7 +41,7 @@ def test_a_fault_is_told_in_one_line_that_says_whose_it_is_and_where(where):
 
 
 def test_a_bug_of_the_package_itself_is_no_fault_of_an_environment(monkeypatch):
-    monkeypatch.setattr(ObservationSpace, "rounded", None)
+    monkeypatch.setattr(ObservationSpace, "quick", None)
     with pytest.raises(TypeError, match="not callable"):
         play("toy_environments:Toy")
 

@@ -94,10 +94,10 @@ def test_entries_are_chosen_in_their_order():
     parts = spaces.Dict(a=spaces.Box(0, 1, (2,)), b=spaces.Discrete(2), c=spaces.Tuple([spaces.MultiBinary(2)]))
     space = ObservationSpace(parts, ["c", "a"])
     assert space.dim == 4
-    vector = space.flat({"a": np.float32([0.25, 0.5]), "b": 7, "c": (np.array([0, 1], np.int8),)})
+    vector, _ = space.read({"a": np.float32([0.25, 0.5]), "b": 7, "c": (np.array([0, 1], np.int8),)})
     assert vector.tolist() == [0.0, 1.0, 0.25, 0.5]
     with pytest.raises(ValueError, match=r"without its entry c\.0"):
-        space.flat({"a": np.zeros(2)})
+        space.read({"a": np.zeros(2)})
 
 
 @pytest.mark.parametrize("entries", [[], ["a"], [0, 0]])

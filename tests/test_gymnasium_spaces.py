@@ -69,10 +69,8 @@ def test_entries_with_very_many_values_are_read_as_ordered_numbers_with_a_warnin
 
 def test_observed_entries_with_very_many_values_are_numbers():
     space = ObservationSpace(Dict(m=MultiDiscrete([MANY, 3]), n=Discrete(MANY, start=4)))
-    assert space.flat({"m": np.array([7, 2]), "n": np.int64(5)}).tolist() == [7.0, 2.0, 5.0]
-    vector = np.zeros(3)
-    space.writer(vector, np.zeros(0, np.uint8))({"m": np.array([9, 1]), "n": 6})
-    assert vector.tolist() == [9.0, 1.0, 6.0]
+    assert space.read({"m": np.array([7, 2]), "n": np.int64(5)})[0].tolist() == [7.0, 2.0, 5.0]
+    assert space.quick([{"m": np.array([9, 1]), "n": np.array(6)}])[0].tolist() == [[9.0, 1.0, 6.0]]
 
 
 @pytest.mark.parametrize(("high", "is_told"), [(500_000.0, True), (2.0, False), (np.inf, False)])
@@ -146,8 +144,8 @@ def test_observations_are_flattened():
     value = (np.array([[1.5], [-2.0]], np.float32), np.int64(2), {"a": np.array([1, 0], np.int8)})
     space = ObservationSpace(MIXED)
     plain, scaled = (ObservationScaling(space, scaling) for scaling in ("none", "bounds"))
-    assert plain.scaled(space.flat(value)[None]).tolist() == [[1.5, -2.0, 0.0, 1.0, 0.0, 1.0, 0.0]]
-    assert scaled.scaled(space.flat(value)[None]).tolist() == [[0.75, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0]]
+    assert plain.scaled(space.read(value)[0][None]).tolist() == [[1.5, -2.0, 0.0, 1.0, 0.0, 1.0, 0.0]]
+    assert scaled.scaled(space.read(value)[0][None]).tolist() == [[0.75, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0]]
 
 
 def test_entries_without_bounds_stay_as_they_are():
@@ -160,7 +158,7 @@ def test_entries_without_bounds_stay_as_they_are():
         )
         assert seen.tolist() == [[-0.5, 7.0, 7.0, 7.0, 7.0, 5.0, -1.0], [3.5, 7.0, 7.0, 7.0, 7.0, 5.0, -1.0]]
     image = ObservationSpace(spaces.Box(0, 255, (2, 2), np.uint8))
-    seen = ObservationScaling(image, "bounds").scaled(image.flat(np.array([[0, 255], [0, 255]], np.uint8))[None])
+    seen = ObservationScaling(image, "bounds").scaled(image.read(np.array([[0, 255], [0, 255]], np.uint8))[0][None])
     assert seen.tolist() == [[-1.0, 1.0, -1.0, 1.0]]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -13,9 +13,10 @@ import numpy as np
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError, closed_on_error, fault_of
 from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
 from hpamdp.env.gymnasium.contract import ContractCheck, checked_step, refuse_running_statistics, refuse_step
+from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.masks import Masks
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
-from hpamdp.env.gymnasium.options import ActionForm, MaskSource, OutOfBounds
+from hpamdp.env.gymnasium.options import GymnasiumOptions
 from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds
 from hpamdp.env.gymnasium.time_limit import limit_of
 from hpamdp.env.gymnasium.values import flag
@@ -31,33 +32,14 @@ _PICTURES_PER_SECOND = 4.0
 
 
 @dataclass(frozen=True)
-class Reading:
-    """How an environment's spaces are read: settings of `env=gymnasium`.
-
-    Attributes:
-        flattens_pictures: whether pictures are part of the vectors.
-    """
-
-    max_steps: int | None = None
-    action_form: ActionForm = "auto"
-    parameter_dims: tuple[int, ...] | None = None
-    option_key: int | str | None = None
-    action_mask: MaskSource | None = None
-    pair_mask: MaskSource | None = None
-    parameter_bounds: MaskSource | None = None
-    observation_keys: tuple[int | str, ...] | None = None
-    out_of_bounds: OutOfBounds = "refuse"
-    flattens_pictures: bool = False
-
-
-@dataclass(frozen=True)
 class Results:
     """What the copies have last returned, float64, a row for each copy.
 
     Attributes:
         observation: `[N, dim]`, flattened but not scaled, without pictures.
-        reward, terminated, truncated, success, has_success: `[N]`. `has_success` is 1 if the last info had a success.
-        flags: the four of these that are flags, one after another, `[4, N]`.
+        reward: `[N]`.
+        flags: whether the episode terminated, whether it was truncated, its success, and whether the last info had one,
+            0 or 1, `[4, N]`.
         masks: by name, `[N, K]`.
         bounds: the parameters' lower and upper bounds in the space's own numbers, `[N, num_parameters]` each; None if
             the bounds do not depend on the state.
@@ -65,10 +47,6 @@ class Results:
 
     observation: np.ndarray
     reward: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    success: np.ndarray
-    has_success: np.ndarray
     flags: np.ndarray
     masks: dict[str, np.ndarray]
     bounds: tuple[np.ndarray, np.ndarray] | None
@@ -103,9 +81,8 @@ class Layout:
             start += size
         middle = start + self.num_bounded
         bounds = (table[:, start:middle], table[:, middle:]) if self.num_bounded else None
-        reward, terminated, truncated, success, has_success = after = table[:, self.dim : self.dim + _NUM_AFTER].T
-        observation, flags = table[:, : self.dim], after[1:]
-        return Results(observation, reward, terminated, truncated, success, has_success, flags, masks, bounds)
+        reward, *_ = after = table[:, self.dim : self.dim + _NUM_AFTER].T
+        return Results(table[:, : self.dim], reward, after[1:], masks, bounds)
 
 
 class Copies:
@@ -114,8 +91,8 @@ class Copies:
     Args:
         make: makes a copy.
         num: number of copies.
-        reading: how its spaces are read.
-        name: what errors call the environment.
+        settings: how its spaces are read.
+        flattens_pictures: whether pictures are part of the vectors.
         first: number of the first copy in errors.
 
     Attributes:
@@ -134,17 +111,17 @@ class Copies:
     """
 
     def __init__(
-        self, make: Callable[[], gymnasium.Env], num: int, reading: Reading, name: str, first: int = 0
+        self, make: Maker, num: int, settings: GymnasiumOptions, flattens_pictures: bool = False, first: int = 0
     ) -> None:
-        self._name = name
+        self._name = make.name
         self._first = first
         self.envs: list[gymnasium.Env] = []
         with closed_on_error(self):
             for _ in range(num):
                 self.envs.append(make())
-            self._read(num, reading)
+            self._read(num, settings, flattens_pictures)
 
-    def _read(self, num: int, reading: Reading) -> None:
+    def _read(self, num: int, settings: GymnasiumOptions, flattens_pictures: bool) -> None:
         """Read the spaces, and set up what each step needs."""
         self._check_spaces()
         try:
@@ -155,20 +132,20 @@ class Copies:
                     "environment does not know which of the two it is in; use the problem itself, such as env=pinball"
                 )
             refuse_running_statistics(self.example)
-            self._limits = [limit_of(env, reading.max_steps) for env in self.envs]
+            self._limits = [limit_of(env, settings.max_steps) for env in self.envs]
             self.max_steps = max(self._limits)
             space = self.envs[0].observation_space
-            self.options = OptionSpace(self.envs[0].action_space, reading.option_key)
-            self.actions = ActionSpace(self.options.rest, reading.parameter_dims, reading.action_form)
-            sources = reading.action_mask, reading.pair_mask
+            self.options = OptionSpace(self.envs[0].action_space, settings.option_key)
+            self.actions = ActionSpace(self.options.rest, settings.parameter_dims, settings.action_form)
+            sources = settings.action_mask, settings.pair_mask
             self._masks = Masks(self.envs[0], num, self.actions, self.options.num_options, *sources)
-            self._bounds = ParameterBounds(self.envs[0], num, self.actions, reading.parameter_bounds)
-            entries: Sequence[int | str] | None = reading.observation_keys
+            self._bounds = ParameterBounds(self.envs[0], num, self.actions, settings.parameter_bounds)
+            entries: Sequence[int | str] | None = settings.observation_keys
             apart = {*self._masks.in_observation, *(self._bounds.names if self._bounds.in_observation else ())}
             if apart and entries is None:
                 entries = [entry for entry in getattr(space, "spaces", {}) if entry not in apart]
             self.observations = ObservationSpace(
-                space, entries, reading.out_of_bounds, flattens_pictures=reading.flattens_pictures
+                space, entries, settings.out_of_bounds, flattens_pictures=flattens_pictures
             )
         except ValueError as error:
             raise SettingError(f"{self._name}: {error}") from error
@@ -182,8 +159,6 @@ class Copies:
         self.pixels = np.zeros((num, self.layout.num_pixels), np.uint8)
         self.results = self.layout.results(self.table)
         # What each step needs, looked up once.
-        rows = zip(self.results.observation, self.pixels, strict=True)
-        self._write = [self.observations.writer(*row) for row in rows]
         # Without the outer check, whose work `step` does in its loop.
         self._inner = [env.env if isinstance(env, ContractCheck) else env for env in self.envs]
         self._num_steps = [0] * num
@@ -227,19 +202,18 @@ class Copies:
             ProblemError: a copy broke its contract.
             EnvironmentFaultError: its `reset` raised an error.
         """
-        rows = np.array([*seeds], np.int64)
-        unchecked: dict[int, Any] = {}
+        rows, seen = [*seeds], []
         try:
             for self._row, seed in seeds.items():
                 env = self.envs[self._row]
                 observation, info = env.reset(seed=seed)
                 self._check_unchanged(self._row)
-                if self._write[self._row](observation):
-                    unchecked[self._row] = observation
+                seen.append(observation)
                 self._masks.keep(self._row, observation, info)
                 self._bounds.keep(self._row, observation, info)
                 self._num_steps[self._row] = 0
-            self._settle(rows, unchecked)
+            if rows:
+                self._settle(rows, rows, seen)
         except Exception as error:
             self._explain("reset", error)
         self._after[rows] = 0.0
@@ -259,10 +233,10 @@ class Copies:
         """
         index: Any = _ALL if len(rows) == len(self.envs) else rows
         natives = self._natives(index, option, discrete, parameters)
-        envs, write, num_steps, limits = self._inner, self._write, self._num_steps, self._limits
+        envs, num_steps, limits = self._inner, self._num_steps, self._limits
         rewards: list[float] = []
         flags: dict[int, tuple[bool, ...]] = {}  # of the few copies that have one
-        unchecked: dict[int, Any] = {}
+        seen: list[Any] = []
         try:
             for row, action in zip(rows, natives, strict=True):
                 self._row = row
@@ -272,8 +246,7 @@ class Copies:
                     refuse_step(error)
                     raise
                 observation, reward, terminated, truncated, info = checked_step(values)
-                if write[row](observation):
-                    unchecked[row] = observation
+                seen.append(observation)
                 rewards.append(reward)
                 num_steps[row] += 1
                 truncated = not terminated and (truncated or num_steps[row] >= limits[row])
@@ -287,7 +260,7 @@ class Copies:
                 if terminated or truncated or success is not None:
                     flags[row] = (terminated, truncated, bool(success), success is not None)
             if rows:
-                self._settle(index, unchecked)
+                self._settle(index, rows, seen)
         except Exception as error:
             self._explain("step", error)
         self.results.flags[:, index] = 0.0
@@ -309,21 +282,21 @@ class Copies:
         chosen = zip(natives, option[index].tolist(), strict=True)
         return [self.options.with_option(native, number) for native, number in chosen]
 
-    def _settle(self, rows: Any, unchecked: Mapping[int, Any]) -> None:
-        """Check the observations that these copies have written, and keep their masks and bounds.
+    def _settle(self, index: Any, rows: list[int], seen: list[Any]) -> None:
+        """Keep what these copies have returned: observations, masks and bounds.
 
         Args:
-            rows: index of the copies' rows.
-            unchecked: observations whose numbers may be outside their bounds, by row.
+            index: of the copies' rows.
+            rows: their numbers.
+            seen: their observations.
         """
-        observations = self.results.observation
-        vectors = observations[rows]
-        for number in self.observations.unsettled(vectors):
-            row = number if rows is _ALL else int(rows[number])
-            if row in unchecked:
-                self._row = row
-                vectors[number] = self.observations.flat(unchecked[row])
-        observations[rows] = self.observations.rounded(vectors)
+        found: Any = self.observations.quick(seen)
+        if found is None:
+            read = []
+            for self._row, observation in zip(rows, seen, strict=True):
+                read.append(self.observations.read(observation))
+            found = map(np.stack, zip(*read, strict=True))
+        self.results.observation[index], self.pixels[index] = found
         for name, masks in self._masks.rows.items():
             self.results.masks[name][:] = masks
         if self.results.bounds is not None:

@@ -23,7 +23,7 @@ from hpamdp.env.actions import check_action_values, invalid_action
 from hpamdp.env.base import OBSERVATION_ENTRIES, PAMDPEnv, ProblemError, checked_option_names
 from hpamdp.env.errors import closed_on_error
 from hpamdp.env.facts import NAMING_SETTINGS
-from hpamdp.env.gymnasium.copies import Copies, Reading
+from hpamdp.env.gymnasium.copies import Copies
 from hpamdp.env.gymnasium.form import NativeForm, joined
 from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.masks import as_leaf
@@ -114,8 +114,8 @@ class GymnasiumEnv(PAMDPEnv):
         self.first_env = first_env
         self._name = f"GymnasiumEnv: {options.entry_point or options.id or getattr(make, '__name__', 'environment')}"
         maker = Maker(self._name, options.id, options.entry_point or make, options.kwargs, options.max_steps)
-        self._reading = _reading_of(options, flatten_pictures)
-        self._copies = self._make_copies(maker)
+        self._settings = options
+        self._copies = self._make_copies(maker, flatten_pictures)
         self.is_closed = False  # TorchRL's flag: from here on there are copies to close
         with closed_on_error(self):
             self._set_up(seed)
@@ -156,10 +156,10 @@ class GymnasiumEnv(PAMDPEnv):
         self._reports_success = False
         self._set_seed(seed)
 
-    def _make_copies(self, make: Maker) -> Copies | ProcessCopies:
-        num_workers = self.options.num_workers
+    def _make_copies(self, make: Maker, flattens_pictures: bool) -> Copies | ProcessCopies:
+        num_workers = self._settings.num_workers
         if num_workers == 0:
-            return Copies(make, self.num_envs, self._reading, self._name)
+            return Copies(make, self.num_envs, self._settings, flattens_pictures)
         if multiprocessing.current_process().daemon:
             raise SettingError(f"{self._name}: {num_workers=}: a worker process cannot start others; use 0")
         why = why_unsendable(make)
@@ -168,7 +168,7 @@ class GymnasiumEnv(PAMDPEnv):
                 f"{self._name}: {num_workers=}: cannot be sent to processes ({why}); create what it refers to in its "
                 "constructor or function, or use 0"
             )
-        return ProcessCopies(make, self.num_envs, self._reading, self._name, num_workers)
+        return ProcessCopies(make, self.num_envs, self._settings, flattens_pictures)
 
     @property
     def envs(self) -> list[gymnasium.Env]:
@@ -209,7 +209,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     def gymnasium_form(self) -> NativeForm:
         """Return the form of the environment itself."""
-        return NativeForm(self._copies, self.scaling, self._reading)
+        return NativeForm(self._copies, self.scaling, self._settings)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `success` bool `[M]` if any info so far had it, and with `reward_scaling` the unscaled `return`."""
@@ -222,7 +222,7 @@ class GymnasiumEnv(PAMDPEnv):
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]] | None:
         """The lowest and the highest scaled observation; None with running statistics or `out_of_bounds=allow`."""
-        if self.scaling.statistics is not None or self._reading.out_of_bounds == "allow":
+        if self.scaling.statistics is not None or self._settings.out_of_bounds == "allow":
             return None
         layout = self._copies.layout
         with np.errstate(over="ignore"):
@@ -324,13 +324,16 @@ class GymnasiumEnv(PAMDPEnv):
             statistics.add(columns)
 
     def film_state(self, num: int) -> dict[str, Tensor]:
-        """Return what the first `num` copies draw, if their `render_mode` is `rgb_array`: uint8 `[num, H, W, 3]`.
+        """Return what the first `num` copies draw, if their `render_mode` is `rgb_array`: uint8 `[num, S, S, 3]`.
 
-        Pictures that are smaller than another one get a white margin.
+        Pictures that are not square get white margins. S is that of the largest one, or less.
         """
         if not self._copies.has_pictures:
             return {}
-        return {_PICTURE: torch.from_numpy(_stacked([_fitted(picture) for picture in self._copies.pictures(num)]))}
+        images = [Image.fromarray(picture) for picture in self._copies.pictures(num)]
+        side = min(_LARGEST_PICTURE, max(max(image.size) for image in images))
+        squares = [np.array(ImageOps.pad(image, (side, side), color="white")) for image in images]
+        return {_PICTURE: torch.from_numpy(np.stack(squares))}
 
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
         """Yield the pictures of `render`, each for as long as the environment's `render_fps` says.
@@ -432,10 +435,11 @@ class GymnasiumEnv(PAMDPEnv):
             is_stepped &= tensordict.get("_step").reshape(-1).numpy(force=True)
         is_all = bool(is_stepped.all())
         self._copies.step(self._rows if is_all else np.flatnonzero(is_stepped).tolist(), option, chosen, values)
+        terminated, truncated, *_ = results.flags
         if self._terminates_at_limit:
-            results.terminated[is_stepped & (results.truncated > 0.0)] = 1.0
+            terminated[is_stepped & (truncated > 0.0)] = 1.0
         if self._first_ends.any():
-            results.truncated[is_stepped & (self._first_ends == 1) & (results.terminated == 0.0)] = 1.0
+            truncated[is_stepped & (self._first_ends == 1) & (terminated == 0.0)] = 1.0
             self._first_ends -= is_stepped & (self._first_ends > 0)
         self._scale(is_stepped, is_all=is_all)
         rewards = results.reward if is_all else np.where(is_stepped, results.reward, 0.0)
@@ -573,38 +577,6 @@ class SimulatorEnv(GymnasiumEnv):
 
     def _prepare(self) -> None:
         """Set what follows from the settings, such as the names of the actions."""
-
-
-def _reading_of(options: GymnasiumOptions, flattens_pictures: bool) -> Reading:
-    return Reading(
-        max_steps=options.max_steps,
-        action_form=options.action_form,
-        parameter_dims=None if options.parameter_dims is None else tuple(options.parameter_dims),
-        option_key=options.option_key,
-        action_mask=options.action_mask,
-        pair_mask=options.pair_mask,
-        parameter_bounds=options.parameter_bounds,
-        observation_keys=None if options.observation_keys is None else tuple(options.observation_keys),
-        out_of_bounds=options.out_of_bounds,
-        flattens_pictures=flattens_pictures,
-    )
-
-
-def _fitted(picture: np.ndarray) -> np.ndarray:
-    """Return a picture with at most `_LARGEST_PICTURE` px from edge to edge."""
-    image = Image.fromarray(picture)
-    image.thumbnail((_LARGEST_PICTURE, _LARGEST_PICTURE))
-    return np.array(image)
-
-
-def _stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Return pictures of any sizes as uint8 `[N, H, W, 3]`, each in the middle of a white one of the largest size."""
-    height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
-    stacked = np.full((len(pictures), height, width, 3), 255, np.uint8)
-    for whole, picture in zip(stacked, pictures, strict=True):
-        top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
-        whole[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
-    return stacked
 
 
 def _seeds(seed: int, num: int, stream: int, first: int = 0) -> list[int]:

@@ -13,8 +13,9 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
-from hpamdp.env.gymnasium.copies import Copies, Reading
+from hpamdp.env.gymnasium.copies import Copies
 from hpamdp.env.gymnasium.masks import Masks, as_leaf
+from hpamdp.env.gymnasium.options import GymnasiumOptions
 from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds, agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling
@@ -29,26 +30,27 @@ class NativeForm(GymnasiumForm):
     Args:
         copies: the copies of the environment.
         scaling: how their observations are scaled.
-        reading: how their spaces are read.
+        settings: how their spaces are read.
     """
 
-    def __init__(self, copies: Copies | ProcessCopies, scaling: ObservationScaling, reading: Reading) -> None:
+    def __init__(self, copies: Copies | ProcessCopies, scaling: ObservationScaling, settings: GymnasiumOptions) -> None:
         self._env = copies.example
         self.observation_space, self.action_space = self._env.observation_space, self._env.action_space
         self._observations, self._actions, self._options = copies.observations, copies.actions, copies.options
-        self._scaling, self._reading = scaling, reading
+        self._scaling, self._settings = scaling, settings
 
     def read(self, observation: Any, info: Mapping[str, Any] | None = None) -> tuple[TensorDict, bool]:
         """Return the rows of `GymnasiumForm.read`."""
         num = num_in_batch(self.observation_space, observation)
         space: Any = self.observation_space
         singles = [observation] if num is None else list(iterate(batch_space(space, num), observation))
-        vectors = self._observations.rounded(np.stack([self._observations.flat(single) for single in singles]))
+        read = (self._observations.read(single) for single in singles)
+        vectors, pixels = self._observations.quick(singles) or map(np.stack, zip(*read, strict=True))
         observed = self._scaling.rescaled(vectors)
-        reading, actions = self._reading, self._actions
-        sources = reading.action_mask, reading.pair_mask
+        settings, actions = self._settings, self._actions
+        sources = settings.action_mask, settings.pair_mask
         masks = Masks(self._env, len(singles), actions, self._options.num_options, *sources)
-        bounds = ParameterBounds(self._env, len(singles), actions, reading.parameter_bounds)
+        bounds = ParameterBounds(self._env, len(singles), actions, settings.parameter_bounds)
         in_info = [*masks.needs_info, *(() if bounds.in_observation else bounds.names)]
         if in_info and info is None:
             raise ValueError(f"give the info of the step, which holds {' and '.join(in_info)}")
@@ -67,7 +69,6 @@ class NativeForm(GymnasiumForm):
             low, high, seen = agent_bounds(actions, bounds.low, bounds.high)
             observed = np.concatenate([observed, seen], axis=-1)
             rows |= {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
-        pixels = np.stack([self._observations.pixels(single) for single in singles])
         rows[keys.OBSERVATION] = torch.from_numpy(joined(observed, pixels))
         return TensorDict(rows, batch_size=[len(singles)]), num is not None
 

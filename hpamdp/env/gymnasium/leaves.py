@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,7 @@ class Leaf:
     Attributes:
         what: the leaf in words, such as `entry a.b`.
         size: length of its vector.
-        lowest, highest: bounds `[size]` of what a `writer` leaves unchecked. `flat` checks others.
+        lowest, highest: bounds `[size]` of what `quick` leaves unchecked. `flat` checks others.
         clip_low, clip_high: bounds `[size]` that numbers are moved to; infinite if they are kept or refused.
         rounding: dtype that the vector is rounded to; None if it needs no rounding.
     """
@@ -66,78 +66,54 @@ class Leaf:
         self.clip_low = np.full(self.size, -np.inf)
         self.clip_high = np.full(self.size, np.inf)
         self.rounding: np.dtype | None = None
-        self._plain_dtypes: frozenset[np.dtype] = frozenset()
-        self._first = int(space.start) if isinstance(space, spaces.Discrete) else 0
+        self._plain_dtypes = frozenset(_WHOLE)
+        self._offsets: np.ndarray | None = None  # of the numbers in a one-hot vector
         if isinstance(space, spaces.Box):
             self._read_bounds(space)
-        elif isinstance(space, spaces.MultiBinary):
-            self._plain_dtypes = frozenset(_WHOLE)
-        elif isinstance(space, spaces.MultiDiscrete):
-            self._plain_dtypes = frozenset(_WHOLE)
-            self._start, self._sizes = space.start, space.nvec
-            self._offsets = np.cumsum(space.nvec.ravel()) - space.nvec.ravel()
+        elif isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+            sizes: Any = space.n if isinstance(space, spaces.Discrete) else space.nvec
+            self._start, self._sizes = np.ravel(space.start), np.ravel(sizes)
+            self._offsets = np.cumsum(self._sizes) - self._sizes
 
-    def writer(self, vector: np.ndarray) -> Callable[[Any], bool]:
-        """Return a function that writes the leaf's part of an observation into a vector, float64 `[size]`.
+    def quick(self, observations: Sequence[Any]) -> np.ndarray | None:
+        """Return the leaf's part of M observations, float64 `[M, size]`; None if one has to be checked by `flat`.
 
-        It writes only parts of a plain kind: arrays of the space's shape whose dtype the space can hold, and whole
-        numbers of a `Discrete`. This is the quick way. Numbers are compared with their bounds later, for all
-        environments at once.
+        This is the quick way for parts of a plain kind: arrays of the space's shape whose dtype the space can hold, and
+        whole numbers of a `Discrete`, all within their bounds.
 
-        The function returns whether the part is plain. Otherwise use `flat`, which also checks it. It raises a
-        ProblemError if the part is missing.
+        Raises:
+            ProblemError: an observation lacks the part.
         """
-        find = self._find
+        values = [self._find(observation) for observation in observations]
         if isinstance(self.space, spaces.Discrete):
-            return lambda observation: self._write_discrete(find(observation), vector)
-        if isinstance(self.space, spaces.MultiDiscrete):
-            return lambda observation: self._write_multi_discrete(find(observation), vector)
-        shape, dtypes, has_path = self.space.shape, self._plain_dtypes, bool(self.path)
-        shaped = vector.reshape(shape or ())
+            are_plain = all(type(value) in _INTEGERS for value in values)
+        else:
+            are_plain = self._are_arrays(values, self._plain_dtypes)
+        if not are_plain:
+            return None
+        given = np.array(values).reshape(len(values), -1)
+        if self._offsets is not None:
+            whole = given.astype(np.int64) - self._start
+            if not ((whole >= 0) & (whole < self._sizes)).all():
+                return None
+            vectors = np.zeros((len(values), self.size))
+            np.put_along_axis(vectors, self._offsets + whole, 1.0, 1)
+            return vectors
+        vectors = given.astype(np.float64)
+        if not ((vectors >= self.lowest) & (vectors <= self.highest)).all():
+            return None
+        if self._out_of_bounds == "clip":
+            vectors = vectors.clip(self.clip_low, self.clip_high)
+        return vectors if self.rounding is None else vectors.astype(self.rounding).astype(np.float64)
 
-        def write(observation: Any) -> bool:
-            value = find(observation) if has_path else observation
-            if type(value) is not np.ndarray or value.dtype not in dtypes or value.shape != shape:
-                return False
-            shaped[...] = value
-            return True
+    def quick_pixels(self, observations: Sequence[Any]) -> np.ndarray | None:
+        """Return the leaf's pictures, uint8 `[M, size]`, as `quick` does; only uint8 cannot be outside the space."""
+        values = [self._find(observation) for observation in observations]
+        return np.array(values).reshape(len(values), -1) if self._are_arrays(values, {np.dtype(np.uint8)}) else None
 
-        return write
-
-    def pixel_writer(self, pixels: np.ndarray) -> Callable[[Any], bool]:
-        """Return a function that writes a picture into pixels, uint8 `[size]`, as `writer` does for numbers.
-
-        It writes only uint8, since bytes cannot hold what is outside the space.
-        """
+    def _are_arrays(self, values: Sequence[Any], dtypes: Container[np.dtype]) -> bool:
         shape = self.space.shape
-        shaped = pixels.reshape(shape or ())
-
-        def write(observation: Any) -> bool:
-            value = self._find(observation)
-            if type(value) is not np.ndarray or value.dtype != np.uint8 or value.shape != shape:
-                return False
-            shaped[...] = value
-            return True
-
-        return write
-
-    def _write_discrete(self, value: Any, vector: np.ndarray) -> bool:
-        index = int(value) - self._first if type(value) in _INTEGERS else -1
-        if not 0 <= index < self.size:
-            return False
-        vector[:] = 0.0
-        vector[index] = 1.0
-        return True
-
-    def _write_multi_discrete(self, value: Any, vector: np.ndarray) -> bool:
-        if type(value) is not np.ndarray or value.dtype not in self._plain_dtypes or value.shape != self.space.shape:
-            return False
-        whole = value.astype(np.int64) - self._start
-        is_inside = bool(((whole >= 0) & (whole < self._sizes)).all())
-        if is_inside:
-            vector[:] = 0.0
-            vector[self._offsets + whole.ravel()] = 1.0
-        return is_inside
+        return all(type(value) is np.ndarray and value.dtype in dtypes and value.shape == shape for value in values)
 
     def flat(self, observation: Any, cure: str = "") -> np.ndarray:
         """Return the leaf's part of an observation as a vector, float64; discrete values are one-hot.

@@ -12,13 +12,15 @@ vector without a word.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim, flatten_space
 
+from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.action_spaces import written
 from hpamdp.env.gymnasium.leaves import Leaf, children, leaves
 from hpamdp.env.gymnasium.options import OutOfBounds
@@ -74,11 +76,6 @@ class ObservationSpace:
         self.slices = _slices(self.leaves)
         self.num_pixels = sum(leaf.size for leaf in self._pictures)
         self._picture_slices = _slices(self._pictures)
-        self._lowest = _joined([leaf.lowest for leaf in self.leaves])
-        self._highest = _joined([leaf.highest for leaf in self.leaves])
-        self._clip_low = _joined([leaf.clip_low for leaf in self.leaves])
-        self._clip_high = _joined([leaf.clip_high for leaf in self.leaves])
-        self._is_clipped = out_of_bounds == "clip"
 
     def entries(self, num_bounds: int = 0) -> tuple[ObservationEntry, ...]:
         """Return the entries of observations in which the pictures follow the vector; none without a picture.
@@ -135,58 +132,28 @@ class ObservationSpace:
         assert isinstance(box, spaces.Box)  # as are all spaces that `_is_flat` lets pass
         return box.low.astype(np.float64), box.high.astype(np.float64)
 
-    def flat(self, observation: Any) -> np.ndarray:
-        """Return the vector of an observation, float64 `[dim]`.
+    def quick(self, observations: Sequence[Any]) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return what `read` returns for M observations, stacked; None if `read` has to check them, one by one."""
+        num = len(observations)
+        with suppress(ProblemError):  # an entry is missing
+            vectors = [leaf.quick(observations) for leaf in self.leaves]
+            pixels = [leaf.quick_pixels(observations) for leaf in self._pictures]
+            if all(part is not None for part in (*vectors, *pixels)):
+                return (
+                    np.concatenate([np.zeros((num, 0)), *vectors], 1),
+                    np.concatenate([np.zeros((num, 0), np.uint8), *pixels], 1),
+                )
+        return None
+
+    def read(self, observation: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the vector of an observation, float64 `[dim]`, and its pixels, uint8 `[num_pixels]`.
 
         Raises:
             ProblemError: an entry is missing or not in its space: see `Leaf`.
         """
-        return _joined([leaf.flat(observation, cure) for leaf, cure in zip(self.leaves, self._cures, strict=True)])
-
-    def pixels(self, observation: Any) -> np.ndarray:
-        """Return the pixels of an observation, uint8 `[num_pixels]`.
-
-        Raises:
-            ProblemError: a picture is missing or not in its space: see `Leaf`.
-        """
-        pixels = np.empty(self.num_pixels, np.uint8)
-        for leaf, own in zip(self._pictures, self._picture_slices, strict=True):
-            if not leaf.pixel_writer(pixels[own])(observation):
-                pixels[own] = leaf.picture(observation)
-        return pixels
-
-    def writer(self, vector: np.ndarray, pixels: np.ndarray) -> Callable[[Any], bool]:
-        """Return a function that writes an observation into a vector, float64 `[dim]`, and pixels uint8 `[num_pixels]`.
-
-        The function returns whether the numbers are still to be checked, by `unsettled` and `flat`. It raises a
-        ProblemError if an entry is missing, or if a value that is not plain is not in its space.
-        """
-        writers = [leaf.writer(vector[own]) for leaf, own in zip(self.leaves, self.slices, strict=True)]
-        for leaf, own in zip(self._pictures, self._picture_slices, strict=True):
-            writers.append(leaf.pixel_writer(pixels[own]))
-
-        def write_any(observation: Any) -> bool:
-            vector[:], pixels[:] = self.flat(observation), self.pixels(observation)
-            return False
-
-        if len(writers) == 1:  # saves a call
-            (write_leaf,) = writers
-            return lambda observation: write_leaf(observation) or write_any(observation)
-        return lambda observation: all([write(observation) for write in writers]) or write_any(observation)
-
-    def unsettled(self, vectors: np.ndarray) -> list[int]:
-        """Return which of the vectors `[M, dim]` that a `writer` wrote need a check by `flat`, one after another."""
-        is_inside = (vectors >= self._lowest) & (vectors <= self._highest)
-        return [] if np.logical_and.reduce(is_inside, None) else np.flatnonzero(~is_inside.all(1)).tolist()
-
-    def rounded(self, vectors: np.ndarray) -> np.ndarray:
-        """Return checked vectors `[M, dim]`, moved to their bounds if asked, in the precision of their spaces."""
-        if self._is_clipped:
-            vectors = vectors.clip(self._clip_low, self._clip_high)
-        for leaf, own in zip(self.leaves, self.slices, strict=True):
-            if leaf.rounding is not None:
-                vectors[:, own] = vectors[:, own].astype(leaf.rounding)
-        return vectors
+        vectors = [leaf.flat(observation, cure) for leaf, cure in zip(self.leaves, self._cures, strict=True)]
+        pixels = [leaf.picture(observation).astype(np.uint8) for leaf in self._pictures]
+        return _joined(vectors), np.concatenate([np.zeros(0, np.uint8), *pixels])
 
     @property
     def is_precise(self) -> bool:
@@ -201,10 +168,8 @@ class ObservationSpace:
         )
 
     def clip_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the bounds to which `rounded` clips, float64 `[dim]` each; infinite if it does not clip."""
-        if self._is_clipped:
-            return self._clip_low, self._clip_high
-        return np.full(self.dim, -np.inf), np.full(self.dim, np.inf)
+        """Return the bounds to which numbers are clipped, float64 `[dim]` each; infinite if they are not."""
+        return _joined([leaf.clip_low for leaf in self.leaves]), _joined([leaf.clip_high for leaf in self.leaves])
 
     def _cure(self, leaf: Leaf) -> str:
         """Return how to leave out the leaf's entry, as the end of a message; empty if there is no other entry."""

@@ -7,7 +7,7 @@ of all copies in it. So a step sends one message to each worker, and the copies 
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +18,9 @@ from gymnasium import logger, spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError, closed_on_error
-from hpamdp.env.gymnasium.copies import Copies, Reading
+from hpamdp.env.gymnasium.copies import Copies
+from hpamdp.env.gymnasium.making import Maker
+from hpamdp.env.gymnasium.options import GymnasiumOptions
 from hpamdp.env.registration import register
 from hpamdp.messages import warn
 from hpamdp.settings import SettingError
@@ -36,16 +38,16 @@ class _Block:
     """Some of the copies, which one worker steps. Calling it makes the worker's environment.
 
     Attributes:
-        make, reading, name: as for `Copies`.
+        make, settings, flattens_pictures: as for `Copies`.
         first: number of the first copy.
         num: number of copies.
         num_rows: number of rows of the tables, the same in all workers.
         num_columns: of the tables of actions, of results and of pixels.
     """
 
-    make: Callable[[], gymnasium.Env]
-    reading: Reading
-    name: str
+    make: Maker
+    settings: GymnasiumOptions
+    flattens_pictures: bool
     first: int
     num: int
     num_rows: int
@@ -75,7 +77,7 @@ class _BlockEnv(gymnasium.Env):
         block = self._block
         if self._copies is None:
             register()
-            self._copies = Copies(block.make, block.num, block.reading, block.name, block.first)
+            self._copies = Copies(block.make, block.num, block.settings, block.flattens_pictures, block.first)
         seeds = {row - block.first: seed for row, seed in (options or {})["seeds"].items()}
         self._copies.reset({row: seed for row, seed in seeds.items() if 0 <= row < block.num})
         return self._results(), {}
@@ -120,16 +122,15 @@ class _BlockEnv(gymnasium.Env):
 
 
 class ProcessCopies:
-    """As `Copies`, except that `num_workers` processes each step a part of the copies.
+    """As `Copies`, except that up to `settings.num_workers` processes each step a part of the copies.
 
     One more copy is made in this process, to read its spaces.
 
     Args:
         make: makes a copy; can be pickled.
         num: number of copies.
-        reading: how the spaces are read.
-        name: what errors call the environment.
-        num_workers: largest number of processes.
+        settings: how the spaces are read.
+        flattens_pictures: whether pictures are part of the vectors.
 
     Attributes:
         max_steps, option_names, has_pictures, pictures_per_second: as those of `Copies`.
@@ -142,13 +143,11 @@ class ProcessCopies:
         EnvironmentFaultError: a constructor raised an error.
     """
 
-    def __init__(
-        self, make: Callable[[], gymnasium.Env], num: int, reading: Reading, name: str, num_workers: int
-    ) -> None:
-        self._name = name
+    def __init__(self, make: Maker, num: int, settings: GymnasiumOptions, flattens_pictures: bool = False) -> None:
+        self._name = make.name
         self._is_broken = False
         self.envs: list[gymnasium.Env] = []
-        probe = Copies(make, 1, reading, name)
+        probe = Copies(make, 1, settings, flattens_pictures)
         probe.close()
         self.example = probe.example
         self.max_steps, self.option_names, self.layout = probe.max_steps, probe.option_names, probe.layout
@@ -157,12 +156,13 @@ class ProcessCopies:
         self.table = np.zeros((num, self.layout.num_result_columns))
         self.results = self.layout.results(self.table)
         self.pixels = np.zeros((num, self.layout.num_pixels), np.uint8)
-        rows = -(-num // num_workers)
+        rows = -(-num // settings.num_workers)
         self._first_parameter = _DISCRETE + self.actions.num_components
         of_actions = self._first_parameter + sum(self.actions.parameter_dims)
         columns = (of_actions, self.layout.num_result_columns, self.layout.num_pixels)
         blocks = [
-            _Block(make, reading, name, first, min(rows, num - first), rows, columns) for first in range(0, num, rows)
+            _Block(make, settings, flattens_pictures, first, min(rows, num - first), rows, columns)
+            for first in range(0, num, rows)
         ]
         self._table_of_actions = np.zeros((len(blocks) * rows, columns[0]))
         self._shape_of_actions = (len(blocks), rows, columns[0])
