@@ -33,9 +33,9 @@ MOST_AGENTS = 8  # the colours of agents in `game.js`
 _FOLDER = Path(__file__).resolve().parent / "page"
 
 
-def shared_rules() -> dict[str, Any]:
-    """Return what every page of boats needs: the constants of motion and episode, and the words for outcomes."""
-    return {
+def shared_data(has_server: bool, **rules: float) -> dict[str, Any]:
+    """Return what every page of boats needs; its rules are those of motion and episode, and the page's own ones."""
+    shared = {
         "harbour_radius": physics.HARBOUR_RADIUS,
         "dock_radius": physics.DOCK_RADIUS,
         "glide": physics.GLIDE,
@@ -45,6 +45,14 @@ def shared_rules() -> dict[str, Any]:
         "max_presses": MAX_PRESSES,
         "outcomes": {name: outcome.words for name, outcome in OUTCOME_TABLE.items()},
     }
+    rules_of_page = {**shared, **rules}
+    return {"format": episodes.FORMAT, "software": __version__, "has_server": has_server, "rules": rules_of_page}
+
+
+def places(layout: harbour.Layout) -> list[dict[str, list[float]]]:
+    """Return `start` and `goal` of each layout; numbers are not rounded."""
+    columns = zip(*(column.tolist() for column in layout), strict=True)
+    return [{"start": [x, y], "goal": [goal_x, goal_y]} for x, y, goal_x, goal_y in columns]
 
 
 class BoatPage:
@@ -77,10 +85,7 @@ class BoatPage:
                 told_apart = f"the page tells at most {MOST_AGENTS} agents apart"
                 raise EpisodeError(f"{agent['name']}: {told_apart}, and this is number {number}")
         return {
-            "format": episodes.FORMAT,
-            "software": __version__,
-            "has_server": has_server,
-            "rules": {**shared_rules(), "block": BLOCK, "num_blocks": NUM_BLOCKS},
+            **shared_data(has_server, block=BLOCK, num_blocks=NUM_BLOCKS),
             "directions": {
                 "incongruent_1": harbour.DIRECTIONS[0],
                 "incongruent_2": harbour.DIRECTIONS[1],
@@ -128,8 +133,7 @@ class BoatPage:
         bins = torch.bucketize(harbour.bearing_offset(layout), torch.tensor(OFFSET_EDGES[1:-1], dtype=torch.float32))
         rows = [
             {
-                "start": [layout.start_x[i].item(), layout.start_y[i].item()],
-                "goal": [layout.goal_x[i].item(), layout.goal_y[i].item()],
+                **place,
                 "people": HUMAN_CONGRUENT_BY_OFFSET[int(bins[i])],
                 "best": {
                     name: {
@@ -145,7 +149,7 @@ class BoatPage:
                     for option, name in enumerate(harbour.CONTROLLERS)
                 },
             }
-            for i in range(num)
+            for i, place in enumerate(places(layout))
         ]
         modes, first = {}, 0
         for mode, size in sizes.items():

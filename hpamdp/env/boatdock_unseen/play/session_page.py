@@ -9,11 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hpamdp import __version__
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import harbour, task
 from hpamdp.env.boatdock.harbour import Layout
-from hpamdp.env.boatdock.play import boat_page, episodes
+from hpamdp.env.boatdock.play import boat_page
 from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.boatdock_unseen import fleet, planner
 from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
@@ -57,14 +56,9 @@ class SessionPage:
         if agents:
             raise EpisodeError(f"{agents[0]['name']}: people play sessions alone")
         return {
-            "format": episodes.FORMAT,
-            "software": __version__,
-            "has_server": has_server,
-            "rules": {
-                **boat_page.shared_rules(),
-                "shortest_press": self.rules.shortest_press,
-                "longest_press": task.MAX_DURATION,
-            },
+            **boat_page.shared_data(
+                has_server, shortest_press=self.rules.shortest_press, longest_press=task.MAX_DURATION
+            ),
             "session_rules": self.rules.model_dump(mode="json"),
             "sessions": self._sessions,
         }
@@ -113,14 +107,7 @@ class SessionPage:
             ]
             for i in range(NUM_SESSIONS)
         ]
-        trips = [
-            {
-                "start": [layout.start_x[i].item(), layout.start_y[i].item()],
-                "goal": [layout.goal_x[i].item(), layout.goal_y[i].item()],
-                "best": best[i].item(),
-            }
-            for i in range(len(best))
-        ]
+        trips = [{**place, "best": each} for place, each in zip(boat_page.places(layout), best.tolist(), strict=True)]
         return [{"boats": boats[i], "trips": trips[i * num_trips : (i + 1) * num_trips]} for i in range(NUM_SESSIONS)]
 
     def _best_scores(self, layout: Layout, numbers: Tensor) -> Tensor:
