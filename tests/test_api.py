@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import ClassVar
 
@@ -344,6 +345,7 @@ WITHOUT_FOLDER = {"folder": None}
         ({"folder": "file"}, "folder="),
         ({"resume": "auto", **WITHOUT_FOLDER}, "so give folder"),
         ({"logger": "wandb", **WITHOUT_FOLDER}, "writes files, so give the run a folder"),
+        ({"checkpoint_every": 100, **WITHOUT_FOLDER}, "checkpoint_every=100: writes files, so give the run a folder"),
         ({"low": {"name": "hppo", "gamma": 0.9}, "low.gamma": 0.9}, "low.gamma: given twice, as 0.9 and as 0.9"),
     ],
 )
@@ -792,3 +794,20 @@ def test_an_experiment_that_is_a_sweep_is_refused_until_each_swept_setting_has_a
     with pytest.raises(hpamdp.ConfigError, match=r"a sweep over env\.controller, .* give it a value"):
         hpamdp.train(experiment="few_steps", seed=3, **tiny)
     hpamdp.train(experiment="few_steps", seed=3, controller="congruent", **tiny)
+
+
+def test_threads_get_their_own_agents_and_a_line_says_that_no_seed_repeats_them(capsys):
+    agents: dict[str, hpamdp.Agent] = {}
+
+    def run(name: str) -> None:
+        agents[name] = hpamdp.train(name, low="hppo", **TINY)
+
+    class Nested(hpamdp.Callback):
+        def on_end(self, trainer):
+            thread = threading.Thread(target=run, args=("moving",))
+            thread.start()
+            thread.join()
+
+    outer = hpamdp.train("platform", low="hppo", callbacks=[Nested()], **TINY)
+    assert (outer.specs.observation_dim, agents["moving"].specs.observation_dim) == (9, 10)
+    assert "no seed repeats them" in capsys.readouterr().err

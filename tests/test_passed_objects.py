@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -184,6 +185,9 @@ def test_classes_of_one_name_from_two_modules_are_trained_and_loaded_in_one_proc
         assert hpamdp.load(tmp_path / name, low=cls)._config.low.cls is cls
         again = {"low": cls, "folder": tmp_path / name, "resume": "auto"}
         assert hpamdp.train("platform", **again, **TINY)._config.low.cls is cls
+    for call in (partial(hpamdp.load, tmp_path / "old"), partial(hpamdp.train, resume=tmp_path / "old")):
+        with pytest.raises(hpamdp.ConfigError, match=r"^low=Twin: several classes have this name; pass that of"):
+            call()
 
 
 def test_an_agent_of_a_forgotten_class_asks_for_the_class(of_classes, monkeypatch):

@@ -208,6 +208,7 @@ def saved(tmp_path_factory):
         ("env.max_steps=3", "has env.max_steps=200; leave it out"),
         ("env=goal", "env=goal: the run in "),
         ("data=human", "data=human: low=hppo learns from its own steps only"),
+        ("total_frames=16", "total_frames=16: the run that is continued has 32 already; set more, or leave it out"),
     ],
 )
 def test_errors_of_a_resumed_run_name_its_own_parts(word, line, saved, command):

@@ -14,9 +14,9 @@ from torchrl.checkpoint import GlobalRNGState
 
 from hpamdp.api.agent import Agent
 from hpamdp.api.arguments import choices_and_settings, flag, path_argument, problem_of
-from hpamdp.config.compose import conf_dir
+from hpamdp.config.compose import conf_dir, setting_of
 from hpamdp.config.errors import ConfigError, problems_explained
-from hpamdp.config.outside_jobs import choosing_class, own_hydra, searching
+from hpamdp.config.outside_jobs import check_is_single, choosing_class, own_hydra, searching
 from hpamdp.config.saved import choices_of
 from hpamdp.config.schema import RunConfig
 from hpamdp.env.errors import closed_on_error
@@ -78,6 +78,7 @@ def load(
     words = [*searching(config_dirs), *problem.words, *choices, *(["trust=true"] if trust else [])]
     if env is None:
         check_problem(file, given, "load")
+    check_shared_names(file, [*settings, *words])
     return loaded(file, words, own, problem.objects)
 
 
@@ -106,6 +107,14 @@ def _check_classes(file: Path, settings: Mapping[str, Any]) -> None:
                 f"{group}={cls.__name__}: the agent was trained with {group}={choices[group]}; pass that class, or "
                 "leave it out"
             )
+
+
+def check_shared_names(file: Path, words: Sequence[str]) -> None:
+    """Refuse a saved agent if a class of it, which these words do not name, is not the only one of its name."""
+    given = {setting_of(each) for each in words}
+    for group, name in choices_of(checkpoint.progress_of(file)["config"]).items():
+        if group not in given:
+            check_is_single(group, name)
 
 
 def check_problem(file: Path, settings: Iterable[str], where: str) -> None:

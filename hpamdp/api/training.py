@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -11,9 +12,9 @@ from typing import Any
 
 from hpamdp.api.agent import Agent
 from hpamdp.api.arguments import Problem, choices_and_settings, flag, path_argument, problem_of
-from hpamdp.api.loading import check_problem, loaded, torch_restored
+from hpamdp.api.loading import check_problem, check_shared_names, loaded, torch_restored
 from hpamdp.config.command_line import SEARCH_PATH
-from hpamdp.config.compose import job_overrides
+from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.outside_jobs import check_no_sweep, composed, own_hydra, searching
 from hpamdp.config.schema import RESUME_AUTO, Config
@@ -26,6 +27,9 @@ from hpamdp.run.folder import locked
 from hpamdp.run.resume import resolve, saved_words
 from hpamdp.run.stopping import exits_explained
 from hpamdp.run.train import begin, check_callbacks
+
+# Values of the run that are of use only if the run writes files.
+_OF_FILES = ("checkpoint_every", "checkpoint_minutes", "film")
 
 
 def train(
@@ -83,13 +87,13 @@ def train(
     goes_on = settings.get("resume") == RESUME_AUTO
     if goes_on:
         settings = {**settings, "resume": None}
-    with torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
+    with _warned_if_concurrent(), torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
         with own_hydra(), composed(*_given(problem, settings, config_dirs)) as cfg:
             words = job_overrides()
             check_no_sweep(cfg, words)
             config, source = resolve(cfg, words, problem.objects)
             if output_dir is None:
-                _check_without_folder(config, goes_on=goes_on)
+                _check_without_folder(config, words, goes_on=goes_on)
             stack.enter_context(memory_errors_explained(config))
             if output_dir is not None:
                 stack.enter_context(_own_folder(output_dir))
@@ -110,16 +114,20 @@ def train(
     return Agent(config, parts.agent, parts.problem, trainer.progress(), trainer.recorder.metrics.rows())
 
 
-def _check_without_folder(config: Config, *, goes_on: bool) -> None:
+def _check_without_folder(config: Config, words: Sequence[str], *, goes_on: bool) -> None:
     """Refuse what needs a folder, for a run without one.
 
     Raises:
-        ConfigError: the run has a logger that writes files, or is to go on with the run in a folder.
+        ConfigError: the run is to write files, or to go on with the run in a folder.
     """
     if goes_on:
         raise ConfigError("resume=auto: goes on with the run in a folder, so give folder")
     if config.logger.name != "csv":
         raise ConfigError(f"{config.logger}: writes files, so give the run a folder")
+    for each in words:
+        name = setting_of(each)
+        if name in _OF_FILES and getattr(config.run, name):
+            raise ConfigError(f"{each}: writes files, so give the run a folder")
 
 
 def _given(
@@ -136,6 +144,7 @@ def _given(
     words = [*searching(config_dirs), *problem.words, *choices]
     if settings.get("resume") is not None:
         resumed, trust = str(settings["resume"]), ["trust=true"] if settings.get("trust") is True else []
+        check_shared_names(checkpoint.find(resumed, "resume"), words)
         words = [*saved_words(resumed, "resume", [*words, *trust]), *words]
         if not problem.words and not problem.objects:
             check_problem(checkpoint.find(resumed, "resume"), [*settings, *dict(problem.settings)], "resume")
@@ -162,6 +171,22 @@ def _checked_callbacks(given: Any) -> list[Callback]:
         raise ConfigError(f"callbacks={as_code(given)}: must be a list of objects of subclasses of hpamdp.Callback")
     check_callbacks(callbacks)
     return [*callbacks]
+
+
+_running = threading.Lock()  # held while a training of this process runs
+
+
+@contextmanager
+def _warned_if_concurrent() -> Iterator[None]:
+    """Warn if another training runs in this process."""
+    is_first = _running.acquire(blocking=False)
+    if not is_first:
+        warn("another training runs in this process; they share torch's random numbers, so no seed repeats them")
+    try:
+        yield
+    finally:
+        if is_first:
+            _running.release()
 
 
 @contextmanager

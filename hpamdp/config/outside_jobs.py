@@ -225,6 +225,20 @@ def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list
     return [search_word([folder_path(folder, where) for folder in folders])] if folders else []
 
 
+# Groups and names of passed classes that several modules have.
+_shared_names: set[tuple[str, str]] = set()
+
+
+def check_is_single(group: str, name: str) -> None:
+    """Refuse the name that a saved run gives for a class, if classes of several modules had it in this process.
+
+    Raises:
+        ConfigError: there are several.
+    """
+    if (group, name) in _shared_names:
+        raise ConfigError(f"{group}={name}: several classes have this name; pass that of the saved run as {group}")
+
+
 def choosing_class(group: str, cls: type) -> str:
     """Return the name of a class in a group: that of its yaml file, or a choice of its own, which Hydra then knows.
 
@@ -241,6 +255,9 @@ def choosing_class(group: str, cls: type) -> str:
     name = cls.__name__
     if name in files:
         raise ConfigError(f"{group}: {dotted} has the name of {file_of(group, name)}; rename the class")
+    stored = ConfigStore.instance().repo.get(group, {}).get(f"{name}.yaml")
+    if stored is not None and stored.node.get(TARGET) != dotted:
+        _shared_names.add((group, name))
     check_base_class(group, name, dotted)
     budget = {"budget": _BUDGET} if group == "low" else {}
     settings = defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group]))

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from hpamdp.cards import CallbackCard, outside_card
 from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.saved import needs_trust
-from hpamdp.config.schema import Config
+from hpamdp.config.schema import Config, RunConfig
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble, choose_selector
@@ -141,6 +141,8 @@ def begin(
         trainer = Trainer(config, parts, output_dir, _all_callbacks(config, callbacks) if is_training else ())
         if source is not None:
             trainer.restore(source)
+            if is_training:
+                check_more(overrides, trainer.frames, config.run)
         trainer.start(is_own=is_own)
     except BaseException:
         parts.close()
@@ -212,3 +214,16 @@ def _resuming(config: Config, output_dir: Path) -> str:
     mode = "" if config.run.mode == "train" else f"mode={config.run.mode} "
     trust = " trust=true" if needs_trust(config) else ""  # the settings came from the user's own command line
     return f"{program()} {mode}{path_setting('resume', output_dir)}{trust}"
+
+
+def check_more(overrides: Sequence[str], frames: int, run: RunConfig) -> None:
+    """Refuse to continue a run for fewer frames than it has, counted in whole batches.
+
+    Raises:
+        ConfigError: the length is too small; the message names the frames so far.
+    """
+    batch = 1 if run.mode == "offline" else run.num_envs * run.steps_per_batch
+    most = -(-run.num_frames // batch) * batch
+    for word in overrides:
+        if word.startswith(("total_frames=", "offline.updates=")) and frames > most:
+            raise ConfigError(f"{word}: the run that is continued has {frames:,} already; set more, or leave it out")
