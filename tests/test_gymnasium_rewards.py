@@ -61,6 +61,16 @@ def test_returns_in_training_have_the_unit_of_those_in_evaluations():
         assert history[-1]["train/return"] == history[-1]["train/score"] == history[-1]["eval/return"] == 2.0 * 3
 
 
+def test_a_line_says_that_the_greedy_agent_takes_one_discrete_action_only(capfd):
+    class Idle(hpamdp.Callback):
+        def on_batch(self, trainer):
+            trainer.parts.agent.learners[0].actor.discrete_head.bias.data[1] = 100.0
+
+    sizes = {"total_frames": 64, "num_envs": 2, "steps_per_batch": 8, "eval.layouts": 2, "low.minibatch_size": 16}
+    hpamdp.train(lambda: Toy(), low="hppo", high="none", progress=True, max_steps=3, callbacks=[Idle()], **sizes)
+    assert "the agent took discrete action 1 at every step of the evaluation" in "".join(capfd.readouterr())
+
+
 def test_an_evaluation_reports_rewards_as_they_are():
     env = make(2, max_steps=3, reward_scaling=0.9)
     env.seed_evaluation(0)
