@@ -16,13 +16,13 @@ from test_decisions import check_accounts, collect
 from test_grid import SHORT, SHORT_SELECTORS
 from test_resume import SMALL as RESUMED
 from test_resume import rows_of, stop_and_resume
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_env import ToyEnv
 from toy_options import Listener, Stepper, Toll
 
 import hpamdp
 from hpamdp import keys
-from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Selector
@@ -125,7 +125,7 @@ def test_lengths_that_leave_no_choice_give_the_run_of_options_of_that_length(hig
     assert {each["eval/option_length"] for each in lengths} == {"", "3.0"}
 
 
-class Lights(PAMDPEnv):
+class Lights(ToyEnv):
     """Every `period` steps another option may become the right one, and only then the observation shows which.
 
     A step with the right option is rewarded with 1. The observation is dark, first or second, as a one-hot vector.
@@ -138,13 +138,7 @@ class Lights(PAMDPEnv):
     def __init__(self, num_envs: int, period: int) -> None:
         super().__init__(device=CPU, batch_size=[num_envs])
         self.period = period
-        n = num_envs
-        self.observation_spec = Composite(observation=Bounded(0.0, 1.0, shape=(n, 3)), shape=(n,))
-        action = Composite(discrete=Categorical(2, shape=(n,)), parameters=Bounded(0.0, 1.0, shape=(n, 2)), shape=(n,))
-        self.action_spec = Composite(action=action, option=Categorical(2, shape=(n,)), shape=(n,))
-        self.reward_spec = Unbounded(shape=(n, 1))
-        self.done_spec = self.make_done_spec()
-        self._set_seed(0)
+        self.begin(0.0, 1.0, 0, has_option=True, observation=Bounded(0.0, 1.0, shape=(num_envs, 3)))
 
     def _set_seed(self, seed):
         self.generator = torch.Generator().manual_seed(seed or 0)
@@ -166,8 +160,7 @@ class Lights(PAMDPEnv):
         self.right = torch.where(is_lit, fresh, self.right)
         shown = torch.nn.functional.one_hot(torch.where(is_lit, 1 + self.right, 0), 3).float()
         done = (self.steps >= self.max_steps).unsqueeze(-1)
-        flags = {keys.TERMINATED: done, keys.TRUNCATED: torch.zeros_like(done), keys.DONE: done.clone()}
-        return TensorDict({keys.OBSERVATION: shown, **flags}, self.batch_size)
+        return TensorDict({keys.OBSERVATION: shown, **self.flags(done)}, self.batch_size)
 
 
 def make_meta_critic(specs: PAMDPSpecs) -> MetaCritic:

@@ -7,13 +7,13 @@ from typing import Literal
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded
+from toy_env import ToyEnv
 
 from hpamdp import keys
-from hpamdp.env.base import PAMDPEnv
 
 
-class OneStep(PAMDPEnv):
+class OneStep(ToyEnv):
     """Choose two of two discrete actions with a parameter each, and three without; the observation is one coin.
 
     The parameter of what the first component chose should be 0.4. How the components pay depends on `pays`:
@@ -51,11 +51,7 @@ class OneStep(PAMDPEnv):
         observed = {keys.OBSERVATION: Bounded(0.0, 1.0, shape=(n, 2))}
         if forbids_pairs:
             observed[keys.PAIR_MASK] = Binary(5, shape=(n, 5, 5), dtype=torch.bool)
-        self.observation_spec = Composite(observed, shape=(n,))
-        self.action_spec = self.make_action_spec(-torch.ones(2), torch.ones(2))
-        self.reward_spec = Unbounded(shape=(n, 1))
-        self.done_spec = self.make_done_spec()
-        self._set_seed(seed)
+        self.begin(-1.0, 1.0, seed, **observed)
 
     def _set_seed(self, seed: int | None) -> None:
         self.generator = torch.Generator().manual_seed(seed or 0)
@@ -84,8 +80,7 @@ class OneStep(PAMDPEnv):
 
     def _read(self, *, is_over: bool) -> TensorDict:
         n = self.batch_size
-        flag = torch.full((*n, 1), is_over)
-        td = TensorDict({keys.DONE: flag, keys.TERMINATED: flag.clone(), keys.TRUNCATED: torch.zeros_like(flag)}, n)
+        td = TensorDict(self.flags(torch.full((*n, 1), is_over)), n)
         td.set(keys.OBSERVATION, torch.nn.functional.one_hot(self.coin, 2).float())
         if self.forbids_pairs:
             pairs = torch.ones(5, 5, dtype=torch.bool)

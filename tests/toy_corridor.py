@@ -5,15 +5,15 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Bounded
+from toy_env import ToyEnv
 
 from hpamdp import keys
-from hpamdp.env.base import PAMDPEnv
 
 BACK, FORTH, REST = 0, 1, 2
 
 
-class Corridor(PAMDPEnv):
+class Corridor(ToyEnv):
     """Go back or forth by a length in [0, 1], or rest. Only the end of the corridor is rewarded, with 1.
 
     A step costs `cost`, a rest nothing. So the best return without the end is 0, by resting. The observation is the
@@ -43,12 +43,7 @@ class Corridor(PAMDPEnv):
         self.length = length
         self.max_steps = max_steps
         self.cost = cost
-        n = num_envs
-        self.observation_spec = Composite(observation=Bounded(0.0, 1.0, shape=(n, 1)), shape=(n,))
-        self.action_spec = self.make_action_spec(torch.zeros(2), torch.ones(2))
-        self.reward_spec = Unbounded(shape=(n, 1))
-        self.done_spec = self.make_done_spec()
-        self._set_seed(seed)
+        self.begin(0.0, 1.0, seed, observation=Bounded(0.0, 1.0, shape=(num_envs, 1)))
 
     def _set_seed(self, seed: int | None) -> None:
         self.place = torch.zeros(self.batch_size)
@@ -75,8 +70,7 @@ class Corridor(PAMDPEnv):
         place: Tensor = (self.place / self.length).unsqueeze(-1)
         terminated = place >= 1.0
         truncated = (self.steps >= self.max_steps).unsqueeze(-1) & ~terminated
-        flags = {keys.TERMINATED: terminated, keys.TRUNCATED: truncated, keys.DONE: terminated | truncated}
-        return TensorDict({keys.OBSERVATION: place, **flags}, self.batch_size)
+        return TensorDict({keys.OBSERVATION: place, **self.flags(terminated, truncated)}, self.batch_size)
 
 
 def trained(learner, exploration=None, *, steps: int, num_envs: int = 16, steps_per_batch: int = 16, **corridor):

@@ -5,17 +5,16 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Unbounded
-from torchrl.data import Composite as Spec
+from torchrl.data import Binary, Bounded
+from toy_env import ToyEnv
 
 from hpamdp import keys
-from hpamdp.env.base import PAMDPEnv
 
 NUM_DISCRETE = 3
 NUM_OPTIONS = 3
 
 
-class Forbidden(PAMDPEnv):
+class Forbidden(ToyEnv):
     """Four steps, at each of which one of three actions is forbidden; the observation is its one-hot number.
 
     An allowed action pays 0.1 times the mean of its parameter's distance from -1; a forbidden one pays 100. The same
@@ -46,11 +45,7 @@ class Forbidden(PAMDPEnv):
         }
         if has_option:
             leaves[keys.OPTION_MASK] = Binary(NUM_OPTIONS, shape=(n, NUM_OPTIONS), dtype=torch.bool)
-        self.observation_spec = Spec(leaves, shape=(n,))
-        self.action_spec = self.make_action_spec(-torch.ones(3), torch.ones(3), has_option=has_option)
-        self.reward_spec = Unbounded(shape=(n, 1))
-        self.done_spec = self.make_done_spec()
-        self._set_seed(seed)
+        self.begin(-1.0, 1.0, seed, has_option=has_option, **leaves)
 
     def _set_seed(self, seed: int | None) -> None:
         self.generator = torch.Generator().manual_seed(seed or 0)
@@ -87,9 +82,7 @@ class Forbidden(PAMDPEnv):
             keys.OBSERVATION: one_hot.float(),
             # Where the episode is over, nothing is allowed, as in some problems.
             keys.ACTION_MASK: (one_hot == 0) & ~terminated & (not self.is_empty),
-            keys.TERMINATED: terminated,
-            keys.DONE: terminated.clone(),
-            keys.TRUNCATED: torch.zeros_like(terminated),
+            **self.flags(terminated),
         }
         if self.has_option:
             leaves[keys.OPTION_MASK] = (one_hot == 0) & ~terminated

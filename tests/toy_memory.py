@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Bounded
+from toy_env import ToyEnv
 
 from hpamdp import keys
-from hpamdp.env.base import PAMDPEnv
 
 
-class Cue(PAMDPEnv):
+class Cue(ToyEnv):
     """See a cue of -1 or 1 in the first step, then the time alone; only the last of `length` steps is rewarded.
 
     The right discrete action, 1 for a positive cue, earns 1 less the distance of its parameter from half the cue. The
@@ -29,13 +29,7 @@ class Cue(PAMDPEnv):
     def __init__(self, num_envs: int = 1, *, length: int = 4, seed: int = 0, device: object = "cpu") -> None:
         super().__init__(device=device, batch_size=[num_envs])
         self.max_steps = length
-        n = num_envs
-        self.observation_spec = Composite(observation=Bounded(-1.0, 1.0, shape=(n, 2)), shape=(n,))
-        action = Composite(discrete=Categorical(2, shape=(n,)), parameters=Bounded(-1.0, 1.0, shape=(n, 2)), shape=(n,))
-        self.action_spec = Composite(action=action, shape=(n,))
-        self.reward_spec = Unbounded(shape=(n, 1))
-        self.done_spec = self.make_done_spec()
-        self._set_seed(seed)
+        self.begin(-1.0, 1.0, seed, observation=Bounded(-1.0, 1.0, shape=(num_envs, 2)))
 
     def _set_seed(self, seed: int | None) -> None:
         self.generator = torch.Generator().manual_seed(seed or 0)
@@ -65,9 +59,4 @@ class Cue(PAMDPEnv):
         cue = torch.where(self.steps == 0, self.cue, 0.0)
         observation = torch.stack([cue, self.steps / self.max_steps], -1)
         terminated = (self.steps >= self.max_steps).unsqueeze(-1)
-        flags = {
-            keys.TERMINATED: terminated,
-            keys.TRUNCATED: torch.zeros_like(terminated),
-            keys.DONE: terminated.clone(),
-        }
-        return TensorDict({keys.OBSERVATION: observation, **flags}, self.batch_size)
+        return TensorDict({keys.OBSERVATION: observation, **self.flags(terminated)}, self.batch_size)

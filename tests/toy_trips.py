@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Bounded
+from toy_env import ToyEnv
 
 from hpamdp import keys
 from hpamdp.cards import ProblemCard
-from hpamdp.env.base import PAMDPEnv
 
 
-class Sessions(PAMDPEnv):
+class Sessions(ToyEnv):
     """Take `length` steps in each of `trips` trips; every step earns 1.
 
     The observation is the step in the trip and the number of the trip, both as fractions, and what `shown` returns.
@@ -39,15 +39,9 @@ class Sessions(PAMDPEnv):
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.length, self.max_steps = length, trips * length
-        n = num_envs
-        flag = Binary(n=1, shape=(n, 1), dtype=torch.bool)
-        self.observation_spec = Composite(observation=Bounded(-1.0, 1.0, shape=(n, 3)), trip_ended=flag, shape=(n,))
-        action = Composite(discrete=Categorical(2, shape=(n,)), parameters=Bounded(-1.0, 1.0, shape=(n, 2)), shape=(n,))
-        option = {"option": Categorical(2, shape=(n,))} if self.option_names else {}
-        self.action_spec = Composite(action=action, **option, shape=(n,))
-        self.reward_spec = Unbounded(shape=(n, 1))
-        self.done_spec = self.make_done_spec()
-        self._set_seed(seed)
+        flag = Binary(n=1, shape=(num_envs, 1), dtype=torch.bool)
+        seen = {"observation": Bounded(-1.0, 1.0, shape=(num_envs, 3)), "trip_ended": flag}
+        self.begin(-1.0, 1.0, seed, has_option=bool(self.option_names), **seen)
 
     def _set_seed(self, seed: int | None) -> None:
         self.seed = seed or 0
@@ -95,13 +89,8 @@ class Sessions(PAMDPEnv):
         place, trip = self.steps % self.length, self.steps // self.length
         observation = torch.stack([place / self.length, trip * self.length / self.max_steps, self.shown()], -1)
         terminated = (self.steps >= self.max_steps).unsqueeze(-1)
-        flags = {
-            keys.TRIP_ENDED: ((place == 0) & (self.steps > 0)).unsqueeze(-1),
-            keys.TERMINATED: terminated,
-            keys.TRUNCATED: torch.zeros_like(terminated),
-            keys.DONE: terminated.clone(),
-        }
-        return TensorDict({keys.OBSERVATION: observation, **flags}, self.batch_size)
+        seen = {keys.OBSERVATION: observation, keys.TRIP_ENDED: ((place == 0) & (self.steps > 0)).unsqueeze(-1)}
+        return TensorDict({**seen, **self.flags(terminated)}, self.batch_size)
 
 
 class SessionsOfOptions(Sessions):
