@@ -290,21 +290,6 @@ def test_a_guarded_setting_of_a_callback_in_a_saved_config_needs_trust():
     assert read_saved(saved, trust=True).callbacks[0].settings == {"command": "ls"}
 
 
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (["callbacks=[patiense]"], "callbacks.0=patiense: no such file in conf/callback; did you mean patience?"),
-        (["callbacks=[{name:patience,evaluation:3}]"], "callbacks.0.evaluation: no such setting of Patience; did you "),
-        (["callbacks=[patience]", "eval.every=0"], "callback=patience: needs evaluations during training; set "),
-    ],
-)
-def test_a_callback_that_no_run_can_have_is_told_in_one_line(words, complaint, tmp_path):
-    with pytest.raises(ConfigError) as error:
-        start(tmp_path / "run", *words)
-    assert str(error.value).startswith(complaint) and "\n" not in str(error.value)
-    assert not (tmp_path / "run").exists()
-
-
 def test_help_explains_the_settings_of_listed_callbacks(command):
     code, out, _ = command("callbacks=[{name:patience,evaluations:7},best_agent]", "--help")
     assert code == 0

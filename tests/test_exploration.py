@@ -36,7 +36,6 @@ from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP
 from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
-from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 EXPLORING = ["hppo", "pdqn", "paddpg", "hsac", "hyar", "qpamdp", "dlpa", "pets"]
@@ -361,20 +360,6 @@ def test_cells_leave_out_the_entries_whose_resolution_is_0():
     table.see(torch.cat([place.expand(3, 2), speeds], -1))
     assert table.bonus(torch.cat([place, -speeds[1]])) == pytest.approx(3.0**-0.5)
     assert table.bonus(torch.cat([other, speeds[1]])) == 1.0
-
-
-@pytest.mark.parametrize(
-    ("resolution", "line"),
-    [
-        ([0.0, 0.0, 0.0, 0.0], r"must have a number above 0"),
-        ([1.0, 1e-50, 0.0, 0.0], r"must be from 1e-12 to 1e\+06"),
-        (1e30, r"must be from 1e-12 to 1e\+06"),
-        ([1.0, 2.0], "must have a number for each of 4 entries"),
-    ],
-)
-def test_counts_refuse_resolutions_out_of_bounds_lists_of_zeros_and_of_another_length(resolution, line):
-    with pytest.raises(SettingError, match=rf"^resolution=.*: {line}"):
-        Counts(HPPO(SPECS), resolution=resolution)
 
 
 @pytest.mark.parametrize("kind", [DLPA, PETS])

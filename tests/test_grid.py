@@ -12,7 +12,6 @@ from conftest import CONF, OF_EACH_KIND, TRAINED, choices, compose_config, make_
 from tensordict import TensorDict
 
 from hpamdp.config.components import SUPPLIED_ARGUMENTS, load_class, settings_model
-from hpamdp.config.errors import ConfigError
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.shared.symmetry import RandomSymmetry
 from hpamdp.run import checkpoint
@@ -33,7 +32,7 @@ SHORT = {
     "hyar": ["low.warmup_steps=64", "low.codec_pretrain_updates=2", "low.updates_per_step=0.05", "low.batch_size=16"],
     "hyar_published": [
         *("low.warmup_steps=64", "low.codec_pretrain_updates=2", "low.updates_per_step=0.05", "low.batch_size=16"),
-        *("low.codec_episodes=1", "low.codec_first_episode=0", "low.codec_batch_size=16"),
+        *("low.codec_episodes=8", "low.codec_first_episode=0", "low.codec_batch_size=16"),
     ],
     "paddpg": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
     "pets": [
@@ -216,9 +215,3 @@ def test_every_learner_makes_updates_in_bfloat16(low, tmp_path):
     given = [*words("ucb", low), "update_precision=bfloat16"]
     assert run(compose_config(given), tmp_path, given) == 0
     assert_it_updated(given, tmp_path)
-
-
-@pytest.mark.parametrize("low", ["pdqn", "pets"])
-def test_augment_is_refused_where_the_problem_declares_no_symmetries(low):
-    with pytest.raises(ConfigError, match="low: augment=true: the problem declares no symmetries; use augment=false"):
-        assemble(make_config(["env=platform", "high=none", f"low={low}", "low.augment=true", *SMALL]))

@@ -347,14 +347,3 @@ def test_rows_that_wait_in_a_run_are_not_taken_over_by_another_one():
     other.load_networks(learner.state_dict())
     assert learner.waiting and not other.waiting
     assert torch.equal(learner.actor.discrete_head.weight, other.actor.discrete_head.weight)
-
-
-@pytest.mark.parametrize("final", [0.01, 1.5])
-def test_a_largest_scale_that_ends_outside_its_range_is_refused(final):
-    with pytest.raises(ValueError, match=f"max_scale_final={final}"):
-        make(max_scale_final=final)
-
-
-def test_a_scale_outside_its_range_is_refused():
-    with pytest.raises(ValueError, match=r"initial_scale=2.0: must lie between min_scale=0.05 and max_scale=1.0"):
-        make(initial_scale=2.0)

@@ -167,8 +167,3 @@ def test_a_policy_takes_any_batch_shape_and_stays_in_bounds(is_random):
         parameters = td[keys.PARAMETERS]
         assert td[keys.DISCRETE].shape == shape and parameters.shape == (*shape, 3)
         assert (parameters >= low).all() and (parameters <= high).all()
-
-
-def test_an_empty_range_of_scales_is_refused():
-    with pytest.raises(ValueError, match="min_scale"):
-        make(min_scale=1.0)

@@ -9,7 +9,6 @@ from toy_steps import SPECS
 
 from hpamdp import keys
 from hpamdp.policies.low_level.hyar import LATENT, HyAR
-from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
@@ -277,11 +276,6 @@ def test_without_a_number_z_has_as_many_dimensions_as_an_action_has_parameters_a
     assert make(latent_dim=None).codec.latent_dim == 2
 
 
-def test_a_problem_without_parameters_is_refused():
-    with pytest.raises(SettingError, match="no discrete action of the problem has one"):
-        make(PAMDPSpecs(4, (), (0, 0), (), ()))
-
-
 @pytest.mark.parametrize(
     ("shape", "fractions"),
     [("linear", (1.0, 0.775, 0.1, 0.1)), ("cosine", (1.0, 0.868198, 0.1, 0.1)), ("constant", (1.0, 1.0, 1.0, 1.0))],
@@ -372,6 +366,7 @@ def test_with_a_window_the_critics_see_the_newest_steps_alone_and_none_of_the_wa
     learner = make(critic_window=80, warmup_steps=200, codec_pretrain_updates=1, updates_per_step=1.0, batch_size=60)
     learn(learner, 1)
     assert learner.updates == 0 and len(learner.buffer) == 200
+    assert learner.steps_to_update()["warmup_steps"] == 260
     learn(learner, 1, 50)
     assert learner.updates == 0, "fewer than a batch"
     learn(learner, 1, 50)
@@ -434,14 +429,6 @@ def test_the_published_recipe_learns():
     for _ in range(3):
         learner.learn(random_rows(learner, 200), torch.ones(200, dtype=torch.bool))
     assert learner.updates == 8 and learner.episodes == 400
-
-
-def test_a_window_smaller_than_a_batch_and_noise_that_would_rise_are_refused():
-    with pytest.raises(SettingError, match="critic_window=10: must be at least batch_size=64"):
-        make(critic_window=10)
-    with pytest.raises(SettingError, match=r"noise_initial=0\.01: must be at least parameter_noise=0\.1"):
-        make(noise_initial=0.01)
-    assert make(critic_window=100).steps_to_update()["warmup_steps"] == 2064
 
 
 @pytest.mark.parametrize("change_unit", ["warmup", "stored"])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import gymnasium
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from hpamdp import keys
 from hpamdp.env.lunar_lander.environment import LunarLanderEnv
 from hpamdp.env.lunar_lander.lander import HybridLunarLander, continuous_action, hybrid_action
 from hpamdp.env.registration import register
-from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 register()
@@ -105,13 +102,6 @@ def test_copies_have_episodes_of_their_own_and_the_settings_reach_them():
     env = LunarLanderEnv(3, gravity=-5.0, enable_wind=True)
     assert {copy.unwrapped.gravity for copy in env.envs} == {-5.0} and env.envs[0].unwrapped.enable_wind
     assert len(set(env.reset()[keys.OBSERVATION][:, 0].tolist())) == 3
-
-
-def test_without_box2d_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gymnasium.envs.box2d.lunar_lander", None)
-    with pytest.raises(SettingError, match=r"Box2D is not installed; pip install 'hpamdp\[box2d\]'$") as raised:
-        LunarLanderEnv(1)
-    assert "\n" not in str(raised.value)
 
 
 def test_watch_names_the_setting_with_which_it_is_drawn_before_it_plays(command, monkeypatch):

@@ -293,11 +293,6 @@ def test_a_penalty_on_preactivations_frees_parameters_that_tanh_holds_at_a_bound
     assert is_free.all() if penalty > 0.0 else not is_free.any()
 
 
-def test_a_penalty_on_preactivations_is_refused_where_nothing_is_squashed():
-    with pytest.raises(ValueError, match=r"preactivation_penalty=0\.1: needs bounding=tanh"):
-        make(preactivation_penalty=0.1, bounding="inverting_gradients")
-
-
 class TwoHills(torch.nn.Module):
     """Values that have a high hill at `high` and a low one at 0.6 in every parameter of the discrete action.
 
@@ -337,11 +332,6 @@ def test_the_search_leaves_forbidden_actions_parameters_alone():
     loss, _ = learner.actor_loss(states(64)[keys.OBSERVATION], allowed)
     gradient = torch.autograd.grad(loss, learner.actor.net[-1].bias)[0]
     assert (gradient != 0.0).tolist() == [False, False, True]
-
-
-def test_the_search_is_refused_where_values_depend_on_other_actions_parameters():
-    with pytest.raises(ValueError, match="search_samples=8: needs multipass=true"):
-        make(search_samples=8, multipass=False)
 
 
 def test_epsilon_can_fall_with_the_episodes_from_the_start():

@@ -130,20 +130,6 @@ def test_the_smallest_deviation_falls_from_iteration_to_iteration():
     assert [round(value, 2) for value in spread[1:]] == [0.2, 0.1, 0.05]
 
 
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        ({"min_deviation": 0.3}, "min_deviation=0.3: must be at most first_min_deviation=0.2"),
-        ({"num_elites": 20}, "num_elites=20: must be at most num_samples=16"),
-        ({"num_elites": 12, "greedy_samples": 8}, "num_elites=12: must be at most greedy_samples=8"),
-        ({"augment": True}, "augment=true: the problem declares no symmetries; use augment=false"),
-    ],
-)
-def test_a_search_or_model_that_cannot_be_built_is_refused(changes, complaint):
-    with pytest.raises(ValueError, match=complaint):
-        make(**changes)
-
-
 def test_a_rougher_estimate_may_choose_what_is_refined():
     def rough(steps):
         discrete, unit = whole(steps)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
 from typing import get_args
 
 import gymnasium
@@ -86,13 +85,6 @@ def test_fingers_stay_in_a_move_and_are_closed_along_an_axis(name, effort):
     hand = PerfectHand()
     hand.act(name, *[0.01] * ALL[name].num_arguments)
     assert {*hand.efforts} == {effort}
-
-
-def test_without_the_simulator_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "metaworld.env_dict", None)
-    with pytest.raises(SettingError, match=r"Meta-World is not installed; pip install 'hpamdp\[robots\]'$") as raised:
-        PrimitivesEnv(1)
-    assert "\n" not in str(raised.value)
 
 
 def test_the_options_suggested_hold_every_action_once():

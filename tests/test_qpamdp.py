@@ -89,13 +89,6 @@ def test_features_are_cosines_of_the_varying_entries_scaled_to_their_ranges():
     torch.testing.assert_close(features, expected, atol=1e-6, rtol=0.0)
 
 
-def test_a_regression_that_would_not_fit_into_memory_is_refused():
-    many = PAMDPSpecs(4, (), (1,) * 1024, (0.0,) * 1024, (1.0,) * 1024)
-    with pytest.raises(ValueError, match=r"psi_order=3: the regression .* 68,619 coefficients, more than 16,384"):
-        make(many, psi_order=3, psi_max_coupled=2)
-    make(many, psi_order=1, psi_max_coupled=1)
-
-
 def sarsa_rows(phi, next_phi, discrete, reward, terminated, done) -> TensorDict:
     shape = (2, len(discrete[0]))
     return TensorDict(

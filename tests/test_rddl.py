@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from importlib.util import find_spec
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import make_config
 from torchrl.envs.utils import check_env_specs
 
 import hpamdp
@@ -36,13 +34,6 @@ DOMAINS = {
     "CrossingTraffic_POMDP_ippc2014": {},
     "EarthObservation_ippc2018": {},
 }
-
-
-def test_without_pyrddlgym_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyRDDLGym", None)
-    with pytest.raises(SettingError, match=r"pyRDDLGym is not installed; pip install 'hpamdp\[rddl\]'$") as raised:
-        make_config(["env=rddl"]).env.cls(1)
-    assert "\n" not in str(raised.value)
 
 
 def grounded(env: RDDLProblem, action) -> dict:

@@ -3,10 +3,11 @@
 import copy
 import functools
 import re
+import sys
 
 import pytest
 import yaml
-from conftest import CONF, choices, compose_config
+from conftest import CONF, choices, compose_config, make_config
 from omegaconf import DictConfig, OmegaConf
 from pydantic import TypeAdapter
 
@@ -21,7 +22,7 @@ from hpamdp.run.compatibility import settings_without_effect
 from hpamdp.run.players import load_agent, split_words
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.train import run
-from hpamdp.settings import OnlyWith
+from hpamdp.settings import OnlyWith, SettingError
 
 SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "eval.every=0"]
 PLATFORM = "env=platform high=none low=random "
@@ -53,6 +54,17 @@ REFUSED = [
     ("low=qpamdp low.features=[0,16]", "low: features=[0, 16]: name some of the observation's entries 0 to 15"),
     ("low=qpamdp low.phi_order=1000000", "low: phi_order=1000000, psi_order=3: the regression for the parameters"),
     ("high=linucb high.inputs=[1,1]", "high: inputs=[1, 1]: names an entry twice"),
+    ("low=hppo low.initial_scale=2.0", "initial_scale=2.0: must lie between min_scale="),
+    ("low=hppo low.max_scale_final=1.5", "max_scale_final=1.5"),
+    ("low=hppo low.min_scale=0.05 low.max_scale_final=0.01", "max_scale_final=0.01"),
+    ("low=pdqn low.preactivation_penalty=0.1 low.bounding=inverting_gradients", "preactivation_penalty=0.1: needs"),
+    ("low=pdqn low.search_samples=8 low.multipass=false", "search_samples=8: needs multipass=true"),
+    ("low=hyar low.critic_window=10", "critic_window=10: must be at least batch_size="),
+    ("low=hyar low.noise_initial=0.01 low.parameter_noise=0.1", "noise_initial=0.01: must be at least parameter_no"),
+    ("low=pets low.min_deviation=0.3 low.first_min_deviation=0.2", "min_deviation=0.3: must be at most first_min_"),
+    ("low=pets low.num_elites=20 low.num_samples=16", "num_elites=20: must be at most num_samples=16"),
+    ("low=pets low.num_elites=12 low.greedy_samples=8", "num_elites=12: must be at most greedy_samples=8"),
+    ("high=linucb high.features=random_fourier high.degree=2000", "degree=2000: 2001 features of 2 inputs; at most"),
     # Parts of another kind.
     ("low=random low._target_=hpamdp.policies.random_agent.random_agent", "there is no class random_agent in "),
     ("low._target_=hpamdp.policies.low_level.random.Random", " more like this"),
@@ -92,11 +104,12 @@ REFUSED = [
     ("high=none low=hppo env=catch_point_picture exploration=counts", "exploration: no picture is seen twice; use "),
     ("high=value low=pets exploration=counts", "exploration: low=pets does not predict whole observations here, so "),
     ("high=value low=pets exploration=novelty exploration.in_plans=distillation", "use low.augment=false, or explor"),
+    ("low=hppo exploration=counts exploration.resolution=[1.0,2.0]", "must have a number for each of 16 entries"),
+    ("low=hppo exploration=counts exploration.resolution=[0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0]", "have a number above 0"),
+    ("low=hppo exploration=counts exploration.resolution=1e30", "must be from 1e-12 to 1e+06"),
+    (PLATFORM + "low=pets low.augment=true", "augment=true: the problem declares no symmetries; use augment=false"),
     # Pictures.
-    (
-        PICTURE + "low=pets",
-        "low=pets: env=catch_point_picture observes pictures, which it has no encoder for; use anot",
-    ),
+    (PICTURE + "low=pets", "low=pets: env=catch_point_picture observes pictures, which it has no encoder for"),
     (PICTURE + "low=hyar", "low=hyar: env=catch_point_picture observes pictures"),
     ("high=none env=goal low=hppo encoder=cnn", "encoder=cnn: env=goal observes no pictures; use encoder=auto"),
     (PICTURE + "low=hppo encoder.net=nature encoder.num_features=0", "encoder.num_features=0"),
@@ -120,6 +133,10 @@ REFUSED = [
     (CHOSEN + "high=actor agent.option_lengths=[0,1]", "agent.option_lengths.0=0: must be greater than 0"),
     (CHOSEN + "high=actor agent.termination=steps agent.option_length=2", "agent.option_lengths=[1, 2, 4]: goes with"),
     (CHOSEN + "high=actor compile_updates=true low=pdqn", "compile_updates=true: goes with agent.termination=episode "),
+    # Callbacks.
+    ("callbacks=[patiense]", "callbacks.0=patiense: no such file in conf/callback; did you mean patience?"),
+    ('callbacks=[{"name":"patience","evaluation":3}]', "callbacks.0.evaluation: no such setting of Patience; did you "),
+    ("callbacks=[patience]", "callback=patience: needs evaluations during training; set eval.every"),
     # Workers.
     ("collector=multi collector.num_workers=3", "collector.num_workers=3: must divide num_envs=4"),
     (SCALED + "collector.ahead=true", "collector.ahead=true: env=gymnasium learns the scale"),
@@ -156,6 +173,23 @@ def test_what_no_run_can_have_is_refused_in_one_line(words, line):
     with pytest.raises(ConfigError) as raised:
         assemble(choose_selector(read(config_of(words))))
     assert line in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("env", "module", "line"),
+    [
+        ("lunar_lander", "gymnasium.envs.box2d.lunar_lander", "Box2D is not installed; pip install 'hpamdp[box2d]'"),
+        ("primitives", "metaworld.env_dict", "Meta-World is not installed; pip install 'hpamdp[robots]'"),
+        ("rddl", "pyRDDLGym", "pyRDDLGym is not installed; pip install 'hpamdp[rddl]'"),
+        ("traffic", "sumo", "SUMO is not installed; pip install 'hpamdp[traffic]'"),
+        ("traffic", "libsumo", "SUMO is not installed; pip install 'hpamdp[traffic]'"),
+    ],
+)
+def test_without_the_simulator_of_a_problem_one_line_says_what_to_install(env, module, line, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(SettingError) as raised:
+        make_config([f"env={env}"]).env.cls(1)
+    assert str(raised.value).endswith(line) and "\n" not in str(raised.value)
 
 
 def test_a_project_name_that_wandb_refuses_is_reported_in_one_line(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import ClassVar
 from xml.etree import ElementTree
 
@@ -16,17 +15,8 @@ from hpamdp.env.traffic.network import FOLDER, GREENS, NETWORKS, YELLOW, entries
 from hpamdp.env.traffic.options import PHASES
 from hpamdp.env.traffic.players import Webster
 from hpamdp.env.traffic.simulation import observation_names
-from hpamdp.settings import SettingError
 
 HOUR = 3600
-
-
-@pytest.mark.parametrize("module", ["sumo", "libsumo"])
-def test_without_sumo_one_line_says_what_to_install(module, monkeypatch):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(SettingError, match=r"SUMO is not installed; pip install 'hpamdp\[traffic\]'$") as raised:
-        make_config(["env=traffic"]).env.cls(1)
-    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("kind", KINDS)
