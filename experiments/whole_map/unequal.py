@@ -1,0 +1,166 @@
+"""Train agents with an option that is of little or no use among good ones, and print which options practise.
+
+python experiments/whole_map/unequal.py weak 301    trains the case with this seed, and prints a row of the table
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from torch import Tensor
+from torchrl.data import Binary, TensorSpec
+
+import hpamdp
+from experiments.options import train_rooms
+from hpamdp import keys
+from hpamdp.env.batched_env import Action
+from hpamdp.env.boatdock import episode, harbour, physics
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.task import CONGRUENT, NOT_CHOSEN, BoatState
+from hpamdp.env.counter_rng import RngKey
+from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.office import rules as office_rules
+from hpamdp.env.office.environment import OfficeEnv
+from hpamdp.env.office.options import GOALS, OfficeOptions
+from hpamdp.env.rooms.environment import RoomsEnv
+from hpamdp.env.rooms.options import RoomsOptions
+from hpamdp.env.rooms.rules import RoomsState
+from hpamdp.messages import exit_code
+from hpamdp.run.trainer import Trainer
+
+
+class WeakBoatEnv(BoatDockEnv):
+    """Boats of which the congruent one has a third of the push.
+
+    Its speed, and so the way of a press, is a third of that of the other boat; a press takes as much fuel. The planner
+    does not know, so neither do ceiling and oracle.
+    """
+
+    def act(self, state: BoatState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[BoatState, Tensor]:
+        """Return the states after one press, and the rewards `[N]`."""
+        option, key = action.option.int(), action.discrete.int()
+        held = torch.where(state.controller == NOT_CHOSEN, option, state.controller)
+        dir_x, dir_y = harbour.direction_of(self.rules, held, state.keymap, key)
+        strength = torch.where(held == CONGRUENT, 1.0 / 3.0, 1.0)
+        position = (state.x, state.y, state.fuel, state.goal_x, state.goal_y)
+        pressed = physics.press(*position, dir_x, dir_y, action.parameters.squeeze(-1), strength=strength)
+        after = state._replace(
+            x=pressed.x,
+            y=pressed.y,
+            velocity_x=pressed.speed * dir_x,
+            velocity_y=pressed.speed * dir_y,
+            fuel=pressed.fuel,
+            controller=held,
+            presses=state.presses + 1,
+            outcome=pressed.outcome,
+        )
+        return after, episode.reward_of(state, after, self.rules)
+
+
+class _PlantOptions(OfficeOptions):
+    def facts(self, title: str) -> ProblemFacts:
+        return ProblemFacts(title=title, option_names=(*GOALS, "plant"), has_choice=True)
+
+
+class PlantOfficeEnv(OfficeEnv):
+    """Office with a fourth goal that is always open, a plant: an agent that goes for it takes and delivers nothing."""
+
+    Options = _PlantOptions
+
+    def act(self, state: Any, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[Any, Tensor]:
+        """Return the states after one move and the rewards `[N]`."""
+        takes = action.option < len(GOALS)
+        after, reward = super().act(state, action._replace(option=action.option.clamp(max=2)), rng, is_idle)
+        kept = {name: torch.where(takes, getattr(after, name), getattr(state, name)) for name in ("coffee", "mail")}
+        outcome = torch.where(takes, after.outcome, office_rules.ON_THE_WAY)
+        reward = torch.where(takes, reward, reward.clamp(max=office_rules.STEP_REWARD))
+        return after._replace(**kept, outcome=outcome), reward
+
+    def masks(self) -> dict[str, Tensor]:
+        """Return which goals are open."""
+        is_open = office_rules.open_goals(self._state)
+        return {keys.OPTION_MASK: torch.cat([is_open, torch.ones_like(is_open[:, :1])], -1)}
+
+    def _knowledge_specs(self) -> dict[str, TensorSpec]:
+        num = len(GOALS) + 1
+        spec = Binary(num, shape=(self.num_envs, num), dtype=torch.bool, device=self.device)
+        return super()._knowledge_specs() | {keys.OPTION_MASK: spec}
+
+
+class _SlippersOptions(RoomsOptions):
+    def facts(self, title: str) -> ProblemFacts:
+        return ProblemFacts(title=title, option_names=("skates", "boots", "slippers"), has_choice=True)
+
+
+class SlippersRoomsEnv(RoomsEnv):
+    """Rooms with a third kind of shoes, slippers, in which the agent stays where it is."""
+
+    Options = _SlippersOptions
+
+    def act(self, state: RoomsState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[RoomsState, Tensor]:
+        """Return the states after one move and the rewards `[N]`."""
+        walks = (action.option < 2).unsqueeze(-1)
+        return super().act(state, action._replace(parameters=action.parameters * walks), rng, is_idle)
+
+
+BOATS = {"high": "meta_critic", "low": "hyar", "recipe": "boatdock_hyar"}
+OFFICE = {
+    **{"high": "meta_critic", "low": "hppo", "recipe": "office_hppo", "env.tiles": 20, "env.chooses_goal": True},
+    **{"exploration": "counts", "exploration.resolution": 1, "exploration.weight": 25, "eval.layouts": 100},
+}
+ROOMS_WORDS = [*train_rooms.COMMON[1:], *train_rooms.SELECTORS["meta_critic"], *train_rooms.LEARNERS["hppo"]]
+ROOMS = {name: yaml.safe_load(value) for name, _, value in (word.partition("=") for word in ROOMS_WORDS)}
+ROOMS |= {"high": "meta_critic", "low": "hppo"}
+CRIPPLED = {"env.boats": ["incongruent1", "congruent", "crippled"], "env.controllers": {"crippled": [0.0, 5.0, 10.0]}}
+CASES: dict[str, dict[str, Any]] = {
+    "boats": {"env": BoatDockEnv, **BOATS},
+    "weak": {"env": WeakBoatEnv, **BOATS},
+    "noisy": {"env": BoatDockEnv, **BOATS, "env.motor_noise": [0.6, 0.0]},
+    "crippled": {"env": BoatDockEnv, **BOATS, **CRIPPLED},
+    "office": {"env": OfficeEnv, **OFFICE},
+    "plant": {"env": PlantOfficeEnv, **OFFICE},
+    "rooms": {"env": RoomsEnv, **ROOMS},
+    "rooms, curves": {"env": RoomsEnv, **ROOMS, "agent.practice": "curves"},
+    "slippers": {"env": SlippersRoomsEnv, **ROOMS},
+    "slippers, curves": {"env": SlippersRoomsEnv, **ROOMS, "agent.practice": "curves"},
+}
+
+
+class CountDecisions(hpamdp.Callback):
+    """Count how many decisions practised each option."""
+
+    def on_end(self, trainer: Trainer) -> None:
+        """Keep the counts, which only practice by curves has."""
+        counts = getattr(trainer.parts.agent.practice, "counts", None)
+        self.shares = None if counts is None else (counts.sum(-1) / counts.sum()).tolist()
+
+
+def main(name: str, seed: str) -> None:
+    """Train, and print the score, and each option's share of the final choices and of the practice."""
+    counted = CountDecisions()
+    with tempfile.TemporaryDirectory() as folder:
+        settings = {"eval.every": 0, **CASES[name], "seed": int(seed), "eval.seed": int(seed), "film": False}
+        hpamdp.train(**settings, folder=folder, overwrite=True, callbacks=[counted], progress=False)
+        summary = json.loads((Path(folder) / "summary.json").read_text())
+        with np.load(Path(folder) / "evaluation.npz", allow_pickle=False) as evaluation:
+            chosen = np.bincount(evaluation["option"], minlength=len(summary["practised"])) / summary["episodes"]
+    columns = [", ".join(summary["practised"]), f"{summary['score']:.3f}", f"{summary['success']:.1%}"]
+    columns += [_percent(each) for each in (chosen, summary["practised"].values(), counted.shares)]
+    columns += [f"{summary[key]:.3f}" if key in summary else "" for key in ("oracle_agreement_weighted", "regret")]
+    print(f"| {name} | {seed} | {' | '.join(columns)} | {summary['cpu_s']:.0f} s |")
+
+
+def _percent(shares: Iterable[float] | None) -> str:
+    return "" if shares is None else ":".join(f"{100 * share:.0f}" for share in shares)
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: main(*sys.argv[1:])))
