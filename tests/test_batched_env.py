@@ -213,6 +213,19 @@ def test_a_state_of_other_environments_is_refused_and_an_empty_one_starts_new_ep
 
 
 @each_problem
+def test_an_environment_goes_on_past_the_largest_number_of_an_episode(problem):
+    env = problem(2)
+    env.reset()
+    env.state = env.state._replace(episode=torch.full((2,), 2**31 - 1, dtype=torch.int32))
+    reading = env.reset()
+    assert env.state.episode.tolist() == [-(2**31)] * 2
+    env.check_env_state(env.env_state())
+    resumed = problem(2)
+    resumed.set_env_state(snapshot(env))
+    assert torch.equal(resumed.read()[keys.OBSERVATION], reading[keys.OBSERVATION])
+
+
+@each_problem
 def test_an_invalid_action_is_refused_and_changes_nothing(problem):
     env = problem(2)
     env.reset()

@@ -221,6 +221,13 @@ def test_layouts_are_frozen_for_life_by_default_and_new_each_episode_otherwise()
     assert (layouts(frozen.reset()) == layouts(frozen.reset(frozen.fixed_episodes(0)))).all()
 
 
+def test_layouts_stay_frozen_past_the_largest_number_of_an_episode():
+    env = ReleasedBoatDockEnv(5)
+    first = layouts(env.reset())
+    env.state = env.state._replace(episode=torch.full((5,), 2**31 - 1, dtype=torch.int32))
+    assert all((layouts(env.reset()) == first).all() for _ in range(2))
+
+
 def test_key_map_zero_is_sampled_again_at_every_reset_until_it_is_one():
     env = ReleasedBoatDockEnv(400, controller="incongruent")
     last = torch.zeros(400)

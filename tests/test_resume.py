@@ -13,6 +13,7 @@ import torch
 from conftest import TRAINED, assert_same, compose_config, forked, parts_of
 from test_grid import SHORT, SHORT_SELECTORS
 
+import hpamdp
 from hpamdp.run import checkpoint
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.stopping import STOP_SIGNALS
@@ -32,6 +33,20 @@ def parts_of_run(folder: Path) -> dict:
     parts = parts_of(folder / checkpoint.FILE_NAME)
     del parts["progress"]  # which has wall times
     return parts
+
+
+class Far(hpamdp.Callback):
+    """Lets a run begin shortly before the largest int32 of steps and of episodes, and copies its folder in between."""
+
+    def on_start(self, trainer) -> None:
+        env = trainer.parts.env.base_env
+        if trainer.resumed_from is None:
+            trainer.frames = 2**31 - 96
+            env.state = env.state._replace(episode=torch.full((8,), 2**31 - 3, dtype=torch.int32))
+
+    def on_batch(self, trainer) -> None:
+        if trainer.frames == 2**31 and trainer.resumed_from is None:
+            shutil.copytree(trainer.output_dir, trainer.output_dir.with_name("copy"))
 
 
 def stop_and_resume(
@@ -161,3 +176,16 @@ def test_several_components_resume_to_the_last_bit(low, collector, tmp_path, mon
     given = [*words_of("none", low), "low.autoregressive=true", "env=gymnasium", "env.entry_point=shop:Tour"]
     given += ["env.max_steps=1", "env.pair_mask=info", f"collector={collector}"]
     stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM, on_resuming=("trust=true",))
+
+
+def test_a_run_goes_on_past_the_largest_int32_of_steps_and_episodes_and_resumes_there(tmp_path):
+    sizes = {"num_envs": 8, "steps_per_batch": 4, "max_steps": 2, "total_frames": 2**31 + 64, "eval.layouts": 2}
+    every = {"eval.every": 0, "log_every": 32, "checkpoint_every": 32}
+    given = {"low": "random", "film": False, "progress": False, **sizes, **every}
+    hpamdp.train("catch_point", folder=tmp_path / "whole", callbacks=[Far()], **given)
+    hpamdp.train(folder=tmp_path / "resumed", resume=str(tmp_path / "copy"), progress=False)
+    assert rows_of(tmp_path / "resumed") == rows_of(tmp_path / "whole")
+    assert [float(row["frames"]) for row in rows_of(tmp_path / "whole")] == [2**31 + 32.0 * i for i in range(-3, 3)]
+    parts, whole = (parts_of_run(tmp_path / name) for name in ("resumed", "whole"))
+    assert (whole["collection"]["env"]["episode"] < 0).all()
+    assert_same(parts["collection"], whole["collection"])

@@ -416,8 +416,9 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
                 setting = name.removesuffix("_checksum")
                 file = getattr(self.options, setting)
                 raise ValueError(f"the file env.{setting}={file!r} is no longer the one of this state")
-        steps, outcome, episode = self._state._fields[-3:]
-        check_range(columns, {steps: (0, 2**30), outcome: (0, len(self.outcomes)), episode: (-1, 2**30)})
+        # Any number of an episode is valid: after 2^31 - 1 comes -2^31, with random numbers of its own.
+        steps, outcome, _ = self._state._fields[-3:]
+        check_range(columns, {steps: (0, 2**30), outcome: (0, len(self.outcomes))})
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue from an `env_state`; an empty one starts new episodes.

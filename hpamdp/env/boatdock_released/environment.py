@@ -165,7 +165,7 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
         episode = state.episode + 1
         rng = counter_rng.rng_key(self._seed, counter_rng.TRAINING, self._environment, episode)
         points = torch.stack(state[:4], -1)
-        is_due = mask & (state.episode < 0) if self.options.frozen_layouts else mask
+        is_due = mask & (state.episode == -1) if self.options.frozen_layouts else mask
         if is_due.any():
             due = rng._replace(bits=rng.bits[is_due])
             points[is_due] = released.sample_layouts(due, self.options.test_mode).to(points)
