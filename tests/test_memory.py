@@ -186,6 +186,16 @@ def test_a_sequence_is_the_history_of_its_last_step_across_batches_and_never_of_
     assert lengths == {1, 2, 3}
 
 
+def test_a_buffer_counts_more_rows_than_32_bits_hold():
+    learner, rolled = stored("pdqn", 2, buffer_size=70, burn_in=1, sequence_length=2)
+    writer = learner.buffer._writer
+    writer.load_state_dict({"_cursor": (2**31 - 20) % 70, "_write_count": 2**31 - 20})
+    for batch in rolled.split(3, 1):
+        learner.learn(batch, everything(batch))
+    assert learner.buffer.write_count == 2**31 - 20 + rolled.numel()
+    assert sample_with_past(learner.buffer, 100, learner.num_past)["num_past"].max() == 3
+
+
 @pytest.mark.parametrize(("burn_in", "length"), [(0, 4), (2, 2), (3, 1), (0, 1), (0, 9)])
 def test_sampled_states_are_those_of_the_policy_that_stored_them(burn_in, length):
     learner, _ = stored("hsac", 6, burn_in=burn_in, sequence_length=length)

@@ -23,7 +23,6 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
@@ -33,7 +32,7 @@ from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.exploration import schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
-from hpamdp.policies.shared.replay import first_multiple, packed_states, unpacked_states
+from hpamdp.policies.shared.replay import first_multiple, packed_states, replay_buffer, unpacked_states
 from hpamdp.policies.shared.selector_memory import RemembersDecisions
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
 from hpamdp.specs import PAMDPSpecs
@@ -69,7 +68,7 @@ class MetaCritic(RemembersDecisions):
         self.optimizer = torch.optim.Adam(
             [*self.critics.parameters(), *self.perception.parameters()], lr=self.options.lr, fused=True
         )
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(self.options.buffer_size, device=device))
+        self.buffer = replay_buffer(self.options.buffer_size, device)
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizer and the replay buffer."""

@@ -30,7 +30,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
@@ -39,7 +38,7 @@ from hpamdp.policies.high_level.options import CARDS, OptionCriticOptions
 from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.policies.shared.exploration import schedule
 from hpamdp.policies.shared.networks import mlp, polyak_update
-from hpamdp.policies.shared.replay import first_multiple
+from hpamdp.policies.shared.replay import first_multiple, replay_buffer
 from hpamdp.policies.shared.selector_memory import RemembersDecisions
 from hpamdp.specs import PAMDPSpecs
 
@@ -80,7 +79,7 @@ class OptionCritic(RemembersDecisions):
             "critic": torch.optim.Adam(self.critic.parameters(), lr=self.options.lr, fused=True),
             "termination": torch.optim.Adam(self.termination.parameters(), lr=self.options.termination_lr, fused=True),
         }
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(self.options.buffer_size, device=device))
+        self.buffer = replay_buffer(self.options.buffer_size, device)
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizers and the replay buffer."""

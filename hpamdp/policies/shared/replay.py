@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import LazyTensorStorage, ReplayBuffer, RoundRobinWriter
 
 from hpamdp import keys
 from hpamdp.devices import checked_device
@@ -100,7 +100,7 @@ class ReplayLearner(Learner):
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(options.buffer_size, device=device))
+        self.buffer = replay_buffer(options.buffer_size, device)
         self.descent = Descent()
         self.links = None
         self.make_networks(specs)
@@ -260,7 +260,7 @@ class ReplayLearner(Learner):
     def _storing_only(self, batch: TensorDictBase, mask: Tensor) -> Iterator[None]:
         """Let the buffer hold only the transitions in `mask` of a batch `[*B, T]` while the block runs."""
         own, last_rows = self.buffer, None if self.links is None else self.links.last_rows
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(batch.numel(), device=self.frames.device))
+        self.buffer = replay_buffer(batch.numel(), self.frames.device)
         try:
             self.store(batch, mask)
             yield
@@ -417,6 +417,15 @@ class ReplayLearner(Learner):
     def pairs(self, sample: TensorDictBase) -> Tensor | None:
         """Return which discrete actions go together in a sample's states, as in `pair_mask`. If None, all do."""
         return sample.get("pair_mask", None)
+
+
+def replay_buffer(capacity: int, device: torch.device) -> ReplayBuffer:
+    """Return an empty ring buffer.
+
+    By default TorchRL counts the stored rows in 32 bits. After 2^31 rows the count would be negative, and with it the
+    numbers of the rows that `HistoryLinks` follows and that a checkpoint restores. A compilable writer has no limit.
+    """
+    return ReplayBuffer(storage=LazyTensorStorage(capacity, device=device), writer=RoundRobinWriter(compilable=True))
 
 
 def packed_states(rows: TensorDictBase, specs: PAMDPSpecs) -> TensorDictBase:
