@@ -243,11 +243,6 @@ def name_of_passed(cls: type) -> str:
     return dotted
 
 
-def is_passed(cls: object) -> bool:
-    """Return whether Python code passed a class, which another process may be unable to import."""
-    return cls in _passed.values()
-
-
 def load_class(dotted: str) -> type:
     """Import a class by its dotted name.
 

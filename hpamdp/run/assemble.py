@@ -152,7 +152,7 @@ def check_built(config: Config, env: PAMDPEnv) -> None:
     Raises:
         ConfigError: the settings do not go with the problem.
     """
-    facts = facts_about(env, config)
+    facts = compatibility.facts_of(config) or _facts_of_built(env)
     compatibility.check_problem(config, facts)
     left_out = actions_in_no_option(env) if isinstance(config.run.env.grouping, dict) else []
     if left_out:
@@ -181,12 +181,8 @@ def actions_in_no_option(env: PAMDPEnv) -> list[str]:
     return [name for name, by_options in zip(names, taken, strict=True) if not any(by_options)]
 
 
-def facts_about(env: PAMDPEnv, config: Config) -> ProblemFacts:
-    """Return the facts about a problem from its settings, or else from the built environment."""
-    return compatibility.facts_of(config) or _facts_of_built(env)
-
-
 def _facts_of_built(env: PAMDPEnv) -> ProblemFacts:
+    """Return the facts about a problem whose settings do not tell them."""
     return ProblemFacts(
         title=env.title,
         option_names=env.option_names,

@@ -17,7 +17,6 @@ from hpamdp.config.components import (
     GROUPS,
     Component,
     constructor_arguments,
-    is_passed,
 )
 from hpamdp.config.compose import RECIPE, setting_of, settings_in
 from hpamdp.config.errors import ConfigError
@@ -341,9 +340,9 @@ def _about_batches(config: Config) -> Iterator[str]:
 
 
 def _about_workers(config: Config) -> Iterator[str]:
-    """Yield what Python code passed and no worker process can get."""
+    """Yield what is not of this package and no worker process can get."""
     parts = (config.env, config.high, *config.learners)
-    passed: dict[str, object] = {str(part): part.cls for part in parts if is_passed(part.target)}
+    passed: dict[str, object] = {str(part): part.cls for part in parts if isinstance(part.target, type)}
     if config.env.objects:
         passed["env"] = config.env.objects
     for what, value in passed.items():

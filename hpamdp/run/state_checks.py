@@ -17,7 +17,7 @@ from hpamdp.policies.shared.sized_by_data import SizedByData
 _SCHEDULED = ("lr", "weight_decay")  # settings of an optimizer that training changes
 
 
-def check_form(where: str, saved: object, own: Tensor, *, any_size: bool = False, any_rows: bool = False) -> None:
+def check_form(where: str, saved: object, own: Tensor, *, any_size: bool = False) -> None:
     """Refuse a value unless it is a tensor with the dtype and shape of `own`; float16 may stand for float32.
 
     Args:
@@ -25,15 +25,13 @@ def check_form(where: str, saved: object, own: Tensor, *, any_size: bool = False
         saved: the value.
         own: the tensor of the run.
         any_size: whether only the number of dimensions must be the same.
-        any_rows: whether the first dimension may differ.
 
     Raises:
         ValueError: the value is refused.
     """
     if not isinstance(saved, Tensor):
         raise ValueError(f"{where} is {type(saved).__name__}, but must be a tensor")
-    first = own.ndim if any_size else int(any_rows)  # the first dimension that must be the same
-    fits = saved.ndim == own.ndim and saved.shape[first:] == own.shape[first:]
+    fits = saved.ndim == own.ndim and (any_size or saved.shape == own.shape)
     if not fits or (saved.dtype != own.dtype and (saved.dtype, own.dtype) != (torch.float16, torch.float32)):
         raise ValueError(f"{where} is {_form(saved)}, but must be {_form(own)}")
 
@@ -42,23 +40,22 @@ def _form(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
 
 
-def check_like(where: str, saved: Any, own: Any, *, any_rows: bool = False) -> None:
+def check_like(where: str, saved: Any, own: Any) -> None:
     """Refuse nested values whose names, types, dtypes or shapes differ from `own`.
 
     Args:
         where: name of the values in the error.
         saved: the values.
         own: the values of the run.
-        any_rows: whether the first dimension of tensors may differ.
 
     Raises:
         ValueError: the values differ; the message names the first difference.
     """
     if isinstance(own, Tensor):
-        check_form(where, saved, own, any_rows=any_rows)
+        check_form(where, saved, own)
     elif isinstance(own, Mapping):
         for name, value in check_names(saved, own, where).items():
-            check_like(f"{where}.{name}", value, own[name], any_rows=any_rows)
+            check_like(f"{where}.{name}", value, own[name])
     elif type(saved) is not type(own):
         raise ValueError(f"{where} is {type(saved).__name__}, but must be {type(own).__name__}")
 
