@@ -19,13 +19,16 @@ names is used.
 
 import lazy_loader
 
-from hpamdp.shell import is_command_line
+from hpamdp.search_path import is_command_line, put_working_directory_last
 
 __version__ = "0.3.0"
 # `__init__.pyi` lists the names with their modules, which are imported when a name is used.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-if not is_command_line():
+if is_command_line():
+    # `python -m` puts the working directory first, and the next import needs other packages.
+    put_working_directory_last()
+else:
     # The command line leaves this to `env=gymnasium`: importing Gymnasium takes longer than refusing a wrong setting.
     from hpamdp.env.registration import register
 

@@ -9,6 +9,7 @@ import sys
 import uuid
 import warnings
 from contextlib import suppress
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import NoReturn
 
@@ -38,7 +39,8 @@ from hpamdp.messages import (
 )
 from hpamdp.run import compatibility, sweep
 from hpamdp.run.folder import is_about_folder, locked
-from hpamdp.shell import find_own_classes, program
+from hpamdp.search_path import protect_children, put_working_directory_last, unprotect_children
+from hpamdp.shell import program
 
 # Further commands, and the modules whose `main` gets the words that follow and a parser.
 _COMMANDS = {
@@ -63,7 +65,8 @@ def main() -> None:
 
 
 def _main() -> None:
-    find_own_classes()
+    # The user's own classes may lie in the working directory, as with `python -m`.
+    put_working_directory_last()
     # Then Hydra raises its errors. Otherwise it would print them in several lines.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # TorchRL logs every replay buffer that it fills.
@@ -123,6 +126,7 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         has_started = True
         return _run_job(cfg, start)
 
+    protect_children()
     try:
         line = completed(_with_saved_choices(line), conf)
         sys.argv[1:] = line.argv()  # which Hydra parses
@@ -136,6 +140,8 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         if not has_started and isinstance(error, _BEFORE_A_JOB) and not isinstance(error, ConfigError):
             _exit_with(explained(error, line, conf))
         raise
+    finally:
+        unprotect_children()
     if sweep.has_begun(start):
         sys.exit(sweep.report(start))
     if line.is_multirun and not line.only_shows:
@@ -154,7 +160,10 @@ def _with_saved_choices(line: CommandLine) -> CommandLine:
 
 def _run_job(cfg: DictConfig, start: str) -> float | None:
     """Run one job, and return its score if the job belongs to a sweep."""
-    find_own_classes()  # in a worker of a launcher, too
+    put_working_directory_last()  # in a worker of a launcher, too
+    with suppress(OSError):  # its first user reports the error
+        resource_tracker.ensure_running()  # a helper process of Python, started while children are protected
+    unprotect_children()
     job = HydraConfig.get()
     if job.mode == RunMode.MULTIRUN:
         return sweep.run_job(cfg, start)

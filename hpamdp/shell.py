@@ -1,4 +1,4 @@
-"""The command line as a program: how it was started, where it finds classes, and words that a user can paste."""
+"""Quote commands for the shell and for Hydra's grammar, so that a user can paste them."""
 
 from __future__ import annotations
 
@@ -11,21 +11,6 @@ from pathlib import Path
 # Texts that need no quotes in Hydra's grammar or in a shell.
 _PLAIN = re.compile(r"(?=.*/|[A-Za-z])[A-Za-z0-9_./-]+")
 _NO_TEXT = ("null", "true", "false", "inf", "nan")
-
-
-def is_command_line() -> bool:
-    """Return whether this package is being imported to run its command line."""
-    started = sys.argv[0] if sys.argv else ""
-    if started == "-m":  # until Python has found the module
-        return any(word.partition(".")[0] == "hpamdp" for word in sys.orig_argv)
-    script = Path(__file__).resolve().parents[1] / "run.py"
-    return os.path.basename(started) == "hpamdp" or os.path.realpath(started) == str(script)
-
-
-def find_own_classes() -> None:
-    """Let Python look for the user's own classes in the working directory, after all installed packages."""
-    if os.getcwd() not in map(os.path.realpath, sys.path):
-        sys.path.append(os.getcwd())
 
 
 def program() -> str:

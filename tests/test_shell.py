@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import forked
+from conftest import CONF, forked
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import QuotedString
 from omegaconf import OmegaConf
@@ -16,7 +16,8 @@ from omegaconf import OmegaConf
 from hpamdp import cli
 from hpamdp.files import replacing
 from hpamdp.run import train
-from hpamdp.shell import find_own_classes, for_hydra, path_setting, setting
+from hpamdp.search_path import put_working_directory_last
+from hpamdp.shell import for_hydra, path_setting, setting
 
 FOLDERS = [
     *("sweep", "outputs/2025-01-31/12-00-00-000001", "lr=0.1,seed=1", "my runs/a", "läufe", "a(b)"),
@@ -107,9 +108,8 @@ def ends_with(folder: Path, words: list[str], out: int, encoding: str, err: Path
 def test_classes_are_found_in_the_working_directory_after_installed_packages(monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "path", ["/packages"])
     monkeypatch.chdir(tmp_path)
-    find_own_classes()
-    find_own_classes()
-    assert sys.path == ["/packages", str(tmp_path)]
+    put_working_directory_last()
+    assert sys.path == [root, "/packages", str(tmp_path)]
 
 
 def of_a_limited_process(folder: Path, limit: int, value: int, err: Path) -> None:

@@ -23,6 +23,7 @@ from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.options import GymnasiumOptions
 from hpamdp.env.registration import register
 from hpamdp.messages import warn
+from hpamdp.search_path import protect_children, unprotect_children
 from hpamdp.settings import SettingError
 
 _PATIENCE_S = 2.0  # until a dead process has an exit code
@@ -76,6 +77,7 @@ class _BlockEnv(gymnasium.Env):
         """Begin episodes of the copies whose `seeds` are in the options."""
         block = self._block
         if self._copies is None:
+            unprotect_children()
             register()
             self._copies = Copies(block.make, block.num, block.settings, block.flattens_pictures, block.first)
         seeds = {row - block.first: seed for row, seed in (options or {})["seeds"].items()}
@@ -255,9 +257,11 @@ class ProcessCopies:
 
 @contextmanager
 def _starting() -> Iterator[None]:
-    """Let processes that are started inside the block leave signals to the run's process."""
+    """Let processes that are started inside the block leave signals and modules to the run's process."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS_OF_THE_RUN)
+    protect_children()
     try:
         yield
     finally:
+        unprotect_children()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

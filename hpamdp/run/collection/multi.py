@@ -15,7 +15,7 @@ from hpamdp.messages import warn
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.options import CARDS, WorkerOptions
 from hpamdp.run.collection.worker import EnvShard, SharedMemoryCollector
-from hpamdp.run.collection.workers import WorkerCollection, children_without
+from hpamdp.run.collection.workers import WorkerCollection, children_without, modules_here_last
 from hpamdp.run.stopping import STOP_SIGNALS
 
 _PATIENCE_S = 2.0  # from the moment a worker's pipe is closed until it has an exit code
@@ -34,7 +34,8 @@ class MultiCollection(WorkerCollection):
         if num > num_cpus:
             warn(f"collector.num_workers={num}: more than the {num_cpus} CPUs, which the workers will share")
         # multiprocessing unblocks the signals when it starts this helper of its own.
-        resource_tracker.ensure_running()
+        with modules_here_last():
+            resource_tracker.ensure_running()
         super().__init__(config, parts, frames, options)
 
     def _start(self, shard: EnvShard) -> MultiSyncCollector:

@@ -25,6 +25,7 @@ from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.messages import one_line
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run.assemble import env_and_policy, make_agent, make_env
+from hpamdp.search_path import unprotect_children
 from hpamdp.specs import PAMDPSpecs
 
 _CPU = torch.device("cpu")
@@ -179,6 +180,7 @@ class EnvShard:
     def make_env(self) -> TransformedEnv:
         """Build the environments, with their decisions tracked."""
         _end_with_parent()
+        unprotect_children()
         torch.set_num_threads(1)
         agent = self._make_agent()
         if self.low is not None:

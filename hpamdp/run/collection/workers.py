@@ -26,6 +26,7 @@ from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, check_state, random_seeds
 from hpamdp.run.collection.options import WorkerOptions
 from hpamdp.run.collection.worker import EnvShard, RemoteError, pack_state
+from hpamdp.search_path import protect_children, unprotect_children
 
 _PATIENCE_S = 2.0  # for workers in the middle of a batch that is no longer needed
 
@@ -83,7 +84,8 @@ class WorkerCollection(Collection):
         self._coming: list[Future[TensorDictBase]] = []
         self._threads = ThreadPoolExecutor(num_workers)
         try:
-            self._on_all(self._start_first)
+            with modules_here_last():
+                self._on_all(self._start_first)
             for new in self._on_all(lambda number: call_worker(self.workers[number], "take_new_statistics")):
                 self._problem.add_statistics(new)
         except BaseException:
@@ -166,7 +168,7 @@ class WorkerCollection(Collection):
     def _attempt(self, number: int, call: Callable[[Any], _Returned]) -> _Returned:
         try:
             if self.workers[number] is None:
-                with self._restarting:
+                with self._restarting, modules_here_last():
                     self.workers[number] = self._start(self._shard(number, self._restarts))
             return call(self.workers[number])
         except Exception as error:
@@ -343,6 +345,16 @@ def children_without(*numbers: signal.Signals) -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def modules_here_last() -> Iterator[None]:
+    """Make processes that are started inside the block look for modules in the working directory last."""
+    protect_children()
+    try:
+        yield
+    finally:
+        unprotect_children()
 
 
 def _side_by_side(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
