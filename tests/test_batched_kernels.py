@@ -11,7 +11,6 @@ from numba import njit
 
 from hpamdp import keys
 from hpamdp.env import counter_rng, kernels
-from hpamdp.env.batched_env import BatchedEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.circuit.environment import CircuitEnv
@@ -166,10 +165,9 @@ def test_a_row_is_the_same_to_the_bit_in_every_batch(problem):
 
 
 @pytest.mark.parametrize("problem", KERNEL_ALONE)
-def test_a_kernel_alone_serves_tensors_on_another_device(problem, monkeypatch):
-    here = problem(5, seed=3, max_steps=4)
-    monkeypatch.setattr(BatchedEnv, "_is_on_cpu", False)  # so that all tensors are moved, here from the CPU to it
-    there = problem(5, seed=3, max_steps=4)
+def test_a_kernel_alone_serves_tensors_on_another_device(problem):
+    here, there = (problem(5, seed=3, max_steps=4) for _ in range(2))
+    there._is_on_cpu = False  # so that all tensors are moved, here from the CPU to it
     actions = [here.rand_action(here.reset()).select(keys.ACTION) for _ in range(9)]
     for env in (here, there):
         env.set_seed(2)

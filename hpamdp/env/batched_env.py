@@ -177,6 +177,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         num_envs, seed, first_env = self.checked_numbers(num_envs, seed, first_env)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
+        self._is_on_cpu = self.device is None or self.device.type == "cpu"  # each step asks
         facts = self.facts(self.options)
         if oracle and not facts.has_oracle:
             raise SettingError(f"oracle={oracle}: {self.title} has no planner to ask")
@@ -252,10 +253,6 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
         are_its_own = all(getattr(type(self), name) is getattr(owner, name) for name in ("start", "act", "observe"))
         return self._is_on_cpu and not self._is_compiled and are_its_own
-
-    @property
-    def _is_on_cpu(self) -> bool:
-        return self.device is None or self.device.type == "cpu"
 
     def leave_kernel(self) -> None:
         """Let the tensor functions move the environments from here on."""
