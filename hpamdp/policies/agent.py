@@ -413,7 +413,6 @@ class HierarchicalAgent(nn.Module):
         ValueError: the selector's `specs` list other options than the pairs.
     """
 
-    frames: Tensor
     values_end_with_trips: bool = False
     selector_values_end_with_trips: bool = False
 
@@ -438,7 +437,7 @@ class HierarchicalAgent(nn.Module):
         self.is_shared = is_shared
         self.is_frozen = is_frozen
         self.practice = practice
-        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
+        self.frames: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
         self._set_practice()
         self.router = OptionRouter(learners, specs, is_shared, explorations)
         self.option_lengths = tuple(option_lengths)

@@ -233,8 +233,8 @@ class Selector(Level, TensorDictModuleBase):
             def __init__(self, specs: PAMDPSpecs, *, epsilon: Fraction) -> None:
                 super().__init__(specs)
                 self.epsilon = epsilon
-                self.register_buffer("sums", torch.zeros(specs.num_options))
-                self.register_buffer("counts", torch.zeros(specs.num_options))
+                self.sums = nn.Buffer(torch.zeros(specs.num_options))
+                self.counts = nn.Buffer(torch.zeros(specs.num_options))
 
             def select(self, td: TensorDictBase) -> Tensor:
                 best = (self.sums / self.counts.clamp(min=1.0)).argmax().expand(td.batch_size)
@@ -287,8 +287,6 @@ class Selector(Level, TensorDictModuleBase):
     decides_ends: bool = False
     gamma: float = 1.0
     memory_key: str | None = None
-    practice: Tensor
-    pending: Tensor
     option_values: nn.Module
 
     in_keys: list[NestedKey]
@@ -302,8 +300,8 @@ class Selector(Level, TensorDictModuleBase):
             self.in_keys.append(keys.OPTION_MASK)
         self.out_keys = [keys.OPTION]
         self.specs = specs
-        self.register_buffer("practice", torch.zeros(specs.num_options, dtype=torch.float32))
-        self.register_buffer("pending", torch.zeros(specs.num_options, dtype=torch.long))
+        self.practice = nn.Buffer(torch.zeros(specs.num_options, dtype=torch.float32))
+        self.pending: Tensor = nn.Buffer(torch.zeros(specs.num_options, dtype=torch.long))
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return an option for every environment, int64 `[*B]`.

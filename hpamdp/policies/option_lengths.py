@@ -39,13 +39,11 @@ class OptionLengths(nn.Module):
         lengths: numbers of steps, positive and increasing.
     """
 
-    lengths: Tensor
-
     def __init__(self, lengths: Sequence[int]) -> None:
         super().__init__()
         self.longest = max(lengths)
         # Not persistent, since the lengths are a setting, which the checkpoint already holds.
-        self.register_buffer("lengths", torch.tensor(lengths, dtype=torch.long), persistent=False)
+        self.lengths = nn.Buffer(torch.tensor(lengths, dtype=torch.long), persistent=False)
 
     def extra_repr(self) -> str:
         """Return the lengths as text."""

@@ -55,12 +55,11 @@ class Practice(nn.Module):
     """
 
     added_later: ClassVar[tuple[str, ...]] = ("own_steps",)  # checkpoints of 0.3 lack it
-    own_steps: Tensor
 
     def __init__(self, num_options: int, uniform_steps: int = 0) -> None:
         super().__init__()
         self.uniform_steps = uniform_steps
-        self.register_buffer("own_steps", torch.zeros(num_options, dtype=torch.float64))
+        self.own_steps: Tensor = nn.Buffer(torch.zeros(num_options, dtype=torch.float64))
 
     @property
     def can_overrule(self) -> bool:
@@ -100,17 +99,14 @@ class CurvePractice(Practice):
 
     added_later = ("own_steps", "width", "counts", "sums", "squares")
     can_overrule = True
-    width: Tensor
-    counts: Tensor
-    sums: Tensor
-    squares: Tensor
 
     def __init__(self, num_options: int, total: int) -> None:
         super().__init__(num_options)
         self.total = total
-        self.register_buffer("width", torch.tensor(total / NUM_BINS, dtype=torch.float64))
-        for name in ("counts", "sums", "squares"):
-            self.register_buffer(name, torch.zeros(num_options, NUM_BINS, dtype=torch.float64))
+        self.width: Tensor = nn.Buffer(torch.tensor(total / NUM_BINS, dtype=torch.float64))
+        self.counts = nn.Buffer(torch.zeros(num_options, NUM_BINS, dtype=torch.float64))
+        self.sums = nn.Buffer(torch.zeros_like(self.counts))
+        self.squares = nn.Buffer(torch.zeros_like(self.counts))
 
     def add(self, options: Tensor, decided: Tensor, returns: Tensor) -> None:
         """Count steps and record returns; see `Practice.add`."""

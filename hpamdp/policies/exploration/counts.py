@@ -43,18 +43,14 @@ class VisitTable(nn.Module):
         options: the settings.
     """
 
-    counts: Tensor
-    factors: Tensor
-    resolution: Tensor
-
     def __init__(self, observation_dim: int, options: CountsOptions) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(_HASH_SEED)
         factors = torch.randint(_LARGEST_FACTOR, (observation_dim,), generator=generator)
-        self.register_buffer("factors", factors, persistent=False)
+        self.factors = nn.Buffer(factors, persistent=False)
         resolution = torch.tensor(options.resolution, dtype=torch.float32)
-        self.register_buffer("resolution", resolution, persistent=False)
-        self.register_buffer("counts", torch.zeros(options.table_size, dtype=torch.long))
+        self.resolution = nn.Buffer(resolution, persistent=False)
+        self.counts = nn.Buffer(torch.zeros(options.table_size, dtype=torch.long))
 
     def places(self, observation: Tensor) -> Tensor:
         """Return the places in the table, int64 `[*B]`, of observations `[*B, observation_dim]`."""

@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
@@ -53,9 +53,6 @@ class HeldPolicy(TensorDictModuleBase):
         options: the settings.
     """
 
-    epsilon: Tensor
-    cumulative: Tensor
-
     def __init__(self, policy: TensorDictModuleBase, specs: PAMDPSpecs, options: HeldOptions) -> None:
         super().__init__()
         is_shared = specs.num_options > 0 and specs.held_option is None
@@ -65,9 +62,9 @@ class HeldPolicy(TensorDictModuleBase):
         self.out_keys = [*policy.out_keys, keys.IS_HELD, *state]
         self.policy = policy
         self.specs = specs
-        self.register_buffer("epsilon", torch.tensor(options.epsilon, dtype=torch.float32))
+        self.epsilon = nn.Buffer(torch.tensor(options.epsilon, dtype=torch.float32))
         cumulative = zeta_distribution(options.mu, options.longest).cumsum(0)
-        self.register_buffer("cumulative", cumulative, persistent=False)
+        self.cumulative = nn.Buffer(cumulative, persistent=False)
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -144,8 +141,6 @@ class Held(Exploration):
     card = CARDS["Held"]
     exploring_keys: ClassVar[frozenset[NestedKey]] = frozenset({keys.HOLD_STEPS, keys.HOLD_DISCRETE, keys.HOLD_UNIT})
 
-    frames: Tensor
-
     def __init__(
         self,
         learner: Learner,
@@ -157,7 +152,7 @@ class Held(Exploration):
         super().__init__(learner)
         self.options: HeldOptions = HeldOptions.of(options, settings)
         self.policy = HeldPolicy(learner.policy, learner.specs, self.options)
-        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
+        self.frames: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
         learner.is_overruled = True
         self.to(checked_device(self, device))
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.high_level.options import CARDS, Exp3Options
@@ -34,9 +34,6 @@ class Exp3(Bandit):
     card = CARDS["Exp3"]
     options: Exp3Options
 
-    low: Tensor
-    high: Tensor
-
     def __init__(self, specs: PAMDPSpecs, options: Exp3Options | None = None, **settings: Any) -> None:
         super().__init__(specs, options, **settings)
         self.out_keys = [*self.out_keys, PROBABILITY]
@@ -44,8 +41,8 @@ class Exp3(Bandit):
         # range of the rewards may still grow.
         self.weighted = RewardStatistics(specs.num_options, self.options)
         self.inverse = RewardStatistics(specs.num_options, self.options)
-        self.register_buffer("low", torch.tensor(torch.inf, dtype=torch.float64))
-        self.register_buffer("high", torch.tensor(-torch.inf, dtype=torch.float64))
+        self.low: Tensor = nn.Buffer(torch.tensor(torch.inf, dtype=torch.float64))
+        self.high: Tensor = nn.Buffer(torch.tensor(-torch.inf, dtype=torch.float64))
 
     @property
     def gains(self) -> Tensor:

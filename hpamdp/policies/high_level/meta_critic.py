@@ -22,7 +22,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
@@ -43,7 +43,6 @@ class MetaCritic(RemembersDecisions):
 
     Options = MetaCriticOptions
     card = CARDS["MetaCritic"]
-    num_decisions: Tensor
 
     def __init__(
         self,
@@ -63,7 +62,7 @@ class MetaCritic(RemembersDecisions):
         self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
         self.links = HistoryLinks() if self.perception.is_recurrent else None
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
+        self.num_decisions: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimizer = torch.optim.Adam(
             [*self.critics.parameters(), *self.perception.parameters()], lr=self.options.lr, fused=True

@@ -49,8 +49,6 @@ class OptionCritic(RemembersDecisions):
     Options = OptionCriticOptions
     card = CARDS["OptionCritic"]
 
-    num_steps: Tensor
-
     def __init__(
         self,
         specs: PAMDPSpecs,
@@ -73,7 +71,7 @@ class OptionCritic(RemembersDecisions):
         with torch.no_grad():
             last.weight.mul_(0.01)
             last.bias.fill_(torch.tensor(self.options.initial_termination, dtype=torch.float32).logit().item())
-        self.register_buffer("num_steps", torch.zeros((), dtype=torch.long))
+        self.num_steps: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimizers = {
             "critic": torch.optim.Adam(self.critic.parameters(), lr=self.options.lr, fused=True),

@@ -64,8 +64,6 @@ class HPPO(OnPolicy, Learner):
     # A new run does not take over rows that wait for an update: they may come from another problem.
     progress = Learner.progress | {"log_min_scale", "log_max_scale", WAITING}
 
-    frames: Tensor
-
     def __init__(
         self,
         specs: PAMDPSpecs,
@@ -103,7 +101,7 @@ class HPPO(OnPolicy, Learner):
         self.policy = HybridPolicy(
             self.actor, specs, writes_raw=True, samples_when_greedy=samples, perception=self.perception
         )
-        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
+        self.frames: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
         self.to(checked_device(self, device))
         self.optimizer = torch.optim.Adam(self._groups(), lr=options.lr, eps=1e-5, fused=True)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]

@@ -80,8 +80,6 @@ _LARGEST_EXECUTED = 1.0 - 1e-6
 class HSACActor(DistributionActor):
     """One network for the logits of the discrete actions and the Gaussians of their parameters, before squashing."""
 
-    owner: Tensor
-
     def __init__(self, specs: PAMDPSpecs, options: HSACOptions) -> None:
         super().__init__()
         self.components = specs.components
@@ -91,7 +89,7 @@ class HSACActor(DistributionActor):
         self.initial = InitialLayer(specs, options.initial_parameters, is_squashed=True)
         means = slice(specs.num_discrete, specs.num_discrete + specs.num_parameters)
         self.initial.shrink(self.net[-1], means)
-        self.register_buffer("owner", specs.parameter_owner, persistent=False)
+        self.owner = nn.Buffer(specs.parameter_owner, persistent=False)
 
     def forward(self, state: Tensor, mask: Tensor | None = None) -> HybridDistribution:
         """Return the distribution of the action for states `[*B, observation_dim]`.
@@ -113,8 +111,6 @@ class HSACPolicy(TensorDictModuleBase):
     If greedy, take the most probable discrete action with its squashed means.
     """
 
-    is_random: Tensor
-
     def __init__(self, actor: HSACActor | HybridActor, perception: Perception, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.in_keys = perception.in_keys
@@ -122,7 +118,7 @@ class HSACPolicy(TensorDictModuleBase):
         self.perception = perception
         self.actor = actor
         self.specs = specs
-        self.register_buffer("is_random", torch.ones((), dtype=torch.bool))
+        self.is_random = nn.Buffer(torch.ones((), dtype=torch.bool))
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -154,13 +150,12 @@ class HSAC(ReplayLearner):
 
     options: HSACOptions
     policy: HSACPolicy
-    parameter_dims: Tensor
 
     def make_networks(self, specs: PAMDPSpecs) -> None:
         """Make the networks and the policy."""
         options = self.options
         self.max_discrete_entropy = sum(math.log(size) for size in specs.components.sizes)
-        self.register_buffer("parameter_dims", torch.tensor(specs.parameter_dims).float(), persistent=False)
+        self.parameter_dims = nn.Buffer(torch.tensor(specs.parameter_dims).float(), persistent=False)
         self.set_perception(options)
         self.actor = make_actor(self.perception.specs, options)
         self.critics: HybridCritics | JointCritics = (

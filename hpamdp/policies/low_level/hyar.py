@@ -159,10 +159,6 @@ def best_of_proposals(critics: LatentCritics, state: Tensor, candidates: Tensor)
 class HyARPolicy(TensorDictModuleBase):
     """Takes the best of the actor's proposals, decoded; explores with noise on them and with random actions."""
 
-    epsilon: Tensor
-    noise: Tensor
-    variations: Tensor
-
     def __init__(
         self, actor: LatentActor, critics: LatentCritics, codec: HybridCodec, specs: PAMDPSpecs, options: HyAROptions
     ) -> None:
@@ -173,11 +169,11 @@ class HyARPolicy(TensorDictModuleBase):
         self.critics = critics
         self.codec = codec
         self.specs = specs
-        self.register_buffer("epsilon", torch.ones((), dtype=torch.float32))
+        self.epsilon = nn.Buffer(torch.ones((), dtype=torch.float32))
         noise = torch.tensor(options.noise_initial or options.parameter_noise, dtype=torch.float32)
-        self.register_buffer("noise", noise, persistent=options.noise_initial is not None)
+        self.noise = nn.Buffer(noise, persistent=options.noise_initial is not None)
         of_z = even_normal(options.greedy_samples, codec.latent_dim, options.greedy_noise)
-        self.register_buffer("variations", F.pad(of_z, (codec.table.shape[-1], 0)), persistent=False)
+        self.variations = nn.Buffer(F.pad(of_z, (codec.table.shape[-1], 0)), persistent=False)
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -247,9 +243,6 @@ class HyAR(ReplayLearner):
 
     options: HyAROptions
     policy: HyARPolicy
-    dynamics_error: Tensor
-    episodes: Tensor
-    warmup_rows: Tensor
 
     def make_networks(self, specs: PAMDPSpecs) -> None:
         """Make the networks and the policy."""
@@ -270,12 +263,12 @@ class HyAR(ReplayLearner):
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = HyARPolicy(self.actor, self.critics, self.codec, specs, options)
         # The codec's mean squared error of the scaled change of the state, see `correction_error`.
-        self.register_buffer("dynamics_error", torch.ones((), dtype=torch.float32))
+        self.dynamics_error = nn.Buffer(torch.ones((), dtype=torch.float32))
         # Saved only where they count: learners of earlier versions had neither.
         self.counts_episodes = options.noise_initial is not None or options.codec_episodes is not None
-        self.register_buffer("episodes", torch.zeros((), dtype=torch.long), persistent=self.counts_episodes)
+        self.episodes: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long), persistent=self.counts_episodes)
         has_window = options.critic_window is not None
-        self.register_buffer("warmup_rows", torch.zeros((), dtype=torch.long), persistent=has_window)
+        self.warmup_rows = nn.Buffer(torch.zeros((), dtype=torch.long), persistent=has_window)
 
     def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Return the optimizers by the names of what they learn."""

@@ -21,11 +21,6 @@ class HybridCodec(nn.Module):
     e `[B, embedding_dim]`, z `[B, latent_dim]`.
     """
 
-    mask: Tensor
-    change_scale: Tensor
-    z_low: Tensor
-    z_high: Tensor
-
     def __init__(self, specs: PAMDPSpecs, latent_dim: int, options: HyAROptions) -> None:
         super().__init__()
         self.latent_dim = latent_dim
@@ -47,11 +42,11 @@ class HybridCodec(nn.Module):
             self.decoder = two_layers(latent_dim + condition_dim, hidden_dim)
         self.parameter_head = OutputLinear(hidden_dim, specs.num_parameters, dtype=torch.float32)
         self.dynamics_head = mlp(hidden_dim, [hidden_dim], specs.observation_dim)
-        self.register_buffer("mask", specs.parameter_mask.float())
-        self.register_buffer("change_scale", torch.ones(specs.observation_dim, dtype=torch.float32))
+        self.mask = nn.Buffer(specs.parameter_mask.float())
+        self.change_scale = nn.Buffer(torch.ones(specs.observation_dim, dtype=torch.float32))
         # The central range of the encoded z, onto which the actor's [-1, 1] is mapped.
-        self.register_buffer("z_low", -torch.ones(latent_dim, dtype=torch.float32))
-        self.register_buffer("z_high", torch.ones(latent_dim, dtype=torch.float32))
+        self.z_low = nn.Buffer(-torch.ones(latent_dim, dtype=torch.float32))
+        self.z_high = nn.Buffer(torch.ones(latent_dim, dtype=torch.float32))
 
     @property
     def embeddings(self) -> Tensor:

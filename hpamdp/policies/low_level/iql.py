@@ -32,7 +32,7 @@ from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hpamdp.policies.base import States
@@ -55,7 +55,6 @@ class IQL(ReplayLearner):
     progress: ClassVar[frozenset[str]] = ReplayLearner.progress | {"actor_updates"}
 
     options: IQLOptions
-    actor_updates: Tensor
 
     def make_networks(self, specs: PAMDPSpecs) -> None:
         """Make the networks and the policy."""
@@ -71,7 +70,7 @@ class IQL(ReplayLearner):
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = HybridPolicy(self.actor, specs)
         # Those of this run, for the schedule of the learning rate.
-        self.register_buffer("actor_updates", torch.zeros((), dtype=torch.long))
+        self.actor_updates: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
 
     def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Return the optimizers by the names of what they learn."""

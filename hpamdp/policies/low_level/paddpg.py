@@ -115,8 +115,6 @@ def with_best(scores: Tensor, discrete: Tensor, components: Components) -> Tenso
 class PADDPGPolicy(TensorDictModuleBase):
     """Takes the discrete action with the highest score; explores with random outputs and noise on the actor's."""
 
-    epsilon: Tensor
-
     def __init__(self, actor: PADDPGActor, specs: PAMDPSpecs, noise: float) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
@@ -124,7 +122,7 @@ class PADDPGPolicy(TensorDictModuleBase):
         self.actor = actor
         self.specs = specs
         self.noise = noise
-        self.register_buffer("epsilon", torch.ones((), dtype=torch.float32))
+        self.epsilon = nn.Buffer(torch.ones((), dtype=torch.float32))
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:

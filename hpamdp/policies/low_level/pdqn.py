@@ -125,9 +125,6 @@ def best_of_candidates(critics: HybridCritics, state: Tensor, candidates: Tensor
 class PDQNPolicy(TensorDictModuleBase):
     """Takes the discrete action with the highest Q; explores with random actions and noise on the parameters."""
 
-    epsilon: Tensor
-    variations: Tensor
-
     def __init__(
         self,
         actor: ParameterActor,
@@ -149,9 +146,9 @@ class PDQNPolicy(TensorDictModuleBase):
         self.critics = critics
         self.specs = specs
         self.noise = options.parameter_noise
-        self.register_buffer("epsilon", torch.ones((), dtype=torch.float32))
+        self.epsilon = nn.Buffer(torch.ones((), dtype=torch.float32))
         variations = even_normal(options.greedy_samples, specs.num_parameters, options.greedy_noise)
-        self.register_buffer("variations", variations, persistent=False)
+        self.variations = nn.Buffer(variations, persistent=False)
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -227,14 +224,13 @@ class PDQN(ReplayLearner):
 
     options: PDQNOptions
     policy: PDQNPolicy
-    episodes: Tensor
 
     def make_networks(self, specs: PAMDPSpecs) -> None:
         """Make the networks and the policy."""
         options = self.options
         self.stores_own_parameters = options.multipass and specs.components.is_single
         self.max_grad_norm = options.max_grad_norm
-        self.register_buffer("episodes", torch.zeros((), dtype=torch.long))
+        self.episodes: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
 
         dims = options.hidden_dims
         self.set_perception(options)

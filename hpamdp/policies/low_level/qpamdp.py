@@ -39,7 +39,7 @@ from typing import Any, ClassVar
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hpamdp import keys
@@ -76,12 +76,6 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         samples_discrete: whether exploring actions are sampled from the softmax, or those of highest value.
     """
 
-    w: Tensor
-    theta: Tensor
-    sigma: Tensor
-    temperature: Tensor
-    samples_discrete: Tensor
-
     def __init__(self, specs: PAMDPSpecs, options: QPAMDPOptions) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
@@ -91,11 +85,11 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         self.psi = FourierBasis(options.psi_order, options.psi_max_coupled)
         self.initial = InitialLayer(specs, options.initial_parameters, is_squashed=False)
         mean = 0.0 if self.initial.exists else options.initial_mean
-        self.register_buffer("temperature", torch.tensor(options.temperature, dtype=torch.float32))
-        self.register_buffer("samples_discrete", torch.tensor(True))
-        self.register_buffer("w", torch.zeros(specs.num_discrete, 1, dtype=torch.float32))
-        self.register_buffer("theta", torch.full((specs.num_parameters, 1), mean, dtype=torch.float32))
-        self.register_buffer("sigma", torch.tensor(options.sigma, dtype=torch.float32))
+        self.temperature: Tensor = nn.Buffer(torch.tensor(options.temperature, dtype=torch.float32))
+        self.samples_discrete = nn.Buffer(torch.tensor(True))
+        self.w: Tensor = nn.Buffer(torch.zeros(specs.num_discrete, 1, dtype=torch.float32))
+        self.theta: Tensor = nn.Buffer(torch.full((specs.num_parameters, 1), mean, dtype=torch.float32))
+        self.sigma: Tensor = nn.Buffer(torch.tensor(options.sigma, dtype=torch.float32))
 
     def widen(self) -> None:
         """Append zeros to the weights to match the fitted bases; the policy stays the same."""
@@ -127,14 +121,11 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
 class SarsaLambda(SizedByData):
     """Linear Sarsa(lambda) over parallel environments; the traces carry over from one batch to the next."""
 
-    traces: Tensor
-    step_size: Tensor
-
     def __init__(self, options: QPAMDPOptions) -> None:
         super().__init__()
         self.options = options
-        self.register_buffer("step_size", torch.tensor(options.step_size, dtype=torch.float32))
-        self.register_buffer("traces", torch.zeros(0, 1, 1, dtype=torch.float32))
+        self.step_size: Tensor = nn.Buffer(torch.tensor(options.step_size, dtype=torch.float32))
+        self.traces: Tensor = nn.Buffer(torch.zeros(0, 1, 1, dtype=torch.float32))
 
     def update(self, w: Tensor, rows: TensorDict, temperature: Tensor, step_scale: Tensor) -> tuple[Tensor, Tensor]:
         """Make the updates of a batch: one for each time step and group of `envs_per_update` environments.
@@ -220,24 +211,17 @@ class NaturalActorCritic(SizedByData):
         ridge: weight of the ridge penalty, in units of the regressors' mean square.
     """
 
-    is_fresh: Tensor  # where the next row begins an episode
-    is_whole: Tensor  # where the current episode began after the last restart
-    regressors: Tensor  # of the current episodes
-    returns: Tensor  # of the current episodes
-    gram: Tensor
-    moment: Tensor
-    num_episodes: Tensor
-
     def __init__(self, ridge: float) -> None:
         super().__init__()
         self.ridge = ridge
-        self.register_buffer("is_fresh", torch.zeros(0, dtype=torch.bool))
-        self.register_buffer("is_whole", torch.zeros(0, dtype=torch.bool))
-        self.register_buffer("regressors", torch.zeros(0, 0, dtype=torch.float32))
-        self.register_buffer("returns", torch.zeros(0, dtype=torch.float32))
-        self.register_buffer("gram", torch.zeros(0, 0, dtype=torch.float64))
-        self.register_buffer("moment", torch.zeros(0, dtype=torch.float64))
-        self.register_buffer("num_episodes", torch.zeros((), dtype=torch.long))
+        self.is_fresh: Tensor = nn.Buffer(torch.zeros(0, dtype=torch.bool))  # where the next row begins an episode
+        # Where the current episode began after the last restart; its regressors and its return.
+        self.is_whole: Tensor = nn.Buffer(torch.zeros(0, dtype=torch.bool))
+        self.regressors: Tensor = nn.Buffer(torch.zeros(0, 0, dtype=torch.float32))
+        self.returns: Tensor = nn.Buffer(torch.zeros(0, dtype=torch.float32))
+        self.gram: Tensor = nn.Buffer(torch.zeros(0, 0, dtype=torch.float64))
+        self.moment: Tensor = nn.Buffer(torch.zeros(0, dtype=torch.float64))
+        self.num_episodes: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
 
     def restart(self, num_regressors: int, is_fresh: Tensor) -> None:
         """Discard the collected episodes.
@@ -316,13 +300,10 @@ class PendingOptionEnds(SizedByData):
     If the selector decides where options end, the next batch shows whether one ended.
     """
 
-    is_open: Tensor  # bool [N]
-    value: Tensor  # discounted, [N]
-
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("is_open", torch.zeros(0, dtype=torch.bool))
-        self.register_buffer("value", torch.zeros(0, dtype=torch.float32))
+        self.is_open: Tensor = nn.Buffer(torch.zeros(0, dtype=torch.bool))  # `[N]`
+        self.value: Tensor = nn.Buffer(torch.zeros(0, dtype=torch.float32))  # discounted, `[N]`
 
     def close(self, rows: TensorDict) -> tuple[Tensor, Tensor]:
         """Return where an option ended with the batch before, bool `[N]`, and the values of what followed, `[N]`.
@@ -350,17 +331,6 @@ class QPAMDP(Learner):
     progress: ClassVar[frozenset[str]] = frozenset()
 
     policy: QPAMDPPolicy
-    mask: Tensor
-    low: Tensor
-    high: Tensor
-    best_return: Tensor  # of the current phase's windows
-    window_return: Tensor  # sum over the current window
-    frames: Tensor
-    phase: Tensor
-    window_episodes: Tensor
-    windows: Tensor  # finished in the current phase
-    windows_since_best: Tensor
-    updates: Tensor  # of the parameters
 
     def __init__(
         self,
@@ -377,13 +347,17 @@ class QPAMDP(Learner):
         self.sarsa = SarsaLambda(self.options)
         self.enac = NaturalActorCritic(self.options.ridge)
         self.open = PendingOptionEnds()
-        self.register_buffer("mask", specs.parameter_mask.float())  # the own parameters of each discrete action
-        self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf, dtype=torch.float32))
-        self.register_buffer("high", torch.full((specs.observation_dim,), -torch.inf, dtype=torch.float32))
-        self.register_buffer("best_return", torch.tensor(-torch.inf, dtype=torch.float32))
-        self.register_buffer("window_return", torch.zeros((), dtype=torch.float32))
-        for name in ("frames", "phase", "window_episodes", "windows", "windows_since_best", "updates"):
-            self.register_buffer(name, torch.zeros((), dtype=torch.long))
+        self.mask = nn.Buffer(specs.parameter_mask.float())  # the own parameters of each discrete action
+        self.low: Tensor = nn.Buffer(torch.full((specs.observation_dim,), torch.inf, dtype=torch.float32))
+        self.high: Tensor = nn.Buffer(torch.full((specs.observation_dim,), -torch.inf, dtype=torch.float32))
+        self.best_return = nn.Buffer(torch.tensor(-torch.inf, dtype=torch.float32))  # of the current phase's windows
+        self.window_return: Tensor = nn.Buffer(torch.zeros((), dtype=torch.float32))  # sum over the current window
+        self.frames: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
+        self.phase = nn.Buffer(torch.zeros((), dtype=torch.long))
+        self.window_episodes: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
+        self.windows: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))  # finished in the current phase
+        self.windows_since_best: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
+        self.updates: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))  # of the parameters
         self.to(checked_device(self, device))
 
     def steps_to_update(self) -> dict[str, int]:

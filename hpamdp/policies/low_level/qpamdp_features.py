@@ -10,7 +10,7 @@ import itertools
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hpamdp.policies.shared.sized_by_data import SizedByData
 
@@ -47,19 +47,14 @@ class FourierBasis(SizedByData):
         max_coupled: largest number of entries that a feature depends on.
     """
 
-    inputs: Tensor
-    low: Tensor
-    width: Tensor
-    coefficients: Tensor
-
     def __init__(self, order: int, max_coupled: int) -> None:
         super().__init__()
         self.order = order
         self.max_coupled = max_coupled
-        self.register_buffer("inputs", torch.zeros(1, dtype=torch.long))
-        self.register_buffer("low", torch.zeros(1, dtype=torch.float32))
-        self.register_buffer("width", torch.ones(1, dtype=torch.float32))
-        self.register_buffer("coefficients", torch.zeros(1, 1, dtype=torch.float32))
+        self.inputs: Tensor = nn.Buffer(torch.zeros(1, dtype=torch.long))
+        self.low: Tensor = nn.Buffer(torch.zeros(1, dtype=torch.float32))
+        self.width: Tensor = nn.Buffer(torch.ones(1, dtype=torch.float32))
+        self.coefficients: Tensor = nn.Buffer(torch.zeros(1, 1, dtype=torch.float32))
 
     def fit(self, inputs: Tensor, low: Tensor, high: Tensor) -> None:
         """Set the entries of the observation to use and their ranges.

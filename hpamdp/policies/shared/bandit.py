@@ -42,23 +42,17 @@ class RewardStatistics(nn.Module):
             decision yet. Both are empty unless the memory is `sliding_window`.
     """
 
-    counts: Tensor
-    sums: Tensor
-    squares: Tensor
-    recent_options: Tensor
-    recent_rewards: Tensor
-
     def __init__(self, num_options: int, options: BanditOptions) -> None:
         super().__init__()
         self.memory = options.memory
         self.discount = options.discount if options.memory == "discounted" else 1.0
         # float64, because there may be 10^8 decisions to sum over.
-        self.register_buffer("counts", torch.zeros(num_options, dtype=torch.float64))
-        self.register_buffer("sums", torch.zeros(num_options, dtype=torch.float64))
-        self.register_buffer("squares", torch.zeros(num_options, dtype=torch.float64))
+        self.counts = nn.Buffer(torch.zeros(num_options, dtype=torch.float64))
+        self.sums = nn.Buffer(torch.zeros(num_options, dtype=torch.float64))
+        self.squares = nn.Buffer(torch.zeros(num_options, dtype=torch.float64))
         size = options.window if options.memory == "sliding_window" else 0
-        self.register_buffer("recent_options", torch.full((size,), -1, dtype=torch.long))
-        self.register_buffer("recent_rewards", torch.zeros(size, dtype=torch.float64))
+        self.recent_options: Tensor = nn.Buffer(torch.full((size,), -1, dtype=torch.long))
+        self.recent_rewards: Tensor = nn.Buffer(torch.zeros(size, dtype=torch.float64))
 
     @property
     def means(self) -> Tensor:
@@ -121,13 +115,11 @@ class Bandit(Selector):
     card = BANDIT_CARD
     options: BanditOptions
 
-    num_decisions: Tensor
-
     def __init__(self, specs: PAMDPSpecs, options: BanditOptions | None = None, **settings: Any) -> None:
         super().__init__(specs)
         self.options = self.Options.of(options, settings)
         self.statistics = RewardStatistics(specs.num_options, self.options)
-        self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
+        self.num_decisions: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
 
     @abstractmethod
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:

@@ -28,16 +28,6 @@ class CanonicalFrame(nn.Module):
         is_revealed: whether directions come from a table of `KnownDirections`, and not from the problem.
     """
 
-    directions: Tensor
-    kind: Tensor
-    x: Tensor
-    y: Tensor
-    origin: Tensor
-    is_vector: Tensor
-    is_y: Tensor
-    partner: Tensor
-    partner_sign: Tensor
-
     def __init__(self, specs: PAMDPSpecs, *, is_used: bool = True, is_revealed: bool = False) -> None:
         super().__init__()
         geometry = specs.geometry if is_used else None
@@ -63,19 +53,15 @@ class CanonicalFrame(nn.Module):
         partner_sign[x], partner_sign[y] = 1.0, -1.0
         origin = zeros.clone()
         origin[x], origin[y] = torch.tensor(origins, dtype=torch.float32).reshape(-1, 2).unbind(-1)
-        buffers = {
-            "directions": directions,
-            "kind": kind,
-            "x": x,
-            "y": y,
-            "origin": origin,
-            "is_vector": zeros.index_fill(0, torch.cat([x, y]), 1.0),
-            "is_y": zeros.index_fill(0, y, 1.0),
-            "partner": partner,
-            "partner_sign": partner_sign,
-        }
-        for name, value in buffers.items():
-            self.register_buffer(name, value, persistent=False)
+        self.directions = nn.Buffer(directions, persistent=False)
+        self.kind = nn.Buffer(kind, persistent=False)
+        self.x = nn.Buffer(x, persistent=False)
+        self.y = nn.Buffer(y, persistent=False)
+        self.origin = nn.Buffer(origin, persistent=False)
+        self.is_vector = nn.Buffer(zeros.index_fill(0, torch.cat([x, y]), 1.0), persistent=False)
+        self.is_y = nn.Buffer(zeros.index_fill(0, y, 1.0), persistent=False)
+        self.partner = nn.Buffer(partner, persistent=False)
+        self.partner_sign = nn.Buffer(partner_sign, persistent=False)
 
     @property
     def num_kinds(self) -> int:

@@ -80,10 +80,6 @@ class HybridActor(DistributionActor):
     takes_pairs: ClassVar[bool] = False
     added_later: ClassVar[tuple[str, ...]] = ("log_max_scale",)  # files in agents/ lack it
 
-    log_min_scale: Tensor
-    log_max_scale: Tensor
-    owner: Tensor
-
     def __init__(
         self,
         specs: PAMDPSpecs,
@@ -112,9 +108,9 @@ class HybridActor(DistributionActor):
             initial_scale = (scale_range[0] * scale_range[1]) ** 0.5
         fraction = (math.log(initial_scale) - log_min_scale) / (log_max_scale - log_min_scale)
         self.make_heads(specs, hidden_dims[-1], math.log(fraction / (1.0 - fraction)))
-        self.register_buffer("log_min_scale", torch.tensor(log_min_scale, dtype=torch.float32))
-        self.register_buffer("log_max_scale", torch.tensor(log_max_scale, dtype=torch.float32))
-        self.register_buffer("owner", specs.parameter_owner, persistent=False)
+        self.log_min_scale = nn.Buffer(torch.tensor(log_min_scale, dtype=torch.float32))
+        self.log_max_scale = nn.Buffer(torch.tensor(log_max_scale, dtype=torch.float32))
+        self.owner = nn.Buffer(specs.parameter_owner, persistent=False)
 
     def make_heads(self, specs: PAMDPSpecs, width: int, raw_scale: float) -> None:
         """Make the heads on hidden layers of this width; `log_scale(raw_scale)` is their initial log-scale."""

@@ -34,12 +34,6 @@ class JointChoice(nn.Module):
         SettingError: there are more than 65,536 combinations.
     """
 
-    choices: Tensor
-    strides: Tensor
-    slots: Tensor
-    has_slot: Tensor
-    is_chosen: Tensor
-
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.components = specs.components
@@ -49,7 +43,7 @@ class JointChoice(nn.Module):
         if self.components.is_single:
             self.parameter_dims = specs.parameter_dims
             own = torch.arange(max(specs.parameter_dims)) < torch.tensor(specs.parameter_dims).unsqueeze(-1)
-            tables = {"slots": specs.parameter_slots, "has_slot": own.float()}
+            slots, has_slot = specs.parameter_slots, own
         else:
             if self.num > _MAX_CHOICES:
                 raise SettingError(
@@ -63,11 +57,13 @@ class JointChoice(nn.Module):
             # The stable sort puts the places of own parameters first, in their order.
             own_first = (~is_own).to(torch.int8).argsort(dim=-1, stable=True)
             slots = own_first[:, : max(self.parameter_dims)]
-            tables = {"slots": slots, "has_slot": is_own.gather(-1, slots).float(), "choices": choices}
-            strides = [math.prod(sizes[place + 1 :]) for place in range(len(sizes))]
-            tables |= {"strides": torch.tensor(strides), "is_chosen": is_chosen}
-        for name, table in tables.items():
-            self.register_buffer(name, table, persistent=False)
+            has_slot = is_own.gather(-1, slots)
+            strides = torch.tensor([math.prod(sizes[place + 1 :]) for place in range(len(sizes))])
+            self.choices = nn.Buffer(choices, persistent=False)
+            self.strides = nn.Buffer(strides, persistent=False)
+            self.is_chosen = nn.Buffer(is_chosen, persistent=False)
+        self.slots = nn.Buffer(slots, persistent=False)
+        self.has_slot = nn.Buffer(has_slot.float(), persistent=False)
 
     def number(self, choice: Tensor) -> Tensor:
         """Return the numbers of the combinations, `[*B]`, given choices `[*B]` or `[*B, num_components]`."""

@@ -38,9 +38,6 @@ class KnownDirections(nn.Module):
     """
 
     is_recurrent = False
-    last_action: Tensor
-    moved: Tensor
-    kept: Tensor
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
@@ -56,9 +53,9 @@ class KnownDirections(nn.Module):
         self.table_size = 3 * self.num_actions
         self.num_features = self.table_size + len(specs.telling_entries)
         self.name = f"directions_{self.size}"
-        entries = {"last_action": revealed.last_action, "moved": revealed.moved, "kept": specs.telling_entries}
-        for name, numbers in entries.items():
-            self.register_buffer(name, torch.tensor(numbers), persistent=False)
+        self.last_action = nn.Buffer(torch.tensor(revealed.last_action), persistent=False)
+        self.moved = nn.Buffer(torch.tensor(revealed.moved), persistent=False)
+        self.kept = nn.Buffer(torch.tensor(specs.telling_entries), persistent=False)
 
     def step(self, seen: Tensor, held: Tensor) -> Tensor:
         """Return the states `[N, size]` after observations `[N, observation_dim]`, given the states before."""

@@ -32,11 +32,6 @@ class ContextFeatures(nn.Module):
         ValueError: the observation has no such entry, or there would be more than 2,000 features.
     """
 
-    inputs: Tensor
-    factors: Tensor
-    directions: Tensor
-    phases: Tensor
-
     def __init__(self, specs: PAMDPSpecs, options: LinearBanditOptions) -> None:
         super().__init__()
         inputs = list(range(specs.observation_dim) if options.inputs is None else options.inputs)
@@ -50,17 +45,15 @@ class ContextFeatures(nn.Module):
         self.num_features = math.comb(len(inputs) + degree, degree) if self.is_polynomial else degree + 1
         if self.num_features > 2000:
             raise SettingError(f"degree={degree}: {self.num_features} features of {len(inputs)} inputs; at most 2000")
-        self.register_buffer("inputs", torch.tensor(inputs))
+        self.inputs = nn.Buffer(torch.tensor(inputs))
         if self.is_polynomial:
             # A monomial is a product of `degree` factors, each an input or the constant 1, which comes last.
             monomials = itertools.combinations_with_replacement(range(len(inputs) + 1), degree)
-            self.register_buffer("factors", torch.tensor(list(monomials)))
+            self.factors = nn.Buffer(torch.tensor(list(monomials)))
         else:
             generator = torch.Generator().manual_seed(0)
-            self.register_buffer(
-                "directions", torch.randn(len(inputs), degree, generator=generator, dtype=torch.float32)
-            )
-            self.register_buffer("phases", 2.0 * math.pi * torch.rand(degree, generator=generator, dtype=torch.float32))
+            self.directions = nn.Buffer(torch.randn(len(inputs), degree, generator=generator, dtype=torch.float32))
+            self.phases = nn.Buffer(2.0 * math.pi * torch.rand(degree, generator=generator, dtype=torch.float32))
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the features of observations `[*B, observation_dim]`, float64."""
@@ -88,20 +81,16 @@ class LinearBandit(Selector):
     card = LINEAR_BANDIT_CARD
     options: LinearBanditOptions
 
-    gram: Tensor
-    moment: Tensor
-    recent_features: Tensor
-
     def __init__(self, specs: PAMDPSpecs, options: LinearBanditOptions | None = None, **settings: Any) -> None:
         super().__init__(specs)
         self.options = self.Options.of(options, settings)
         self.features = ContextFeatures(specs, self.options)
         self.statistics = RewardStatistics(specs.num_options, self.options)
         num, dim = specs.num_options, self.features.num_features
-        self.register_buffer("gram", torch.zeros(num, dim, dim, dtype=torch.float64))
-        self.register_buffer("moment", torch.zeros(num, dim, dtype=torch.float64))
+        self.gram: Tensor = nn.Buffer(torch.zeros(num, dim, dim, dtype=torch.float64))
+        self.moment: Tensor = nn.Buffer(torch.zeros(num, dim, dtype=torch.float64))
         size = len(self.statistics.recent_options)
-        self.register_buffer("recent_features", torch.zeros(size, dim, dtype=torch.float64))
+        self.recent_features: Tensor = nn.Buffer(torch.zeros(size, dim, dtype=torch.float64))
 
     def predict(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return each option's expected reward at observations `[B, observation_dim]`, and its standard deviation.

@@ -170,10 +170,6 @@ class VectorProducts(nn.Module):
         ValueError: the problem declares fewer than two vectors.
     """
 
-    entries: Tensor
-    origins: Tensor
-    pairs: Tensor
-
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
         geometry = specs.geometry
@@ -181,14 +177,14 @@ class VectorProducts(nn.Module):
             raise SettingError(
                 "vector_products=true: the problem declares no two vectors of the plane; use vector_products=false"
             )
-        self.register_buffer("entries", torch.tensor(geometry.vectors), persistent=False)
+        self.entries = nn.Buffer(torch.tensor(geometry.vectors), persistent=False)
         origins = (
             torch.tensor(geometry.origins, dtype=torch.float32)
             if geometry.origins
             else torch.zeros(self.entries.shape, dtype=torch.float32)
         )
-        self.register_buffer("origins", origins, persistent=False)
-        self.register_buffer("pairs", torch.combinations(torch.arange(len(self.entries))).mT, persistent=False)
+        self.origins = nn.Buffer(origins, persistent=False)
+        self.pairs = nn.Buffer(torch.combinations(torch.arange(len(self.entries))).mT, persistent=False)
         self.num_outputs = specs.observation_dim + 2 * self.pairs.shape[-1]
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -233,16 +229,13 @@ class InitialLayer(nn.Module):
         is_squashed: whether the sum is squashed by tanh, and not clipped, into the bounds.
     """
 
-    weight: Tensor
-    bias: Tensor
-
     def __init__(self, specs: PAMDPSpecs, choice: InitialParameters, *, is_squashed: bool) -> None:
         super().__init__()
         self.exists = choice == "domain" and specs.initial_weight is not None
         self.is_squashed = is_squashed
         if self.exists:
-            self.register_buffer("weight", torch.tensor(specs.initial_weight, dtype=torch.float32))
-            self.register_buffer("bias", torch.tensor(specs.initial_bias, dtype=torch.float32))
+            self.weight = nn.Buffer(torch.tensor(specs.initial_weight, dtype=torch.float32))
+            self.bias = nn.Buffer(torch.tensor(specs.initial_bias, dtype=torch.float32))
 
     def forward(self, observation: Tensor) -> Tensor | float:
         """Return what to add for observations `[*B, observation_dim]`: `[*B, num_parameters]`, or 0."""
@@ -276,10 +269,6 @@ class HybridCritics(nn.Module):
     Shapes: states `[B, observation_dim]`, parameters `[B, num_parameters]` in [-1, 1].
     """
 
-    owner: Tensor
-    slots: Tensor
-    is_own: Tensor
-
     def __init__(
         self,
         specs: PAMDPSpecs,
@@ -298,10 +287,10 @@ class HybridCritics(nn.Module):
         input_dim = specs.observation_dim + specs.num_parameters
         self.net = EnsembleMLP(num_members, input_dim, hidden_dims, specs.num_discrete, layer_norm=layer_norm)
         owner, slots = specs.parameter_owner, specs.parameter_slots
-        self.register_buffer("owner", owner, persistent=False)
-        self.register_buffer("slots", slots, persistent=False)
-        self.register_buffer(
-            "is_own", (owner[slots] == torch.arange(self.num_discrete).unsqueeze(-1)).float(), persistent=False
+        self.owner = nn.Buffer(owner, persistent=False)
+        self.slots = nn.Buffer(slots, persistent=False)
+        self.is_own = nn.Buffer(
+            (owner[slots] == torch.arange(self.num_discrete).unsqueeze(-1)).float(), persistent=False
         )
 
     def forward(self, state: Tensor, unit_parameters: Tensor) -> Tensor:
@@ -357,15 +346,13 @@ class JointCritics(nn.Module):
     Shapes: states `[B, observation_dim]`, choices `[B, num_components]`, parameters `[B, num_parameters]` in [-1, 1].
     """
 
-    owner: Tensor
-
     def __init__(self, specs: PAMDPSpecs, num_members: int, hidden_dims: Sequence[int]) -> None:
         super().__init__()
         self.components = specs.components
         self.in_cells = specs.in_cells
         num_inputs = specs.observation_dim + specs.num_discrete + specs.num_parameters
         self.net = EnsembleMLP(num_members, num_inputs, hidden_dims, 1)
-        self.register_buffer("owner", specs.parameter_owner, persistent=False)
+        self.owner = nn.Buffer(specs.parameter_owner, persistent=False)
 
     def of_discrete(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Tensor:
         """Return the values `[E, B]` of actions."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
@@ -31,7 +31,6 @@ class PlanningPolicy(TensorDictModuleBase):
     ignored. The memory, if there is any, sees every step. A subclass implements `first_action`.
     """
 
-    is_trained: Tensor
     in_keys: list[NestedKey]
     out_keys: list[NestedKey]
 
@@ -42,7 +41,7 @@ class PlanningPolicy(TensorDictModuleBase):
         self.perception = perception
         self.specs = specs
         self.epsilon = epsilon
-        self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
+        self.is_trained = nn.Buffer(torch.zeros((), dtype=torch.bool))
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer, RoundRobinWriter
 
 from hpamdp import keys
@@ -74,10 +74,6 @@ class ReplayLearner(Learner):
     perception: Perception
     target_perception: Perception
     links: HistoryLinks | None
-    frames: Tensor
-    updates: Tensor
-    slots: Tensor
-    owner: Tensor
 
     def __init__(
         self,
@@ -96,10 +92,10 @@ class ReplayLearner(Learner):
         if augment == "auto":
             augment = specs.symmetries is not None and not remembers
         self.symmetry = RandomSymmetry(specs, device) if augment else None
-        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
-        self.register_buffer("updates", torch.zeros((), dtype=torch.long))
-        self.register_buffer("slots", specs.parameter_slots, persistent=False)
-        self.register_buffer("owner", specs.parameter_owner, persistent=False)
+        self.frames: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
+        self.updates: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))
+        self.slots = nn.Buffer(specs.parameter_slots, persistent=False)
+        self.owner = nn.Buffer(specs.parameter_owner, persistent=False)
         self.buffer = replay_buffer(options.buffer_size, device)
         self.descent = Descent()
         self.links = None

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
 from hpamdp.policies.shared.perception import Perception
@@ -50,11 +50,9 @@ class HistoryLinks(SizedByData):
         last_rows: number of the row that each environment stored last, or -1.
     """
 
-    last_rows: Tensor
-
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("last_rows", torch.zeros(0, dtype=torch.long))
+        self.last_rows: Tensor = nn.Buffer(torch.zeros(0, dtype=torch.long))
 
     def forward(self, begins: Tensor, mask: Tensor, num_stored: int) -> Tensor:
         """Return the number of the row before each row of a batch, `[*B, T]`; -1 for the first row of a history.

@@ -32,10 +32,6 @@ class Predictor(nn.Module):
     Shapes: states `[B, observation_dim]`, discrete actions `[B]`, parameters `[B, num_parameters]` in [-1, 1].
     """
 
-    mask: Tensor
-    slots: Tensor
-    owner: Tensor
-
     def __init__(
         self, specs: PAMDPSpecs, form: str, num_members: int, hidden_dims: Sequence[int], out_dim: int
     ) -> None:
@@ -50,9 +46,9 @@ class Predictor(nn.Module):
         self.first = nn.Linear(first_dim, hidden_dims[0], dtype=torch.float32) if form == "sequential" else None
         in_dim = hidden_dims[0] if form == "sequential" else first_dim
         self.net = EnsembleMLP(num_members, in_dim + parameters_dim, hidden_dims, out_dim)
-        self.register_buffer("mask", specs.parameter_mask.float())
-        self.register_buffer("slots", specs.parameter_slots)
-        self.register_buffer("owner", specs.parameter_owner, persistent=False)
+        self.mask = nn.Buffer(specs.parameter_mask.float())
+        self.slots = nn.Buffer(specs.parameter_slots)
+        self.owner = nn.Buffer(specs.parameter_owner, persistent=False)
 
     def forward(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Tensor:
         """Apply all members."""
@@ -83,10 +79,6 @@ class PAMDPModel(nn.Module):
         context_dim: entries of the context; 0 without a memory.
     """
 
-    state_mean: Tensor
-    state_scale: Tensor
-    change_scale: Tensor
-
     def __init__(
         self, specs: PAMDPSpecs, form: str, hidden_dims: Sequence[int], num_members: int, context_dim: int = 0
     ) -> None:
@@ -95,9 +87,9 @@ class PAMDPModel(nn.Module):
         predicted_dim = specs.observation_dim - context_dim
         self.transition = Predictor(specs, form, 1, hidden_dims, predicted_dim)
         self.outcome = Predictor(specs, form, num_members, hidden_dims, 3)
-        self.register_buffer("state_mean", torch.zeros(specs.observation_dim, dtype=torch.float32))
-        self.register_buffer("state_scale", torch.ones(specs.observation_dim, dtype=torch.float32))
-        self.register_buffer("change_scale", torch.ones(predicted_dim, dtype=torch.float32))
+        self.state_mean = nn.Buffer(torch.zeros(specs.observation_dim, dtype=torch.float32))
+        self.state_scale = nn.Buffer(torch.ones(specs.observation_dim, dtype=torch.float32))
+        self.change_scale = nn.Buffer(torch.ones(predicted_dim, dtype=torch.float32))
 
     def fit_scales(self, state: Tensor, next_state: Tensor, context: Tensor | None = None) -> None:
         """Set the scales of inputs and targets from transitions `[B, *]`.

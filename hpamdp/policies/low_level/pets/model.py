@@ -72,23 +72,6 @@ class PETSModel(nn.Module):
         is_revealed: whether the context is a table of `KnownDirections`.
     """
 
-    state_mean: Tensor
-    state_scale: Tensor
-    change_scale: Tensor
-    is_predicted: Tensor
-    is_changing: Tensor
-    is_input: Tensor
-    derivation: Tensor
-    linear_weight: Tensor
-    reward_mean: Tensor
-    reward_scale: Tensor
-    feature_mean: Tensor
-    feature_scale: Tensor
-    context_mean: Tensor
-    context_scale: Tensor
-    slot_kind: Tensor
-    slot_number: Tensor
-
     def __init__(
         self, specs: PAMDPSpecs, options: PETSOptions, context_dim: int = 0, *, is_revealed: bool = False
     ) -> None:
@@ -104,8 +87,8 @@ class PETSModel(nn.Module):
         of_kinds = zip(kinds, specs.parameter_dims, strict=True)
         slots = sorted({(kind, slot) for kind, num_slots in of_kinds for slot in range(num_slots)})
         places = torch.tensor(slots, dtype=torch.long).reshape(-1, 2)
-        self.register_buffer("slot_kind", places[:, 0], persistent=False)
-        self.register_buffer("slot_number", places[:, 1], persistent=False)
+        self.slot_kind = nn.Buffer(places[:, 0], persistent=False)
+        self.slot_number = nn.Buffer(places[:, 1], persistent=False)
         self.has_kinds = self.frame.num_kinds > 1
         action_dim = 2 * len(slots) + (self.frame.num_kinds if self.has_kinds else 0) + int(is_revealed)
         seen_context_dim = 0 if is_revealed else context_dim
@@ -120,26 +103,22 @@ class PETSModel(nn.Module):
         is_input = torch.ones(dim, dtype=torch.float32)
         if self.frame.turns and self.frame.geometry is not None:
             is_input[self.frame.geometry.entries_of_contexts] = 0.0
-        buffers = {
-            "state_mean": torch.zeros(dim, dtype=torch.float32),
-            "state_scale": torch.ones(dim, dtype=torch.float32),
-            "change_scale": torch.ones(dim, dtype=torch.float32),
-            "is_predicted": is_input.clone(),
-            "is_changing": is_input.clone(),
-            "derivation": torch.eye(dim, dtype=torch.float32),
-            "reward_mean": torch.zeros(2, dtype=torch.float32),
-            "reward_scale": torch.ones(2, dtype=torch.float32),
-            "feature_mean": torch.zeros(feature_dim, dtype=torch.float32),
-            "feature_scale": torch.ones(feature_dim, dtype=torch.float32),
-        }
+        self.state_mean = nn.Buffer(torch.zeros(dim, dtype=torch.float32))
+        self.state_scale = nn.Buffer(torch.ones(dim, dtype=torch.float32))
+        self.change_scale = nn.Buffer(torch.ones(dim, dtype=torch.float32))
+        self.is_predicted = nn.Buffer(is_input.clone())
+        self.is_changing = nn.Buffer(is_input.clone())
+        self.derivation = nn.Buffer(torch.eye(dim, dtype=torch.float32))
+        self.reward_mean = nn.Buffer(torch.zeros(2, dtype=torch.float32))
+        self.reward_scale = nn.Buffer(torch.ones(2, dtype=torch.float32))
+        self.feature_mean = nn.Buffer(torch.zeros(feature_dim, dtype=torch.float32))
+        self.feature_scale = nn.Buffer(torch.ones(feature_dim, dtype=torch.float32))
         if seen_context_dim > 0:
-            buffers["context_mean"] = torch.zeros(context_dim, dtype=torch.float32)
-            buffers["context_scale"] = torch.ones(context_dim, dtype=torch.float32)
+            self.context_mean = nn.Buffer(torch.zeros(context_dim, dtype=torch.float32))
+            self.context_scale = nn.Buffer(torch.ones(context_dim, dtype=torch.float32))
         if self.has_linear_part:
-            buffers["linear_weight"] = torch.zeros(in_dim + len(slots) + 1, dim, dtype=torch.float32)
-        for name, value in buffers.items():
-            self.register_buffer(name, value)
-        self.register_buffer("is_input", is_input, persistent=False)
+            self.linear_weight = nn.Buffer(torch.zeros(in_dim + len(slots) + 1, dim, dtype=torch.float32))
+        self.is_input = nn.Buffer(is_input, persistent=False)
 
     def forward(
         self, state: Tensor, discrete: Tensor, own: Tensor, precision: torch.dtype = torch.float32
