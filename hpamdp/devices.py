@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 
 from hpamdp.messages import as_code, first_line
 from hpamdp.settings import SettingError
+
+Device: TypeAlias = torch.device | str
 
 
 def checked_device(owner: object, device: Any) -> torch.device:

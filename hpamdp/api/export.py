@@ -295,8 +295,7 @@ def _traced(step: GreedyStep, about: Mapping[str, Any]) -> bytes:
     for value in (*model.graph.inputs, *model.graph.outputs):
         assert value.shape is not None
         value.shape = onnx_ir.Shape(["N", *value.shape[1:]])
-    data: bytes = onnx_ir.to_proto(model).SerializeToString()
-    return data
+    return onnx_ir.to_proto(model).SerializeToString()
 
 
 def _distances(first: Any, second: Any, p: float, compute_mode: Any) -> Any:

@@ -94,8 +94,7 @@ class RecordedProblem:
     @property
     def num_members(self) -> int:
         """The number of the ensemble's members."""
-        num: int = self.learner.model.num_members
-        return num
+        return self.learner.model.num_members
 
     def _inputs_of_rest(self, now: Tensor, next_predicted: Tensor) -> Tensor:
         """Return what the entries that the model does not predict are linear in, `[B, *]`.
@@ -150,8 +149,7 @@ class RecordedProblem:
     def is_covered(self, acted: TensorDictBase) -> Tensor:
         """Return whether there is such an action in such a state in the data, bool `[B]`."""
         known, most = self._known
-        near: Tensor = torch.cdist(self.learner.model.inputs(*self._as_seen(acted)), known).amin(-1) <= most
-        return near
+        return torch.cdist(self.learner.model.inputs(*self._as_seen(acted)), known).amin(-1) <= most
 
     @torch.no_grad()
     def roll_out(self, agent: HierarchicalAgent, tracker: DecisionTracker, starts: Tensor, max_steps: int) -> Rollout:

@@ -74,8 +74,7 @@ class CNN(Encoder):
 
     def forward(self, values: Tensor) -> Tensor:
         """Return features `[B, num_features]` of pictures float32 `[B, C, H, W]`."""
-        features: Tensor = self.net(values)
-        return features
+        return self.net(values)
 
 
 class ResidualBlock(nn.Module):

@@ -24,7 +24,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from hpamdp import keys
-from hpamdp.devices import checked_device
+from hpamdp.devices import Device, checked_device
 from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.exploration.base import Explored
 from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
@@ -86,14 +86,7 @@ class Counts(RewardsNewStates):
     Options = CountsOptions
     card = CARDS["Counts"]
 
-    def __init__(
-        self,
-        learner: Learner,
-        *,
-        device: torch.device | str = "cpu",
-        options: CountsOptions | None = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, learner: Learner, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         options = CountsOptions.of(options, settings)
         if learner.specs.has_pictures:
             raise SettingError("no picture is seen twice; use exploration=novelty")

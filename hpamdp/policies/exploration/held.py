@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.devices import checked_device
+from hpamdp.devices import Device, checked_device
 from hpamdp.policies.base import Learner
 from hpamdp.policies.exploration.base import Exploration, Explored
 from hpamdp.policies.exploration.options import CARDS, HeldOptions
@@ -141,14 +141,7 @@ class Held(Exploration):
     card = CARDS["Held"]
     exploring_keys: ClassVar[frozenset[NestedKey]] = frozenset({keys.HOLD_STEPS, keys.HOLD_DISCRETE, keys.HOLD_UNIT})
 
-    def __init__(
-        self,
-        learner: Learner,
-        *,
-        device: torch.device | str = "cpu",
-        options: HeldOptions | None = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, learner: Learner, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         super().__init__(learner)
         self.options: HeldOptions = HeldOptions.of(options, settings)
         self.policy = HeldPolicy(learner.policy, learner.specs, self.options)

@@ -41,7 +41,7 @@ from torchrl.envs.transforms import RunningMeanStd
 from torchrl.objectives import RNDLoss
 
 from hpamdp import keys
-from hpamdp.devices import checked_device
+from hpamdp.devices import Device, checked_device
 from hpamdp.messages import warn
 from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.encoders.base import JoinedEncoders
@@ -115,14 +115,7 @@ class Novelty(RewardsNewStates):
     Options = NoveltyOptions
     card = CARDS["Novelty"]
 
-    def __init__(
-        self,
-        learner: Learner,
-        *,
-        device: torch.device | str = "cpu",
-        options: NoveltyOptions | None = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, learner: Learner, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         options = NoveltyOptions.of(options, settings)
         super().__init__(learner, options.weight)
         self.options = options

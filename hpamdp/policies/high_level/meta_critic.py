@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.devices import checked_device
+from hpamdp.devices import Device, checked_device
 from hpamdp.policies.high_level.options import CARDS, MetaCriticOptions
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.exploration import schedule
@@ -44,14 +44,7 @@ class MetaCritic(RemembersDecisions):
     Options = MetaCriticOptions
     card = CARDS["MetaCritic"]
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: MetaCriticOptions | None = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, specs: PAMDPSpecs, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         super().__init__(specs)
         device = checked_device(self, device)
         self.options: MetaCriticOptions = MetaCriticOptions.of(options, settings)
@@ -185,16 +178,14 @@ class MetaCritic(RemembersDecisions):
         if self.links is None:
             return self.of_stored(rows["state"])
         memory = states_of_past(rows, self.perception, self.options.burn_in)
-        features: Tensor = self.perception(rows["state"], memory, has_seen=True)
-        return features
+        return self.perception(rows["state"], memory, has_seen=True)
 
     def next_features(self, rows: TensorDictBase) -> Tensor:
         """Return what the target critics see of the next states, `[B, perception.specs.observation_dim]`."""
         if self.links is None:
             return rows["next_state"] if self.stores_features else self.target_perception(rows["next_state"])
         memory = states_of_past(rows, self.target_perception, self.options.burn_in)
-        features: Tensor = self.target_perception(rows["next_state"], memory)
-        return features
+        return self.target_perception(rows["next_state"], memory)
 
     def update_critics(self, rows: TensorDictBase) -> Tensor:
         """Make one update of the critics from decisions `[batch_size]`; return the loss."""

@@ -33,7 +33,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.devices import checked_device
+from hpamdp.devices import Device, checked_device
 from hpamdp.policies.high_level.options import CARDS, OptionCriticOptions
 from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.policies.shared.exploration import schedule
@@ -49,14 +49,7 @@ class OptionCritic(RemembersDecisions):
     Options = OptionCriticOptions
     card = CARDS["OptionCritic"]
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: OptionCriticOptions | None = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, specs: PAMDPSpecs, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         super().__init__(specs)
         device = checked_device(self, device)
         self.options: OptionCriticOptions = OptionCriticOptions.of(options, settings)

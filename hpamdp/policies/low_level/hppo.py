@@ -35,7 +35,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hpamdp import keys
-from hpamdp.devices import checked_device
+from hpamdp.devices import Device, checked_device
 from hpamdp.policies.base import Learner, States, step_discounts
 from hpamdp.policies.low_level.hppo_options import CARDS, HPPOOptions
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
@@ -64,14 +64,7 @@ class HPPO(OnPolicy, Learner):
     # A new run does not take over rows that wait for an update: they may come from another problem.
     progress = Learner.progress | {"log_min_scale", "log_max_scale", WAITING}
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: HPPOOptions | None = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, specs: PAMDPSpecs, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         super().__init__(specs)
         options = HPPOOptions.of(options, settings)
         self.options: HPPOOptions = options
@@ -278,8 +271,7 @@ class HPPO(OnPolicy, Learner):
         if self.perception.is_recurrent:
             columns = (rows[name] for name in (keys.OBSERVATION, "memory", "begins", "starts"))
             return self.perception.of_sequences(*columns)
-        features: Tensor = self.perception(rows[keys.OBSERVATION], rows.get("memory", None), has_seen=True)
-        return features
+        return self.perception(rows[keys.OBSERVATION], rows.get("memory", None), has_seen=True)
 
     def _memory(self, batch: TensorDictBase) -> Tensor | None:
         return None if self.memory_key is None else batch.get(self.memory_key)

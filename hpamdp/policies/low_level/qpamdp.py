@@ -44,7 +44,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.devices import checked_device
+from hpamdp.devices import Device, checked_device
 from hpamdp.policies.base import Learner, States, known_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
 from hpamdp.policies.low_level.qpamdp_options import CARDS, QPAMDPOptions
@@ -332,14 +332,7 @@ class QPAMDP(Learner):
 
     policy: QPAMDPPolicy
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: QPAMDPOptions | None = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, specs: PAMDPSpecs, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         super().__init__(specs)
         self.options: QPAMDPOptions = QPAMDPOptions.of(options, settings)
         check_features(self.options, specs)

@@ -25,6 +25,7 @@ from hpamdp.policies.shared.planning import (
     SequenceStep,
     absolute_temperature,
     elite_weights,
+    moments,
     stratified,
     without_forbidden,
 )
@@ -131,10 +132,10 @@ class ContingentSearch:
     def _refined(self, found: _Candidates, temperature: Tensor, lower_bound: float) -> Tensor:
         """Return new samples of the parameters, `[N, M, A, C, S, H, D]`. The draws are those of all hypotheses."""
         own, of_first, num = found.own, found.of_first(), self.options.num_elites
-        first = _moments(own[:, 0, :, 0, :, :1], *elite_weights(of_first, num, temperature[:, None, None]))
+        first = moments(own[:, 0, :, 0, :, :1], *elite_weights(of_first, num, temperature[:, None, None]))
         # What follows should be good after first actions that are good.
         both = found.value + of_first[:, None, :, None]
-        mean, deviation = _moments(own, *elite_weights(both, num, temperature[:, None, None, None, None]))
+        mean, deviation = moments(own, *elite_weights(both, num, temperature[:, None, None, None, None]))
         for whole, part in zip((mean, deviation), first, strict=True):
             whole[..., :1, :] = part[:, None, :, None]
         shape = own.shape[0], own.shape[2] * own.shape[3], *own.shape[4:]
@@ -177,10 +178,3 @@ def _chosen(found: _Candidates, place: Tensor, dim: int) -> _Candidates:
         own=found.own.take_along_dim(place[..., None, None, None], dim),
         value=found.value.take_along_dim(place[..., None], dim),
     )
-
-
-def _moments(own: Tensor, place: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean and deviation `[*B, H, D]` of samples `[*B, S, H, D]` at places with weights, `[*B, num_elites]`."""
-    elites, weight = own.take_along_dim(place[..., None, None], -3), weight[..., None, None]
-    mean = (weight * elites).sum(-3)
-    return mean, (weight * (elites - mean.unsqueeze(-3)).square()).sum(-3).sqrt()

@@ -49,13 +49,11 @@ class EndValues(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """Return the values `[*B]` of states `[*B, observation_dim]` at the end of a plan."""
-        value: Tensor = self.end(state).squeeze(-1)
-        return value
+        return self.end(state).squeeze(-1)
 
     def of_own(self, state: Tensor) -> Tensor:
         """Return the target network's values `[*B]` of states `[*B, observation_dim]` in which this learner acts."""
-        value: Tensor = self.target_own(state).squeeze(-1)
-        return value
+        return self.target_own(state).squeeze(-1)
 
     def loss(
         self, state: Tensor, next_state: Tensor, reward: Tensor, discount: Tensor, next_value: Tensor

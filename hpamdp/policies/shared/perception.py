@@ -125,10 +125,7 @@ class Perception(nn.Module):
 
     def encoded(self, observation: Tensor) -> Tensor:
         """Return what the memory sees of observations `[*B, *]`: the encoder's features, or the observations."""
-        if self.encoder is None:
-            return observation
-        features: Tensor = self.encoder(observation)
-        return features
+        return observation if self.encoder is None else self.encoder(observation)
 
     def begins(self, td: TensorDictBase) -> Tensor:
         """Return where a history begins, bool `[*B]`."""

@@ -227,7 +227,9 @@ class SequenceSearch:
                 is_allowed = None if is_allowed is None else is_allowed.gather(1, kept)
                 discrete = discrete.take_along_dim(kept.unsqueeze(-1), 1)
                 unit_parameters = unit_parameters.take_along_dim(kept[..., None, None, None], 1)
-            mean, deviation = self._gaussians(value, unit_parameters, temperature, self.lower_bound(refinement))
+            elites = elite_weights(value, self.options.num_elites, temperature[:, None, None])
+            mean, deviation = moments(unit_parameters, *elites)
+            deviation = deviation.clamp(min=self.lower_bound(refinement))
             best = _best_samples(value, unit_parameters)
             normal = torch.special.ndtri(stratified(unit_parameters.shape, device))
             unit_parameters = mean.unsqueeze(2) + deviation.unsqueeze(2) * normal
@@ -251,19 +253,12 @@ class SequenceSearch:
         fraction = refinement / max(1, self.options.num_iterations - 2)
         return self.options.first_min_deviation ** (1.0 - fraction) * self.options.min_deviation**fraction
 
-    def _gaussians(
-        self, value: Tensor, unit_parameters: Tensor, temperature: Tensor, lower_bound: float
-    ) -> tuple[Tensor, Tensor]:
-        """Return mean and deviation `[N, Q, H, D]` of the elites, of returns `[N, Q, S]` of `[N, Q, S, H, D]`.
 
-        `temperature` is `[N]`, in units of returns.
-        """
-        place, weight = elite_weights(value, self.options.num_elites, temperature[:, None, None])
-        elites = unit_parameters.take_along_dim(place[..., None, None], 2)
-        weight = weight[..., None, None]
-        mean = (weight * elites).sum(2)
-        variance = (weight * (elites - mean.unsqueeze(2)).square()).sum(2)
-        return mean, variance.sqrt().clamp(min=lower_bound)
+def moments(own: Tensor, place: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and deviation `[*B, H, D]` of samples `[*B, S, H, D]` at places with weights, `[*B, num_elites]`."""
+    elites, weight = own.take_along_dim(place[..., None, None], -3), weight[..., None, None]
+    mean = (weight * elites).sum(-3)
+    return mean, (weight * (elites - mean.unsqueeze(-3)).square()).sum(-3).sqrt()
 
 
 def _best_samples(value: Tensor, unit_parameters: Tensor) -> Tensor:

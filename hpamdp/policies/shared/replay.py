@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer, RoundRobinWriter
 
 from hpamdp import keys
-from hpamdp.devices import checked_device
+from hpamdp.devices import Device, checked_device
 from hpamdp.messages import warn
 from hpamdp.observation_entries import packed, unpacked
 from hpamdp.policies.base import Bonus, Learner, States, step_discounts
@@ -24,7 +24,6 @@ from hpamdp.policies.shared.options import REPLAY_CARD, MemoryOptions, ReplayMem
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
 from hpamdp.policies.shared.symmetry import RandomSymmetry
-from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
 
 _STATES = ("state", "next_state")
@@ -68,21 +67,14 @@ class ReplayLearner(Learner):
     catches_up: bool = False
     max_grad_norm: float | None = None
 
-    Options: ClassVar[type[Settings]]
+    Options: ClassVar[Any]
     options: ReplayOptions
     optimizers: dict[str, torch.optim.Optimizer]
     perception: Perception
     target_perception: Perception
     links: HistoryLinks | None
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: Any = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, specs: PAMDPSpecs, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         super().__init__(specs)
         device = checked_device(self, device)
         options = self.options = self.read_options(options, settings)
@@ -105,8 +97,7 @@ class ReplayLearner(Learner):
 
     def read_options(self, options: Any, settings: Mapping[str, Any]) -> ReplayOptions:
         """Return the settings that the constructor was given, as `Settings.of` does."""
-        own: Any = self.Options.of(options, settings)
-        return own
+        return self.Options.of(options, settings)
 
     @abstractmethod
     def make_networks(self, specs: PAMDPSpecs) -> None:
@@ -388,8 +379,7 @@ class ReplayLearner(Learner):
     def features(self, sample: TensorDictBase) -> Tensor:
         """Return what the networks see of a sample's states, `[B, perception.specs.observation_dim]`."""
         memory = self.memory_of(sample, self.perception)
-        features: Tensor = self.perception(sample["state"], memory, has_seen=True)
-        return features
+        return self.perception(sample["state"], memory, has_seen=True)
 
     def memory_of(self, sample: TensorDictBase, perception: Perception) -> Tensor | None:
         """Return the memory's states after a sample's states, `[B, size]`, by a perception; None without memory."""

@@ -66,6 +66,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
+from hpamdp.devices import Device
 from hpamdp.policies.base import Bonus, States
 from hpamdp.policies.low_level.pets.model import PETSModel
 from hpamdp.policies.low_level.pets.options import CARDS, PETSOptions
@@ -96,14 +97,7 @@ class PETS(ReplayLearner):
     options: PETSOptions
     policy: PETSPolicy
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: PETSOptions | None = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, specs: PAMDPSpecs, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         options = PETSOptions.of(options, settings)
         self.num_entries = specs.observation_dim
         self.entries = list(range(self.num_entries))

@@ -288,8 +288,7 @@ class PETSPolicy(PlanningPolicy):
     def _end_value_of_joined(self, rows: Tensor) -> Tensor:
         """Return the values `[E, N, Q, S]` of states `[E, F, N, Q, S]` at the end of a plan."""
         assert self.end_value is not None
-        value: Tensor = self.end_value(rows.movedim(1, -1))
-        return value
+        return self.end_value(rows.movedim(1, -1))
 
     def _returns_of_single_members(self, state: Tensor) -> Returns:
         """Return a function from sequences to the returns that a single member predicts, from states `[N, *]`.
