@@ -195,6 +195,7 @@ def timed(row=slice(None), value=2.5):
         ),
         (spoilt(keys.IS_DECISION, 2, False), SPECS, "row 2: is_decision is false, but must be true in an episode's"),
         (spoilt(("next", keys.IS_DECISION), 0, True), SPECS, "row 0: next.is_decision is true, but must be the same"),
+        (episodes(2).set(keys.OBSERVATION, torch.zeros(2, 3)), SPECS, "observation is [3] a row, but the"),
         (episodes(2), WITH_OPTIONS, "lack option, which the agent chooses here, of left, right"),
         (with_option(0, 1, 1, 1, 1), WITH_OPTIONS, "row 1: option is 1, but must be the same as in the row before"),
         (

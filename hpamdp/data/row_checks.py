@@ -22,40 +22,41 @@ DURATION = ("next", keys.DURATION)
 PERSON = "person"  # who acted
 
 _Key = str | tuple[str, ...]
+_Form = tuple[torch.dtype, tuple[int | str, ...]]
 _FLOAT, _INT, _BOOL = torch.float32, torch.int64, torch.bool
-# The type of each entry, and its shape without the number of rows. If None, any length.
-_TRANSITIONS: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
+# The type of each entry, and its sizes beside the number of rows: numbers, or names of sizes of `PAMDPSpecs`.
+_TRANSITIONS: dict[_Key, _Form] = {
     TRAJECTORY: (_INT, ()),
-    keys.OBSERVATION: (_FLOAT, (None,)),
+    keys.OBSERVATION: (_FLOAT, ("observation_dim",)),
     keys.DISCRETE: (_INT, ()),
-    keys.PARAMETERS: (_FLOAT, (None,)),
+    keys.PARAMETERS: (_FLOAT, ("num_parameters",)),
     keys.IS_DECISION: (_BOOL, (1,)),
-    ("next", keys.OBSERVATION): (_FLOAT, (None,)),
+    ("next", keys.OBSERVATION): (_FLOAT, ("observation_dim",)),
     ("next", keys.REWARD): (_FLOAT, (1,)),
     ("next", keys.DONE): (_BOOL, (1,)),
     ("next", keys.TERMINATED): (_BOOL, (1,)),
     ("next", keys.TRUNCATED): (_BOOL, (1,)),
     ("next", keys.IS_DECISION): (_BOOL, (1,)),
 }
-_DECISIONS: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
+_DECISIONS: dict[_Key, _Form] = {
     keys.OPTION: (_INT, ()),
-    ("next", keys.DECISION_OBSERVATION): (_FLOAT, (None,)),
+    ("next", keys.DECISION_OBSERVATION): (_FLOAT, ("observation_dim",)),
     ("next", keys.OPTION_RETURN): (_FLOAT, (1,)),
     ("next", keys.OPTION_STEPS): (_INT, (1,)),
-    ("next", keys.OBSERVATION): (_FLOAT, (None,)),
+    ("next", keys.OBSERVATION): (_FLOAT, ("observation_dim",)),
     ("next", keys.DONE): (_BOOL, (1,)),
     ("next", keys.IS_DECISION): (_BOOL, (1,)),
 }
-_OPTIONAL: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
+_OPTIONAL: dict[_Key, _Form] = {
     PERSON: (_INT, ()),
     keys.OPTION: (_INT, ()),
-    keys.ACTION_MASK: (_BOOL, (None,)),
-    ("next", keys.ACTION_MASK): (_BOOL, (None,)),
-    keys.OPTION_MASK: (_BOOL, (None,)),
-    ("next", keys.OPTION_MASK): (_BOOL, (None,)),
-    keys.PAIR_MASK: (_BOOL, (None, None)),
-    keys.PARAMETER_LOW: (_FLOAT, (None,)),
-    keys.PARAMETER_HIGH: (_FLOAT, (None,)),
+    keys.ACTION_MASK: (_BOOL, ("num_discrete",)),
+    ("next", keys.ACTION_MASK): (_BOOL, ("num_discrete",)),
+    keys.OPTION_MASK: (_BOOL, ("num_options",)),
+    ("next", keys.OPTION_MASK): (_BOOL, ("num_options",)),
+    keys.PAIR_MASK: (_BOOL, ("num_discrete", "num_discrete")),
+    keys.PARAMETER_LOW: (_FLOAT, ("num_parameters",)),
+    keys.PARAMETER_HIGH: (_FLOAT, ("num_parameters",)),
     DURATION: (_FLOAT, (1,)),
 }
 _OBSERVATIONS: tuple[_Key, ...] = (
@@ -120,12 +121,12 @@ def check_actions(rows: TensorDictBase, specs: PAMDPSpecs) -> None:
             action or option.
     """
     what = "the transitions"
-    _check_length(what, rows, keys.PARAMETERS, specs.num_parameters)
-    _check_lengths(what, rows, specs)
-    shape, expected = list(rows.get(keys.DISCRETE).shape[1:]), list(specs.components.shape)
-    if shape != expected:
-        raise DataError(f"{what}' {_dotted(keys.DISCRETE)} has shape {shape} a row, but must have {expected}")
-    _check_state_entries(what, rows, specs)
+    needed = [keys.PAIR_MASK] * specs.has_pair_mask
+    needed += [keys.PARAMETER_LOW, keys.PARAMETER_HIGH] * specs.has_parameter_bounds
+    for name in needed:
+        if name not in rows.keys():
+            raise DataError(f"{what} lack {name}, which the environment gives with every state")
+    _check_sizes(what, rows, specs)
     _check_rules(what, rows, _action_rules(rows, specs))
     if specs.num_options:
         check_options(what, rows, specs)
@@ -140,7 +141,7 @@ def check_options(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
     if keys.OPTION not in rows.keys():
         names = ", ".join(specs.option_names)
         raise DataError(f"{what} lack {keys.OPTION}, which the agent chooses here, of {names}")
-    _check_lengths(what, rows, specs)
+    _check_sizes(what, rows, specs)
     _check_rules(what, rows, _option_rules(rows, specs))
 
 
@@ -173,7 +174,7 @@ def missing_masks(rows: TensorDictBase, specs: PAMDPSpecs) -> list[str]:
     return [_dotted(name) for name in names if name not in present]
 
 
-def _check_form(what: str, rows: TensorDict, required: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]]) -> None:
+def _check_form(what: str, rows: TensorDict, required: dict[_Key, _Form]) -> None:
     """Check the names, shapes and types of the entries."""
     if not isinstance(rows, TensorDictBase):
         raise DataError(f"{what} are of class {type(rows).__name__}, but must be a TensorDict")
@@ -190,45 +191,27 @@ def _check_form(what: str, rows: TensorDict, required: dict[_Key, tuple[torch.dt
             raise DataError(f"{what}' {_dotted(name)} is of class {type(value).__name__}, but must be a tensor")
         shape = tuple(value.shape[1:])
         if name == keys.DISCRETE and len(shape) == 1:  # an action of several components
-            expected = (None,)
+            expected = ("num_components",)
         pairs = zip(expected, shape, strict=True)
-        fits = len(shape) == len(expected) and all(size in (None, own) for size, own in pairs)
+        fits = len(shape) == len(expected) and all(isinstance(size, str) or size == own for size, own in pairs)
         if value.dtype != dtype or not fits:
-            wanted = ", ".join(["N", *("D" if size is None else str(size) for size in expected)])
+            wanted = ", ".join(["N", *("D" if isinstance(size, str) else str(size) for size in expected)])
             found = ", ".join(["N", *map(str, shape)])
             raise DataError(
                 f"{what}' {_dotted(name)} is {_named(value.dtype)} [{found}], but must be {_named(dtype)} [{wanted}]"
             )
 
 
-def _check_length(what: str, rows: TensorDictBase, name: _Key, length: int) -> None:
-    found = rows.get(name).shape[-1]
-    if found != length:
-        raise DataError(f"{what}' {_dotted(name)} has {found} numbers a row, but the environment's has {length}")
-
-
-def _check_lengths(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
+def _check_sizes(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
+    """Check that the entries, whose form is already checked, have the sizes of an environment."""
     present = set(rows.keys(True, True))
-    for name in _OBSERVATIONS:
-        if name in present:
-            _check_length(what, rows, name, specs.observation_dim)
-    for mask, length in ((keys.ACTION_MASK, specs.num_discrete), (keys.OPTION_MASK, specs.num_options)):
-        for name in (mask, ("next", mask)):
-            if length and name in present:
-                _check_length(what, rows, name, length)
-
-
-def _check_state_entries(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
-    """Check that the rows have the pair mask and the bounds of their states, if the environment gives them."""
-    needed = {keys.PAIR_MASK: specs.num_discrete} if specs.has_pair_mask else {}
-    if specs.has_parameter_bounds:
-        needed |= dict.fromkeys((keys.PARAMETER_LOW, keys.PARAMETER_HIGH), specs.num_parameters)
-    for name, length in needed.items():
-        if name not in rows.keys():
-            raise DataError(f"{what} lack {name}, which the environment gives with every state")
-        shape, expected = list(rows.get(name).shape[1:]), [length] * (2 if name == keys.PAIR_MASK else 1)
-        if shape != expected:
-            raise DataError(f"{what}' {name} has shape {shape} a row, but must have {expected}")
+    for name, (_, form) in {**_TRANSITIONS, **_DECISIONS, **_OPTIONAL}.items():
+        expected = [getattr(specs, size) if isinstance(size, str) else size for size in form]
+        expected = list(specs.components.shape) if name == keys.DISCRETE else expected
+        if name in present and list(found := rows.get(name).shape[1:]) != expected:
+            if "num_options" in form and not specs.num_options:  # nobody reads it
+                continue
+            raise DataError(f"{what}' {_dotted(name)} is {list(found)} a row, but the environment's is {expected}")
 
 
 def _check_rules(what: str, rows: TensorDictBase, rules: Iterator[_Rule]) -> None:
