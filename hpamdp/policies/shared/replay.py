@@ -246,15 +246,13 @@ class ReplayLearner(Learner):
     @contextmanager
     def _storing_only(self, batch: TensorDictBase, mask: Tensor) -> Iterator[None]:
         """Let the buffer hold only the transitions in `mask` of a batch `[*B, T]` while the block runs."""
-        own, last_rows = self.buffer, None if self.links is None else self.links.last_rows
+        own = self.buffer
         self.buffer = replay_buffer(batch.numel(), self.frames.device)
         try:
             self.store(batch, mask)
             yield
         finally:
             self.buffer = own
-            if self.links is not None and last_rows is not None:
-                self.links.last_rows = last_rows
 
     @torch.no_grad()
     def held_out_losses(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:

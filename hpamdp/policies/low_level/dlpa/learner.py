@@ -76,7 +76,7 @@ from hpamdp.policies.shared.networks import polyak_update
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.planning_policy import PlanningPolicy, plan_ends
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.policies.shared.sequences import past_of
+from hpamdp.policies.shared.sequences import HistoryLinks, past_of
 from hpamdp.specs import PAMDPSpecs
 
 Tensors: TypeAlias = Mapping[str, Tensor] | TensorDictBase
@@ -122,6 +122,7 @@ class DLPA(ReplayLearner):
 
     Options = DLPAOptions
     card = CARDS["DLPA"]
+    added_later = ("order.last_rows",)  # checkpoints of 0.3 lack it
     catches_up = True
     export_refusal = "plans at every step"
 
@@ -134,6 +135,7 @@ class DLPA(ReplayLearner):
         self.set_perception(options)
         seen, dims = self.perception.specs, options.hidden_dims
         context_dim = seen.observation_dim - specs.observation_dim
+        self.order = HistoryLinks()
         self.model = PAMDPModel(seen, options.form, dims, options.num_members, context_dim)
         self.end_values = EndValues(seen.observation_dim, dims, options) if options.end_values else None
         planner = Planner(self.model, specs, options, self.end_values, self.perception.imagined)
@@ -240,63 +242,32 @@ class DLPA(ReplayLearner):
         return rows.set("terminated", ends)
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
-        """Add the transitions in `mask` of a batch `[*B, T]`, each with its trajectory and a link to the next step.
+        """Add the transitions in `mask` of a batch `[*B, T]`, and link the steps before them to these.
 
-        `trajectory` is a number, unique in the buffer. `successor` is the place of the trajectory's next step in the
-        buffer, -1 while there is none. `is_open` marks the steps whose successor may come with the next batch, which
-        holds the same environments in the same order.
+        `successor` is the place in the buffer of the step that follows, -1 while there is none. The next batch holds
+        the same environments in the same order.
         """
         num_steps = mask.shape[-1]
         rows = self.linked(self.transitions(batch), batch, mask).reshape(-1, num_steps)
         mask = mask.reshape(-1, num_steps)
         ends = known_ends(batch).reshape(-1, num_steps) | rows["terminated"]
-        # A step follows the one before it, which may be the last step of an earlier batch.
-        last_place, last_trajectory = self._open_steps(rows["state"][:, 0])
-        follows = torch.zeros_like(mask)
-        follows[:, 0] = mask[:, 0] & (last_place >= 0)
+        # The step before each, which may be the last one of an earlier batch.
+        previous = self.order(torch.zeros_like(mask), mask, self.buffer.write_count)
+        follows = mask & (previous >= 0)
+        if follows[:, 0].any():
+            before = self.buffer[:][previous[:, 0].clamp(min=0) % self.options.buffer_size]
+            leads_on = (before["next_state"] == rows["state"][:, 0]).all(-1)  # not after a restart
+            follows[:, 0] &= leads_on & ~before["terminated"]
         if keys.IS_DECISION in batch.keys():  # the option of the batch before may have ended, see `known_ends`
             follows[:, 0] &= ~batch.get(keys.IS_DECISION).reshape(-1, num_steps)[:, 0]
-        follows[:, 1:] = mask[:, 1:] & mask[:, :-1] & ~ends[:, :-1]
+        follows[:, 1:] &= mask[:, :-1] & ~ends[:, :-1]
         # A data set may lack steps: then the next row does not begin where this one led.
         follows[:, 1:] &= rows["next_state"][:, :-1].isclose(rows["state"][:, 1:], atol=1e-4).all(-1)
-
-        # New trajectories are numbered on from those in the buffer.
-        num_stored = len(self.buffer)
-        first_number = int(self.buffer[:]["trajectory"].max()) + 1 if num_stored else 0
-        is_first = mask & ~follows
-        number = first_number + is_first.flatten().cumsum(0).reshape(mask.shape) - 1
-        is_new = is_first.cumsum(-1) > 0
-        rows["trajectory"] = torch.where(is_new, number, last_trajectory.unsqueeze(-1))
-        rows["environment"] = torch.arange(len(mask), device=mask.device).unsqueeze(-1).expand_as(mask)
-        rows["successor"] = torch.full_like(number, -1)
-        is_open = torch.zeros_like(mask)
-        is_open[:, -1] = ~ends[:, -1]
-        rows["is_open"] = is_open
-
-        if num_stored:
-            self.buffer[:]["is_open"].fill_(False)
-        place = torch.full_like(number, -1)
+        rows["successor"] = torch.full_like(previous, -1)
+        place = torch.full_like(previous, -1)
         place[mask] = self.buffer.extend(rows[mask]).to(place.device)
-        previous = torch.cat([last_place.unsqueeze(-1), place[:, :-1]], -1)
-        self.buffer[:]["successor"][previous[follows]] = place[follows]
-
-    def _open_steps(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return which stored step each environment goes on from: its place and its trajectory, each `[N]`.
-
-        Both are -1 where there is none, or where it did not end in the environment's state `[N, observation_dim]`, as
-        after a restart.
-        """
-        place = torch.full((len(state),), -1, device=state.device)
-        trajectory = place.clone()
-        if len(self.buffer):
-            stored = self.buffer[:]
-            open_place = stored["is_open"].nonzero().squeeze(-1)
-            last = stored[open_place]
-            is_followed = (last["next_state"] == state[last["environment"]]).all(-1)
-            environment = last["environment"][is_followed]
-            place[environment] = open_place[is_followed]
-            trajectory[environment] = last["trajectory"][is_followed]
-        return place, trajectory
+        follows &= previous >= self.buffer.write_count - self.options.buffer_size  # not overwritten
+        self.buffer[:]["successor"][previous[follows] % self.options.buffer_size] = place[follows]
 
     def on_progress(self, steps: int) -> None:
         """Let the policy plan."""
@@ -322,13 +293,11 @@ class DLPA(ReplayLearner):
         `valid` is true until the trajectory's end; the steps after it are arbitrary. `place` says where each step is.
         """
         stored = self.buffer[:]
-        trajectory = stored["trajectory"][start]
         places = [start]
         valid = [torch.ones_like(start, dtype=torch.bool)]
         for _ in range(self.options.horizon - 1):
             successor = stored["successor"][places[-1]]
-            place = successor.clamp(min=0)
-            valid.append(valid[-1] & (successor >= 0) & (stored["trajectory"][place] == trajectory))
-            places.append(place)
+            valid.append(valid[-1] & (successor >= 0))
+            places.append(successor.clamp(min=0))
         place = torch.stack(places, 1)
         return stored[place].update({"valid": torch.stack(valid, 1), "place": place})
