@@ -343,7 +343,7 @@ class HPPO(OnPolicy, Learner):
         """Return the actor, unless it samples or sees features: see `hpamdp.policies.shared.exported_policy`."""
         if self.policy.samples_when_greedy or not self.perception.is_plain:
             return None
-        return exported_actor(self.policy.actor, self.specs)
+        return exported_actor(self.actor, self.specs)
 
     def num_updates(self, steps: int) -> int:
         """Return the passes over this many steps, in minibatches."""

@@ -44,7 +44,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from hpamdp import keys
@@ -54,7 +53,7 @@ from hpamdp.policies.low_level.hsac_options import CARDS, HSACOptions
 from hpamdp.policies.masks import masked_logits, random_discrete, zero_fixed
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.gradients import adam
-from hpamdp.policies.shared.hybrid_actor import DistributionActor, HybridActor
+from hpamdp.policies.shared.hybrid_actor import DistributionActor, HybridActor, HybridPolicy
 from hpamdp.policies.shared.hybrid_distribution import (
     HybridDistribution,
     gaussian_log_density,
@@ -105,38 +104,27 @@ class HSACActor(DistributionActor):
         return HybridDistribution(log_probs, mean, log_scale, self.owner, self.components)
 
 
-class HSACPolicy(TensorDictModuleBase):
+class HSACPolicy(HybridPolicy):
     """Sample from the actor, or uniformly during the warm-up.
 
     If greedy, take the most probable discrete action with its squashed means.
     """
 
-    def __init__(self, actor: HSACActor | HybridActor, perception: Perception, specs: PAMDPSpecs) -> None:
-        super().__init__()
-        self.in_keys = perception.in_keys
-        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, *perception.out_keys]
-        self.perception = perception
-        self.actor = actor
-        self.specs = specs
+    def __init__(self, actor: DistributionActor, perception: Perception, specs: PAMDPSpecs) -> None:
+        super().__init__(actor, specs, bound=torch.tanh, perception=perception)
         self.is_random = nn.Buffer(torch.ones((), dtype=torch.bool))
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
+        if is_greedy() or not self.is_random:
+            return super().forward(td)
         observation = td.get(keys.OBSERVATION)
+        shape, device = observation.shape[:-1], observation.device
+        self.perception.see(td)
+        unit_parameters = 2.0 * torch.rand(*shape, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
         allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
-        features = self.perception.see(td)
-        if not is_greedy() and self.is_random:
-            shape, device = observation.shape[:-1], observation.device
-            unit_parameters = torch.rand(*shape, self.specs.num_parameters, device=device, dtype=torch.float32)
-            unit_parameters = 2.0 * unit_parameters - 1.0
-            discrete = random_discrete(self.specs, shape, allowed, device)
-        else:
-            if is_greedy():
-                discrete, raw = self.actor.most_probable(features, allowed, None)
-            else:
-                discrete, raw, _ = self.actor.act(HybridDistribution.sample, features, allowed, None)
-            unit_parameters = raw.tanh()
+        discrete = random_discrete(self.specs, shape, allowed, device)
         parameters = self.specs.from_unit(unit_parameters, td)
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
 

@@ -11,17 +11,13 @@ from torch import Tensor, nn
 
 from hpamdp.components import Components
 from hpamdp.policies.masks import masked_logits
-from hpamdp.policies.shared.hybrid_actor import HybridActor, make_small
+from hpamdp.policies.shared.hybrid_actor import HybridActor, clipped, make_small
 from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution
 from hpamdp.policies.shared.networks import OutputLinear
 from hpamdp.specs import PAMDPSpecs
 
 # The most probable choice is searched among all if there are at most this many; each costs a row of the network.
 _MAX_JOINT = 64
-
-
-def _clipped(raw: Tensor) -> Tensor:
-    return raw.clamp(-1.0, 1.0)
 
 
 class AutoregressiveActor(HybridActor):
@@ -40,7 +36,7 @@ class AutoregressiveActor(HybridActor):
 
     takes_pairs = True
 
-    def __init__(self, *args: Any, bound: Callable[[Tensor], Tensor] = _clipped, **settings: Any) -> None:
+    def __init__(self, *args: Any, bound: Callable[[Tensor], Tensor] = clipped, **settings: Any) -> None:
         super().__init__(*args, **settings)
         self.bound = bound
 

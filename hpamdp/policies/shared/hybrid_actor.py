@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import ClassVar
 
@@ -24,6 +24,11 @@ from hpamdp.specs import PAMDPSpecs
 
 # The raw sample of the parameters, before clipping, which a learner needs for its likelihood.
 RAW = "raw_parameters"
+
+
+def clipped(raw: Tensor) -> Tensor:
+    """Return raw parameters, clipped to [-1, 1]."""
+    return raw.clamp(-1.0, 1.0)
 
 
 class DistributionActor(nn.Module):
@@ -179,16 +184,18 @@ class HybridPolicy(TensorDictModuleBase):
         specs: sizes and bounds of the problem.
         writes_raw: whether to write the raw sample of the parameters as `RAW`, too.
         samples_when_greedy: whether to sample greedy discrete actions as well; their parameters are the means.
+        bound: maps raw parameters to those that are executed, in [-1, 1].
         perception: what the actor sees of an observation. If None, the observation itself.
     """
 
     def __init__(
         self,
-        actor: HybridActor,
+        actor: DistributionActor,
         specs: PAMDPSpecs,
         *,
         writes_raw: bool = False,
         samples_when_greedy: bool = False,
+        bound: Callable[[Tensor], Tensor] = clipped,
         perception: Perception | None = None,
     ) -> None:
         super().__init__()
@@ -199,6 +206,7 @@ class HybridPolicy(TensorDictModuleBase):
         self.specs = specs
         self.writes_raw = writes_raw
         self.samples_when_greedy = samples_when_greedy
+        self.bound = bound
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -212,7 +220,7 @@ class HybridPolicy(TensorDictModuleBase):
             discrete, raw, _ = self.actor.act(draw, *state)
         if self.writes_raw:
             td.set(RAW, raw)
-        parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0), td)
+        parameters = self.specs.from_unit(self.bound(raw), td)
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
 
 

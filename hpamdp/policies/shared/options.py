@@ -89,7 +89,22 @@ class OnPolicyOptions(Settings):
     """
 
 
-class OptionValueOptions(Settings):
+class BufferOptions(Settings):
+    """Settings of a replay buffer."""
+
+    buffer_size: PositiveInt = 200_000
+    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
+    batch_size: PositiveInt = 128
+    """Transitions in an update."""
+
+    @model_validator(mode="after")
+    def _check_buffer(self) -> Self:
+        if self.batch_size > self.buffer_size:
+            raise ValueError(f"batch_size={self.batch_size}: must be at most buffer_size={self.buffer_size}")
+        return self
+
+
+class OptionValueOptions(BufferOptions):
     """Settings of option values that are learned from a replay buffer."""
 
     hidden_dims: Widths = (128, 128)
@@ -108,12 +123,6 @@ class OptionValueOptions(Settings):
     """Learning rate of Adam for the option values."""
     tau: PositiveFraction = 0.01
     """Fraction of the way to the learned network that the target network moves after each update."""
-
-    @model_validator(mode="after")
-    def _check_sizes(self) -> Self:
-        if self.batch_size > self.buffer_size:
-            raise ValueError(f"batch_size={self.batch_size}: must be at most buffer_size={self.buffer_size}")
-        return self
 
 
 # `joint`: every component gets the whole advantage. Otherwise the branches of a `CreditCritic` are summed or mixed.
@@ -163,21 +172,6 @@ class EpsilonOptions(Settings):
     """Probability of a random action after `epsilon_steps`; it falls linearly from 1 to this value."""
     epsilon_steps: Annotated[NonNegativeInt, OwnSteps(), Schedule()] = 40_000
     """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
-
-
-class BufferOptions(Settings):
-    """Settings of a replay buffer."""
-
-    buffer_size: PositiveInt = 200_000
-    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
-    batch_size: PositiveInt = 128
-    """Transitions in an update."""
-
-    @model_validator(mode="after")
-    def _check_buffer(self) -> Self:
-        if self.batch_size > self.buffer_size:
-            raise ValueError(f"batch_size={self.batch_size}: must be at most buffer_size={self.buffer_size}")
-        return self
 
 
 class ReplayOptions(BufferOptions):
