@@ -189,9 +189,7 @@ def test_learners_are_told_the_option_that_holds_in_the_next_state(monkeypatch):
 
 def test_the_option_that_follows_a_batch_is_the_selectors_greedy_one(monkeypatch):
     agent, batch = changing_options()
-    monkeypatch.setattr(
-        agent.selector, "choose", lambda td: {keys.OPTION: (td["observation"].argmax(-1) % 2 == 0).long()}
-    )
+    monkeypatch.setattr(agent.selector, "select", lambda td: (td["observation"].argmax(-1) % 2 == 0).long())
     monkeypatch.setattr(agent.selector, "option_probabilities", lambda td: None)
     heard = heard_by_learners(agent, batch, monkeypatch)
     ended = batch["next", keys.OPTION_ENDED].squeeze(-1)
@@ -271,7 +269,7 @@ def test_the_actor_and_uniform_choices_state_the_probabilities_of_their_options(
     is_due = torch.ones(1, 1, dtype=torch.bool)
     td = TensorDict({keys.OBSERVATION: torch.rand(1, 2), keys.IS_DECISION: is_due}, [1]).expand(4000)
     for selector in (Actor(SPECS), Uniform(SPECS)):
-        often = selector.choose(td)[keys.OPTION].bincount(minlength=2) / 4000
+        often = selector.select(td).bincount(minlength=2) / 4000
         torch.testing.assert_close(selector.option_probabilities(td)[0], often, atol=0.03, rtol=0.0)
 
 

@@ -50,10 +50,12 @@ class Counter(Selector):
         self.out_keys = [*self.out_keys, "call"]
         self.calls = 0
 
-    def choose(self, td: TensorDict) -> dict[str, torch.Tensor]:
+    def select(self, td: TensorDict) -> torch.Tensor:
         self.calls += 1
-        call = torch.full(td.batch_size, self.calls)
-        return {keys.OPTION: (call - 1) % 2, "call": call}
+        return torch.full(td.batch_size, (self.calls - 1) % 2)
+
+    def held_with(self, td: TensorDict, option: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {"call": torch.full(td.batch_size, self.calls)}
 
 
 def test_all_keys_of_a_choice_are_held_where_no_decision_is_due():
@@ -235,7 +237,7 @@ def test_exploring_choices_are_uniform_for_the_first_steps_and_greedy_ones_never
         assert 0.4 < batch["option"].float().mean() < 0.6
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             td = parts.env.reset()
-            assert (agent.selector(td.clone())["option"] == agent.selector.choose(td)["option"]).all()
+            assert (agent.selector(td.clone())["option"] == agent.selector.select(td)).all()
         agent.learn(batch)
     assert not agent.selector.practice.any()
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -153,7 +153,7 @@ class OptionValues(nn.Module):
 
     def __init__(self, learners: Sequence[Learner], num_options: int) -> None:
         super().__init__()
-        self.learners = nn.ModuleList(learners)
+        self.learners = cast("Sequence[Learner]", nn.ModuleList(learners))
         self.num_options = num_options
         memory_keys = {each.memory_key if each.memory_lasts_an_episode else None for each in learners}
         self.memory_key = memory_keys.pop() if len(memory_keys) == 1 else None
@@ -165,18 +165,13 @@ class OptionValues(nn.Module):
         While exploring, an option's value is infinite if its learner has made no update yet.
         """
         if len(self.learners) == self.num_options:
-            return torch.stack([_exploring_value(each, states) for each in self._learners()], -1)
-        (learner,) = self._learners()
+            return torch.stack([_exploring_value(each, states) for each in self.learners], -1)
+        (learner,) = self.learners
         observation, values = states.observation, []
         for one_hot in torch.eye(self.num_options, device=observation.device, dtype=torch.float32):
             seen = torch.cat([observation, one_hot.expand(observation.shape[0], -1)], -1)
             values.append(_exploring_value(learner, states._replace(observation=seen)))
         return torch.stack(values, -1)
-
-    def _learners(self) -> Iterator[Learner]:
-        for learner in self.learners:
-            assert isinstance(learner, Learner)
-            yield learner
 
 
 def _exploring_value(learner: Learner, states: States) -> Tensor:
@@ -299,8 +294,8 @@ class AgentNextOptions:
         td = _at_decision(td).set(keys.OPTION, held)
         with acting(ExplorationType.DETERMINISTIC):
             if self.pairs is not None:
-                return self.pairs.split(self.selector.choose(self.pairs.with_pairs(td))[keys.OPTION])[0]
-            option = self.selector.choose(td)[keys.OPTION]
+                return self.pairs.split(self.selector.select(self.pairs.with_pairs(td)))[0]
+            option = self.selector.select(td)
             return torch.where(self.selector.ends(td), option, held) if self.decides_ends else option
 
     def with_ends(self, batch: TensorDictBase) -> TensorDictBase:
@@ -431,8 +426,8 @@ class HierarchicalAgent(nn.Module):
     ) -> None:
         super().__init__()
         self.selector = selector
-        self.learners = nn.ModuleList(learners)
-        self.explorations = nn.ModuleList(explorations)
+        self.learners = cast("Sequence[Learner]", nn.ModuleList(learners))
+        self.explorations = cast("Sequence[Exploration]", nn.ModuleList(explorations))
         self.specs = specs
         self.is_shared = is_shared
         self.is_frozen = is_frozen
@@ -506,7 +501,7 @@ class HierarchicalAgent(nn.Module):
         scalars: dict[str, float] = {}
         views = self._views(ended_with_trips(batch) if self.values_end_with_trips else batch)
         bonuses = []
-        for exploration, view in zip(self._explorations(), views, strict=False):
+        for exploration, view in zip(self.explorations, views, strict=False):
             bonus, explored = exploration.learn(view.batch, view.mask)
             bonuses += [] if bonus is None else [bonus]
             scalars |= view.named(explored)
@@ -539,7 +534,7 @@ class HierarchicalAgent(nn.Module):
         if self.selector is not None:
             learned = self.selector.update(num_updates)
             scalars.update({f"high/{name}": value for name, value in learned.items()})
-        for i, learner in enumerate(self._learners()):
+        for i, learner in enumerate(self.learners):
             learned = learner.update(num_updates)
             scalars.update({f"{self._prefix_of(i)}/{name}": value for name, value in learned.items()})
         return scalars
@@ -555,16 +550,16 @@ class HierarchicalAgent(nn.Module):
         """Return the names, as in logs, of the selector and the learners that have made no update yet."""
         levels: list[tuple[str, Level]] = [] if self.selector is None else [("high", self.selector)]
         if not self.is_frozen:
-            levels += [(self._prefix_of(i), learner) for i, learner in enumerate(self._learners())]
+            levels += [(self._prefix_of(i), learner) for i, learner in enumerate(self.learners)]
         return [name for name, level in levels if not level.has_updated()]
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, by level and name."""
-        levels: dict[str, Level] = {f"learner{i}": each for i, each in enumerate(self._learners())}
+        levels: dict[str, Level] = {f"learner{i}": each for i, each in enumerate(self.learners)}
         if self.selector is not None:
             levels["selector"] = self.selector
         owners: dict[str, Level | Exploration] = dict(levels)
-        owners |= {f"exploration{i}": exploration for i, exploration in enumerate(self._explorations())}
+        owners |= {f"exploration{i}": exploration for i, exploration in enumerate(self.explorations)}
         return {f"{owner}_{name}": part for owner, module in owners.items() for name, part in module.stateful().items()}
 
     def exported(self) -> dict[str, Any] | None:
@@ -575,23 +570,13 @@ class HierarchicalAgent(nn.Module):
         `selector` is None if there is nothing to choose. `learners` has one entry for each option, or a single one.
         With `is_shared` the single learner observes the one-hot option at the end of the observation.
         """
-        learners = [learner.exported() for learner in self._learners()]
+        learners = [learner.exported() for learner in self.learners]
         selector = None if self.selector is None else self.selector.exported()
         if any(learner is None for learner in learners) or (self.selector is not None and selector is None):
             return None
         if self.pairs is not None:
             return None
         return {"selector": selector, "learners": learners, "is_shared": self.is_shared}
-
-    def _learners(self) -> Iterator[Learner]:
-        for learner in self.learners:
-            assert isinstance(learner, Learner)
-            yield learner
-
-    def _explorations(self) -> Iterator[Exploration]:
-        for exploration in self.explorations:
-            assert isinstance(exploration, Exploration)
-            yield exploration
 
     def _views(self, batch: TensorDictBase) -> list[LearnerView]:
         """Return what each learner sees of a batch `[*B, T]`."""
@@ -605,7 +590,7 @@ class HierarchicalAgent(nn.Module):
             masks = [batch.get(keys.OPTION) == i for i in range(len(self.learners))]
         return [
             LearnerView(self._prefix_of(i), learner, batch, mask)
-            for i, (learner, mask) in enumerate(zip(self._learners(), masks, strict=True))
+            for i, (learner, mask) in enumerate(zip(self.learners, masks, strict=True))
         ]
 
     def _prefix_of(self, learner: int) -> str:

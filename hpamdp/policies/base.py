@@ -259,8 +259,8 @@ class Selector(Level, TensorDictModuleBase):
     `[*B, observation_dim]`, `is_decision` bool `[*B, 1]` and, if the problem forbids options, `option_mask` bool
     `[*B, num_options]`. Forbidden options must neither be chosen nor count in a target. `forward` writes `out_keys`:
     `option` int64 `[*B]`. If `learn` needs to know more about a choice, such as its log-probability, append a key to
-    `out_keys`. Return it from `choose` and `choose_to_practise`, with first dimensions `[*B]`. The key is held with the
-    option and is in the batch that `learn` gets.
+    `out_keys`, and return it from `held_with`, with first dimensions `[*B]`. The key is held with the option and is in
+    the batch that `learn` gets.
 
     State: the same module acts in training and evaluation, with different numbers of environments. So the state of an
     episode belongs in the tensordict. What the selector has learned belongs in parameters and buffers, which are saved
@@ -310,12 +310,16 @@ class Selector(Level, TensorDictModuleBase):
         """
         raise NotImplementedError
 
-    def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return a fresh choice: a tensor `[*B, ...]` for each of `out_keys`.
+    def held_with(self, td: TensorDictBase, option: Tensor) -> dict[str, Tensor]:
+        """Return what is held with the options that were chosen or practise in a step: a tensor `[*B, ...]` a key.
 
-        Override it instead of `select` if there is more to return than the option.
+        Override it if `out_keys` has more than the option.
+
+        Args:
+            td: the step `[*B]`.
+            option: the options, int64 `[*B]`. Where no decision is due, they are ignored.
         """
-        return {keys.OPTION: self.select(td)}
+        return {}
 
     @property
     def remembered_keys(self) -> list[str]:
@@ -338,13 +342,9 @@ class Selector(Level, TensorDictModuleBase):
         """Return the function from a step `[*B]` to the greedy option of each environment, int64 `[*B]`, for an export.
 
         Called while `is_greedy()`. The function is traced, so its control flow must not depend on numbers in tensors.
-        What depends on buffers alone is better computed before it is returned. Override it if `choose` does not fit.
+        What depends on buffers alone is better computed before it is returned. Override it if `select` does not fit.
         """
-        return lambda td: self.choose(td)[keys.OPTION]
-
-    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return options that practise, chosen by chance: a tensor `[*B, ...]` for each of `out_keys`."""
-        return {keys.OPTION: sample_index(self.practice_in(td).log())}
+        return self.select
 
     def practice_in(self, td: TensorDictBase) -> Tensor:
         """Return with which probability each option practises in a step, `[*B, num_options]`, 0 where forbidden."""
@@ -471,24 +471,24 @@ class Selector(Level, TensorDictModuleBase):
                 td.set((keys.HELD, key), value)
         if not nothing_held and not is_decision.any():
             return td
-        for key, value in self._choose_or_practise(td).items():
+        option = self._choose_or_practise(td)
+        for key, value in {keys.OPTION: option, **self.held_with(td, option)}.items():
             if self.decides_ends and nothing_held:
                 td.set((keys.HELD, key), value)
             td.set(key, value if nothing_held else _where(is_decision, value, held[key]))
         return td
 
-    def _choose_or_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return what `choose` does, or `choose_to_practise` with the probability of practice if exploring."""
+    def _choose_or_practise(self, td: TensorDictBase) -> Tensor:
+        """Return the options of `select`; if exploring, options practise in their place with their probabilities."""
         if is_greedy() or not self.practice.any():
-            return self.choose(td)
-        practising = self.choose_to_practise(td)
+            return self.select(td)
+        practising = sample_index(self.practice_in(td).log())
         if self.practice.sum() > _CERTAIN:
             return practising
         draw = torch.rand(td.batch_size, device=self.practice.device, dtype=torch.float32)
         practises = draw < self.practice_in(td).sum(-1)
         is_decision = td.get(keys.IS_DECISION) & ~practises.unsqueeze(-1)
-        chosen = self.choose(td.copy().set(keys.IS_DECISION, is_decision))
-        return {key: _where(practises, practising[key], value) for key, value in chosen.items()}
+        return torch.where(practises, practising, self.select(td.copy().set(keys.IS_DECISION, is_decision)))
 
 
 def _where(rows: Tensor, value: Tensor, other: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.devices import checked_device
+from hpamdp.devices import Device, checked_device
 from hpamdp.policies.high_level.options import CARDS, ActorOptions
 from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.policies.shared.networks import mlp
@@ -53,14 +53,7 @@ class Actor(OnPolicy, RemembersDecisions):
     Options = ActorOptions
     card = CARDS["Actor"]
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        device: torch.device | str = "cpu",
-        options: ActorOptions | None = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, specs: PAMDPSpecs, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         super().__init__(specs)
         self.options: ActorOptions = ActorOptions.of(options, settings)
         self.out_keys = [*self.out_keys, LOG_PROB, WEIGHT, *([ALLOWED] if specs.has_option_mask else [])]
@@ -73,29 +66,21 @@ class Actor(OnPolicy, RemembersDecisions):
         self.optimizer = torch.optim.Adam(self.parameters(), lr=self.options.lr, eps=1e-5, fused=True)
 
     @torch.no_grad()
-    def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return options, log-probabilities and weights, `[*B]` each.
-
-        The options are the most likely ones if the policy is greedy, else samples.
-        """
+    def select(self, td: TensorDictBase) -> Tensor:
+        """Return the most likely options `[*B]` if the policy is greedy, else samples."""
         log_probs = self._log_probs(td)
-        option = log_probs.argmax(-1) if is_greedy() else sample_index(log_probs)
-        log_prob = log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)
-        chosen = {keys.OPTION: option, LOG_PROB: log_prob, WEIGHT: self._weight(td, log_probs, option)}
-        return {**chosen, **self._allowed(td), **self.remembered(td)}
+        return log_probs.argmax(-1) if is_greedy() else sample_index(log_probs)
 
     @torch.no_grad()
-    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return options that practise, the policy's log-probabilities and the weights, `[*B]` each."""
-        chosen = super().choose_to_practise(td)
-        option, log_probs = chosen[keys.OPTION], self._log_probs(td)
-        log_prob = log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)
-        return {**chosen, LOG_PROB: log_prob, WEIGHT: self._weight(td, log_probs, option), **self._allowed(td)}
-
-    def _weight(self, td: TensorDictBase, log_probs: Tensor, option: Tensor) -> Tensor:
-        """Return an option's probability under the policy over that of policy and practice together, `[*B]`."""
+    def held_with(self, td: TensorDictBase, option: Tensor) -> dict[str, Tensor]:
+        """Return the log-probabilities and weights of the options, `[*B]` each, and what is remembered."""
+        log_probs, place = self._log_probs(td), option.unsqueeze(-1)
         policy = log_probs.exp()
-        return (policy / self.exploring_probabilities(td, policy)).gather(-1, option.unsqueeze(-1)).squeeze(-1)
+        weights = policy / self.exploring_probabilities(td, policy)
+        held = {LOG_PROB: log_probs.gather(-1, place).squeeze(-1), WEIGHT: weights.gather(-1, place).squeeze(-1)}
+        if self.specs.has_option_mask:
+            held[ALLOWED] = td.get(keys.OPTION_MASK).clone()
+        return {**held, **super().held_with(td, option)}
 
     @torch.no_grad()
     def option_probabilities(self, td: TensorDictBase) -> Tensor:
@@ -106,9 +91,6 @@ class Actor(OnPolicy, RemembersDecisions):
         """Return the policy's log-probabilities `[*B, num_options]`."""
         logits = masked_logits(self.logits(self.seen(td)), td.get(keys.OPTION_MASK, None))
         return logits.log_softmax(-1)
-
-    def _allowed(self, td: TensorDictBase) -> dict[str, Tensor]:
-        return {ALLOWED: td.get(keys.OPTION_MASK).clone()} if self.specs.has_option_mask else {}
 
     def decisions_to_update(self) -> dict[str, int]:
         """Return the size of a minibatch."""

@@ -71,24 +71,14 @@ class Exp3(Bandit):
         probabilities = self.probabilities if allowed is None else self.probabilities * allowed
         return probabilities.multinomial(num, replacement=True)
 
-    def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return options and their probabilities, `[*B]` each."""
-        option = self.select(td)
-        return {keys.OPTION: option, PROBABILITY: self._probability(td, option)}
-
-    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return options that practise, and their probabilities, `[*B]` each."""
-        chosen = super().choose_to_practise(td)
-        return {**chosen, PROBABILITY: self._probability(td, chosen[keys.OPTION])}
-
-    def _probability(self, td: TensorDictBase, option: Tensor) -> Tensor:
-        """Return the probability `[*B]` with which a step's option practises or is chosen."""
+    def held_with(self, td: TensorDictBase, option: Tensor) -> dict[str, Tensor]:
+        """Return the probabilities `[*B]` with which the options practise or are chosen."""
         own = self.probabilities.float().expand(*option.shape, -1)
         mask = td.get(keys.OPTION_MASK, None)
         if mask is not None:
             own = own * mask
         probabilities = self.exploring_probabilities(td, own / own.sum(-1, keepdim=True))
-        return probabilities.gather(-1, option.unsqueeze(-1)).squeeze(-1)
+        return {PROBABILITY: probabilities.gather(-1, option.unsqueeze(-1)).squeeze(-1)}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add the importance-weighted rewards of finished decisions to the gains.

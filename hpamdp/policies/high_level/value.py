@@ -70,19 +70,9 @@ class Value(Selector):
         of_learners = [] if self.learners_memory_key is None else [self.learners_memory_key]
         return super().remembered_keys + of_learners
 
-    def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return the options `[*B]` and, with `untried_first`, what the session has tried before them."""
-        if not self.options.untried_first:
-            return super().choose(td)
-        tried = self._tried(td)
-        is_open = ~tried if (mask := td.get(keys.OPTION_MASK, None)) is None else mask & ~tried
-        option = torch.where(is_open.any(-1), is_open.long().argmax(-1), self._best(td, ~is_open.any(-1)))
-        return {keys.OPTION: option, SESSION_TRIED: tried}
-
-    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return options `[*B]` that practise and, with `untried_first`, what the session has tried before them."""
-        chosen = super().choose_to_practise(td)
-        return {**chosen, SESSION_TRIED: self._tried(td)} if self.options.untried_first else chosen
+    def held_with(self, td: TensorDictBase, option: Tensor) -> dict[str, Tensor]:
+        """Return, with `untried_first`, what the session has tried before the options."""
+        return {SESSION_TRIED: self._tried(td)} if self.options.untried_first else {}
 
     def _tried(self, td: TensorDictBase) -> Tensor:
         """Return which options the session has tried before a decision, the last option included."""
@@ -98,7 +88,11 @@ class Value(Selector):
 
         If no decision is due or the episode has ended, it is the first possible option.
         """
-        return self._best(td, torch.ones(td.batch_size, dtype=torch.bool, device=td.get(keys.OBSERVATION).device))
+        if not self.options.untried_first:
+            return self._best(td, torch.ones_like(td.get(keys.IS_DECISION).squeeze(-1)))
+        tried = self._tried(td)
+        is_open = ~tried if (mask := td.get(keys.OPTION_MASK, None)) is None else mask & ~tried
+        return torch.where(is_open.any(-1), is_open.long().argmax(-1), self._best(td, ~is_open.any(-1)))
 
     def _best(self, td: TensorDictBase, is_asked: Tensor) -> Tensor:
         """Return what `select` does where `is_asked`, bool `[*B]`, and the first possible option elsewhere."""

@@ -23,7 +23,7 @@ class RemembersDecisions(Selector):
     """Base class for selectors whose networks see a `Perception` of the observations at the decisions so far.
 
     A subclass calls `set_perception` in its constructor, and its networks see `seen`. The memory changes only at
-    decisions: between them, `forward` holds what `choose` returned.
+    decisions: between them, `forward` holds what `held_with` returned.
 
     Attributes:
         perception: what the networks see of an observation.
@@ -40,21 +40,13 @@ class RemembersDecisions(Selector):
             self.out_keys += [self.memory_key]
             self.export_refusal = f"remembers {self.memory_key}"
 
-    def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return the option of `select`, and the state of the memory."""
-        return {**super().choose(td), **self.remembered(td)}
-
-    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return an option that practises, and the state of the memory."""
-        return {**super().choose_to_practise(td), **self.remembered(td)}
-
     def seen(self, td: TensorDictBase) -> Tensor:
         """Return what the networks see of a decision in a step `[*B]`, `[*B, perception.specs.observation_dim]`."""
         features, _ = self.perception.features_and_memory(td)
         return features
 
     @torch.no_grad()
-    def remembered(self, td: TensorDictBase) -> dict[str, Tensor]:
+    def held_with(self, td: TensorDictBase, option: Tensor) -> dict[str, Tensor]:
         """Return the memory's state after a decision in a step `[*B]`, under its key; empty without a memory."""
         _, states = self.perception.features_and_memory(td)
         return states
@@ -73,8 +65,7 @@ class RemembersDecisions(Selector):
         observation: Tensor = decisions.get(("next", keys.DECISION_OBSERVATION))
         if not self.stores_features:
             return observation
-        features: Tensor = self.perception(observation, self.held(decisions), has_seen=True)
-        return features
+        return self.perception(observation, self.held(decisions), has_seen=True)
 
     def of_stored(self, state: Tensor) -> Tensor:
         """Return what the networks see of stored states, `[N, perception.specs.observation_dim]`.

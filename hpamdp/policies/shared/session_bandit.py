@@ -69,18 +69,16 @@ class SessionBandit(Bandit):
         """Return a value for each option, `[*B, num_options]`; the option with the highest is chosen."""
         raise NotImplementedError
 
-    def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return the options `[*B]` and, with `memory=session`, the rewards that they were chosen by."""
+    def select(self, td: TensorDictBase) -> Tensor:
+        """Return the options `[*B]`; with `memory=session` by the session's rewards, greedy or not."""
         if self.memory_key is None:
-            return super().choose(td)
-        rewards = self._rewards(td)
-        values = masked_values(self.session_values(SessionRewards(rewards)), td.get(keys.OPTION_MASK, None))
-        return {keys.OPTION: values.argmax(-1), SESSION_REWARDS: rewards}
+            return super().select(td)
+        values = self.session_values(SessionRewards(self._rewards(td)))
+        return masked_values(values, td.get(keys.OPTION_MASK, None)).argmax(-1)
 
-    def choose_to_practise(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return options `[*B]` that practise and, with `memory=session`, the rewards of the session so far."""
-        chosen = super().choose_to_practise(td)
-        return chosen if self.memory_key is None else {**chosen, SESSION_REWARDS: self._rewards(td)}
+    def held_with(self, td: TensorDictBase, option: Tensor) -> dict[str, Tensor]:
+        """Return, with `memory=session`, the rewards of the session before the options."""
+        return {} if self.memory_key is None else {SESSION_REWARDS: self._rewards(td)}
 
     def _rewards(self, td: TensorDictBase) -> Tensor:
         """Return the rewards of the session before a decision, `[*B, 3, num_options]`, the last option's included."""
