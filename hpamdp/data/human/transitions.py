@@ -29,6 +29,7 @@ from hpamdp.env.boatdock.task import FUEL, BoatState, ObservationForm, RewardFor
 NO_PRESS = "the episodes have no logged press"
 _REWARDS = ("paper", "sparse")
 _OBSERVATIONS = ("scaled", "pixels")
+_CENTRE = torch.tensor(harbour.CENTRE, dtype=torch.float32)
 
 
 def transitions(
@@ -100,38 +101,22 @@ def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: Obs
     _check(data, reward, observation)
     rules = Rules(reward=reward, observation=observation)
     episodes = data.episodes
-    start = episodes["start"] - torch.tensor(harbour.CENTRE, dtype=torch.float32)
-    goal = episodes["goal"] - torch.tensor(harbour.CENTRE, dtype=torch.float32)
+    start, goal = episodes["start"] - _CENTRE, episodes["goal"] - _CENTRE
     # Find the end of the last logged press. Without a press, let the boat head for its goal from the start.
     position, heading = start.clone(), torch.nn.functional.normalize(goal - start, dim=1)
     duration = torch.zeros(len(start), dtype=torch.float32)
     last = data.presses[data.presses["is_final"]]
     number = last["episode"]
     controller, keymap = (episodes[name].to(torch.int32) for name in ("controller", "keymap"))
-    position[number] = last["position"] - torch.tensor(harbour.CENTRE, dtype=torch.float32)
+    position[number] = last["position"] - _CENTRE
     heading[number] = torch.stack(harbour.direction(controller[number], keymap[number], last["key"].int()), 1)
     duration[number] = last["duration"]
     full = torch.full_like(duration, physics.TANK)
     end = _final_position(position, goal, full, heading, duration, episodes["outcome"])
 
-    zeros = torch.zeros_like(full)
     steps = episodes["presses"].clamp(min=1)
-    before = BoatState(
-        start_x=start[:, 0],
-        start_y=start[:, 1],
-        goal_x=goal[:, 0],
-        goal_y=goal[:, 1],
-        x=start[:, 0],
-        y=start[:, 1],
-        velocity_x=zeros,
-        velocity_y=zeros,
-        fuel=full,
-        controller=torch.full_like(controller, harbour.NOT_CHOSEN),
-        keymap=keymap,
-        presses=torch.zeros_like(controller),
-        outcome=torch.full_like(controller, physics.SAILING),
-        episode=torch.zeros_like(controller),
-    )
+    not_chosen, no_press = torch.full_like(controller, harbour.NOT_CHOSEN), torch.zeros_like(controller)
+    before = _sailing(episodes, start, torch.zeros_like(start), full, not_chosen, no_press)
     after = before._replace(
         x=end[:, 0],
         y=end[:, 1],
@@ -153,7 +138,7 @@ def _check(data: HumanData, reward: str, observation: str) -> None:
     """Check the arguments of `transitions` and `decisions`."""
     _check_one_of("reward", reward, _REWARDS)
     _check_one_of("observation", observation, _OBSERVATIONS)
-    if not (data.episodes["centre"] == torch.tensor(harbour.CENTRE, dtype=torch.float32)).all():
+    if not (data.episodes["centre"] == _CENTRE).all():
         raise DataError("the harbours have different centres; read the file with one_frame=True")
 
 
@@ -164,43 +149,22 @@ def _check_one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
 
 def _states(presses: TensorDict, episodes: TensorDict, has_choice: bool) -> tuple[BoatState, BoatState]:
     """Return the boats before and after each press, px from the harbour's centre."""
-    centre = torch.tensor(harbour.CENTRE, dtype=torch.float32)
     is_first = presses["press"] == 0
     is_final = presses["is_final"]
     duration = presses["duration"]
-    controller = episodes["controller"].to(torch.int32)
-    keymap = episodes["keymap"].to(torch.int32)
-    num_presses = presses["press"].to(torch.int32)
-
-    start = episodes["start"] - centre
-    goal = episodes["goal"] - centre
-    position = presses["position"] - centre
+    controller, keymap = (episodes[name].to(torch.int32) for name in ("controller", "keymap"))
+    goal, position = episodes["goal"] - _CENTRE, presses["position"] - _CENTRE
     heading = torch.stack(harbour.direction(controller, keymap, presses["key"].to(torch.int32)), 1)
     next_velocity = presses["speed"].unsqueeze(1) * heading
     velocity = torch.where(is_first.unsqueeze(1), 0.0, next_velocity.roll(1, 0))
     fuel, next_fuel = _fuel(duration, is_first, is_final, episodes["tank"])
     final_position = _final_position(position, goal, fuel, heading, duration, episodes["outcome"])
-    next_position = torch.where(is_final.unsqueeze(1), final_position, presses["next_position"] - centre)
+    next_position = torch.where(is_final.unsqueeze(1), final_position, presses["next_position"] - _CENTRE)
 
     shown_controller = controller
     if has_choice:
         shown_controller = torch.where(is_first, harbour.NOT_CHOSEN, controller).to(torch.int32)
-    before = BoatState(
-        start_x=start[:, 0],
-        start_y=start[:, 1],
-        goal_x=goal[:, 0],
-        goal_y=goal[:, 1],
-        x=position[:, 0],
-        y=position[:, 1],
-        velocity_x=velocity[:, 0],
-        velocity_y=velocity[:, 1],
-        fuel=fuel,
-        controller=shown_controller,
-        keymap=keymap,
-        presses=num_presses,
-        outcome=torch.full_like(num_presses, physics.SAILING),
-        episode=torch.zeros_like(num_presses),
-    )
+    before = _sailing(episodes, position, velocity, fuel, shown_controller, presses["press"].to(torch.int32))
     # If `to_rest_to_rest` left out the final press, the episode is truncated, and values bootstrap from its last state.
     number = presses["episode"]
     is_last = torch.cat([number[1:] != number[:-1], torch.ones_like(is_final[:1])])
@@ -212,10 +176,21 @@ def _states(presses: TensorDict, episodes: TensorDict, has_choice: bool) -> tupl
         velocity_y=next_velocity[:, 1],
         fuel=next_fuel,
         controller=controller,
-        presses=num_presses + 1,
+        presses=before.presses + 1,
         outcome=torch.where(is_final, episodes["outcome"], outcome_if_not_final).int(),
     )
     return before, after
+
+
+def _sailing(
+    episodes: TensorDict, position: Tensor, velocity: Tensor, fuel: Tensor, controller: Tensor, presses: Tensor
+) -> BoatState:
+    """Return boats that sail in episodes `[N]`: places `[N, 2]` from the harbour's centre, integers int32 `[N]`."""
+    places = (episodes["start"] - _CENTRE, episodes["goal"] - _CENTRE, position, velocity)
+    outcome = torch.full_like(presses, physics.SAILING)
+    columns = [column for place in places for column in place.unbind(1)]
+    episode_number = torch.zeros_like(presses)
+    return BoatState._make((*columns, fuel, controller, episodes["keymap"].int(), presses, outcome, episode_number))
 
 
 def _fuel(duration: Tensor, is_first: Tensor, is_final: Tensor, tank: Tensor) -> tuple[Tensor, Tensor]:
