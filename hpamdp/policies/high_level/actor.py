@@ -107,7 +107,6 @@ class Actor(OnPolicy, RemembersDecisions):
             return super().learn_from_options(steps)
         decisions = steps[is_end]
         rows = self.rows(decisions)
-        rows["memory"] = self.held(decisions)
         rows["begins"] = self.begins(decisions)
         rows["starts"] = sequence_starts(self.begins(steps), is_end, self.options.sequence_length)
         return self._learn(rows)
@@ -131,12 +130,14 @@ class Actor(OnPolicy, RemembersDecisions):
         held = self.held(decisions)
         next_value = self.critic(self.perception(after.get(keys.OBSERVATION), held)).squeeze(-1)
         rows = {
-            "state": self.stored_state(decisions),
+            "state": after.get(keys.DECISION_OBSERVATION),
             "option": decisions.get(keys.OPTION),
             "log_prob": decisions.get(LOG_PROB),
             "weight": decisions.get(WEIGHT),
             "target": after.get(keys.OPTION_RETURN).squeeze(-1) + self.next_discount(decisions) * next_value,
         }
+        if held is not None:
+            rows["memory"] = held
         if self.specs.has_option_mask:
             rows["allowed"] = decisions.get(ALLOWED)
         return TensorDict(rows, batch_size=decisions.shape)
@@ -145,7 +146,7 @@ class Actor(OnPolicy, RemembersDecisions):
         """Return what policy and critic see of rows `[N]`, `[N, perception.specs.observation_dim]`."""
         if self.perception.is_recurrent:
             return self.perception.of_sequences(*(rows[name] for name in ("state", "memory", "begins", "starts")))
-        return self.of_stored(rows["state"])
+        return self.perception(rows["state"], rows.get("memory", None), has_seen=True)
 
     def loss(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of policy and critic on decisions `[B]`, and scalars to log."""

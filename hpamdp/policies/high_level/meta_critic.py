@@ -32,6 +32,7 @@ from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.exploration import schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import first_multiple, packed_states, replay_buffer, unpacked_states
 from hpamdp.policies.shared.selector_memory import RemembersDecisions
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
@@ -155,8 +156,8 @@ class MetaCritic(RemembersDecisions):
         return unpacked_states(sample_with_past(self.buffer, size, num_past), self.specs)
 
     def rows(self, decisions: TensorDictBase) -> TensorDict:
-        """Return what is stored of decisions `[*B]`; states are features if `stores_features`, else observations."""
-        after = decisions.get("next")
+        """Return what is stored of decisions `[*B]`."""
+        after, held = decisions.get("next"), self.held(decisions)
         rows = {
             "state": after.get(keys.DECISION_OBSERVATION),
             "option": decisions.get(keys.OPTION),
@@ -166,26 +167,23 @@ class MetaCritic(RemembersDecisions):
         }
         if self.specs.has_option_mask:
             rows["next_option_mask"] = after.get(keys.OPTION_MASK)
-        held = self.held(decisions)
-        if held is not None and self.links is not None:
+        if held is not None:
             rows["memory"] = held
-        elif self.stores_features:
-            rows |= {"state": self.stored_state(decisions), "next_state": self.perception(rows["next_state"], held)}
         return TensorDict(rows, batch_size=decisions.shape)
+
+    def memory_of(self, rows: TensorDictBase, perception: Perception) -> Tensor | None:
+        """Return the memory's states after sampled decisions, `[B, size]`, by a perception; None without memory."""
+        if self.links is not None:
+            return states_of_past(rows, perception, self.options.burn_in)
+        return rows.get("memory", None)
 
     def features(self, rows: TensorDictBase) -> Tensor:
         """Return what the critics see of the states of sampled decisions, `[B, perception.specs.observation_dim]`."""
-        if self.links is None:
-            return self.of_stored(rows["state"])
-        memory = states_of_past(rows, self.perception, self.options.burn_in)
-        return self.perception(rows["state"], memory, has_seen=True)
+        return self.perception(rows["state"], self.memory_of(rows, self.perception), has_seen=True)
 
     def next_features(self, rows: TensorDictBase) -> Tensor:
         """Return what the target critics see of the next states, `[B, perception.specs.observation_dim]`."""
-        if self.links is None:
-            return rows["next_state"] if self.stores_features else self.target_perception(rows["next_state"])
-        memory = states_of_past(rows, self.target_perception, self.options.burn_in)
-        return self.target_perception(rows["next_state"], memory)
+        return self.target_perception(rows["next_state"], self.memory_of(rows, self.target_perception))
 
     def update_critics(self, rows: TensorDictBase) -> Tensor:
         """Make one update of the critics from decisions `[batch_size]`; return the loss."""

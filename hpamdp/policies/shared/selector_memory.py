@@ -55,25 +55,6 @@ class RemembersDecisions(Selector):
         """Return the memory's states after the last decisions, `[*B, size]`; None without a memory."""
         return None if self.memory_key is None else batch.get(self.memory_key)
 
-    @property
-    def stores_features(self) -> bool:
-        """Whether the buffer stores features instead of observations: those of a stack, which has nothing to learn."""
-        return self.perception.memory is not None and not self.perception.is_recurrent
-
-    def stored_state(self, decisions: TensorDictBase) -> Tensor:
-        """Return the observations at finished decisions `[*B]`, or features of them if `stores_features`."""
-        observation: Tensor = decisions.get(("next", keys.DECISION_OBSERVATION))
-        if not self.stores_features:
-            return observation
-        return self.perception(observation, self.held(decisions), has_seen=True)
-
-    def of_stored(self, state: Tensor) -> Tensor:
-        """Return what the networks see of stored states, `[N, perception.specs.observation_dim]`.
-
-        For a recurrent memory, use `states_of_past` instead.
-        """
-        return state if self.stores_features else self.perception(state)
-
     @staticmethod
     def begins(decisions: TensorDictBase) -> Tensor:
         """Return whether finished decisions were the first of their episodes, bool `[*B]`."""
