@@ -19,7 +19,7 @@ from torch import Tensor
 
 from hpamdp.policies.high_level.options import CARDS, ThompsonOptions
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit import above_all
+from hpamdp.policies.shared.bandit import Rewards, above_all
 from hpamdp.policies.shared.session_bandit import SessionBandit, SessionRewards
 
 
@@ -32,15 +32,14 @@ class Thompson(SessionBandit):
 
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
         """Return `num` choices, each from its own samples."""
-        statistics = self.statistics
-        noise = torch.randn(num, self.specs.num_options, dtype=torch.float64, device=statistics.counts.device)
-        deviation = self.options.exploration * statistics.deviation / statistics.counts.clamp(min=1e-9).sqrt()
-        sampled_means = statistics.means + deviation * noise
-        # Untried options come first, in random order.
-        return masked_values(torch.where(statistics.is_untried, above_all(noise), sampled_means), allowed).argmax(-1)
+        noise = torch.randn(num, self.specs.num_options, dtype=torch.float64, device=self.statistics.counts.device)
+        return masked_values(self._sampled(self.statistics, noise), allowed).argmax(-1)
 
     def session_values(self, rewards: SessionRewards) -> Tensor:
         """Return samples of the mean rewards in each session; untried options come first, in random order."""
-        noise = torch.randn_like(rewards.means)
-        deviation = self.options.exploration * rewards.deviation / rewards.counts.clamp(min=1.0).sqrt()
+        return self._sampled(rewards, torch.randn_like(rewards.means))
+
+    def _sampled(self, rewards: Rewards, noise: Tensor) -> Tensor:
+        """Return samples of the mean rewards by standard normal noise; untried options come first, in random order."""
+        deviation = self.options.exploration * rewards.deviation / rewards.counts.clamp(min=1e-9).sqrt()
         return torch.where(rewards.is_untried, above_all(noise), rewards.means + deviation * noise)

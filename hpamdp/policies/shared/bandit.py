@@ -27,7 +27,36 @@ def above_all(noise: Tensor) -> Tensor:
     return (1e9 + noise) * 2.0**900
 
 
-class RewardStatistics(nn.Module):
+class Rewards:
+    """What counts, sums and sums of squares of each option's rewards say, `[*B, num_options]` each.
+
+    Attributes:
+        counts, sums, squares: float64.
+    """
+
+    counts: Tensor
+    sums: Tensor
+    squares: Tensor
+
+    @property
+    def means(self) -> Tensor:
+        """Mean reward of each option, `[*B, num_options]`; 0 for untried options."""
+        return self.sums / self.counts.clamp(min=1e-12)
+
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviation of all rewards together, `[*B, 1]`; close to 0 without rewards."""
+        total = self.counts.sum(-1, keepdim=True).clamp(min=1.0)
+        mean = self.sums.sum(-1, keepdim=True) / total
+        return (self.squares.sum(-1, keepdim=True) / total - mean.square()).clamp(min=1e-12).sqrt()
+
+    @property
+    def is_untried(self) -> Tensor:
+        """Whether an option has no known reward, bool `[*B, num_options]`. Forgotten options are untried again."""
+        return self.counts < 1e-9
+
+
+class RewardStatistics(nn.Module, Rewards):
     """Weighted counts, sums and sums of squares of each option's rewards.
 
     Source of the discounted and the sliding-window form: Garivier and Moulines 2011, arXiv 0805.3415, section 2.
@@ -53,22 +82,6 @@ class RewardStatistics(nn.Module):
         size = options.window if options.memory == "sliding_window" else 0
         self.recent_options: Tensor = nn.Buffer(torch.full((size,), -1, dtype=torch.long))
         self.recent_rewards: Tensor = nn.Buffer(torch.zeros(size, dtype=torch.float64))
-
-    @property
-    def means(self) -> Tensor:
-        """Mean reward of each option, `[num_options]`; 0 for untried options."""
-        return self.sums / self.counts.clamp(min=1e-12)
-
-    @property
-    def deviation(self) -> Tensor:
-        """Standard deviation of all rewards, a scalar; close to 0 without rewards."""
-        total = self.counts.sum().clamp(min=1.0)
-        return (self.squares.sum() / total - (self.sums.sum() / total).square()).clamp(min=1e-12).sqrt()
-
-    @property
-    def is_untried(self) -> Tensor:
-        """Whether an option has no known reward, bool `[num_options]`. Forgotten options are untried again."""
-        return self.counts < 1e-9
 
     @property
     def known_means(self) -> Tensor:

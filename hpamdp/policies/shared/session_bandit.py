@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit import Bandit
+from hpamdp.policies.shared.bandit import Bandit, Rewards
 from hpamdp.policies.shared.bandit_options import SessionBanditOptions
 from hpamdp.specs import PAMDPSpecs
 
@@ -25,25 +25,15 @@ from hpamdp.specs import PAMDPSpecs
 SESSION_REWARDS = "session_rewards"
 
 
-class SessionRewards:
+class SessionRewards(Rewards):
     """The rewards of the options in each environment's session so far.
 
     Args:
         rewards: counts, sums and sums of squares, `[*B, 3, num_options]`.
-
-    Attributes:
-        counts, means: of each option's rewards, `[*B, num_options]`; the mean of an untried option is 0.
-        deviation: standard deviation of all rewards of the session, `[*B, 1]`; close to 0 without rewards.
-        is_untried: whether an option has no reward, bool `[*B, num_options]`.
     """
 
     def __init__(self, rewards: Tensor) -> None:
-        self.counts, sums, squares = rewards.unbind(-2)
-        self.is_untried = self.counts == 0.0
-        self.means = sums / self.counts.clamp(min=1.0)
-        total = self.counts.sum(-1, keepdim=True).clamp(min=1.0)
-        variance = squares.sum(-1, keepdim=True) / total - (sums.sum(-1, keepdim=True) / total).square()
-        self.deviation = variance.clamp(min=1e-12).sqrt()
+        self.counts, self.sums, self.squares = rewards.unbind(-2)
 
 
 class SessionBandit(Bandit):
