@@ -49,8 +49,8 @@ class HumanExperienceReplay(TensorDictReplayBuffer):
         buffer_arguments: further arguments of TorchRL's TensorDictReplayBuffer.
 
     Raises:
-        DataError: the file is missing or has another checksum; an argument is of another type or out of range; or no
-            episode or no press is left.
+        DataError: the file is missing or has another checksum; an argument is out of range; or no episode or no
+            press is left.
     """
 
     def __init__(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,21 +33,6 @@ def keep(data: HumanData, mask: Tensor) -> HumanData:
     return HumanData(data.episodes[mask].clone(), presses)
 
 
-def check_conditions(complete: object, successes: object, best_people: object, controller: object) -> None:
-    """Refuse conditions that `select` does not take.
-
-    Raises:
-        DataError: a condition is of another type, or there is no such controller.
-    """
-    for name, value in (("complete", complete), ("successes", successes)):
-        if not isinstance(value, bool):
-            raise DataError(f"{name}={as_code(value)}, but must be True or False")
-    if best_people is not None and (isinstance(best_people, bool) or not isinstance(best_people, int | np.integer)):
-        raise DataError(f"best_people={as_code(best_people)}, but must be a whole number or None")
-    if controller is not None and controller not in harbour.CONTROLLERS:
-        raise DataError(f"controller={as_code(controller)}, but must be one of {', '.join(harbour.CONTROLLERS)}")
-
-
 def _best_first(data: HumanData, people: Collection[int] | None) -> list[int]:
     """Return the numbers of the people in `data`, or of those in `people`, by their mean scores, the highest first."""
     scores = scores_by_person(data)
@@ -59,6 +43,12 @@ def _best_first(data: HumanData, people: Collection[int] | None) -> list[int]:
             f"people: nobody has the number {min(unknown)}; the numbers are {min(present)} to {max(present)}"
         )
     return sorted(present if people is None else set(people), key=lambda person: -float(scores[person]))
+
+
+def _number_of(controller: str) -> int:
+    if controller not in harbour.CONTROLLERS:
+        raise DataError(f"controller={as_code(controller)}, but must be one of {', '.join(harbour.CONTROLLERS)}")
+    return harbour.CONTROLLERS.index(controller)
 
 
 def select(
@@ -85,9 +75,8 @@ def select(
         controller: only episodes with the `congruent` or the `incongruent` controller. If None, with either.
 
     Raises:
-        DataError: a condition is of another type or out of range, or no episode meets them all.
+        DataError: a condition is out of range, or no episode meets them all.
     """
-    check_conditions(complete, successes, best_people, controller)
     episodes = data.episodes
     mask = torch.ones(len(episodes), dtype=torch.bool)
     if complete:
@@ -103,7 +92,7 @@ def select(
             chosen &= set(end[:count])
     mask &= torch.isin(episodes["person"], torch.tensor(sorted(chosen)))
     if controller is not None:
-        mask &= episodes["controller"] == harbour.CONTROLLERS.index(controller)
+        mask &= episodes["controller"] == _number_of(controller)
     if presses is not None:
         for person in chosen:
             of_person = mask & (episodes["person"] == person)

@@ -48,6 +48,7 @@ from hpamdp.policies.encoders.base import JoinedEncoders
 from hpamdp.policies.exploration.base import Explored
 from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
 from hpamdp.policies.exploration.options import CARDS, NoveltyOptions, _OfNetworks
+from hpamdp.policies.shared.gradients import descend
 from hpamdp.policies.shared.hybrid_actor import hidden_layers
 from hpamdp.policies.shared.networks import OutputLinear
 from hpamdp.settings import SettingError
@@ -166,10 +167,7 @@ class Novelty(RewardsNewStates):
         errors = []
         for rows in torch.randperm(len(observation), device=observation.device).tensor_split(num):
             error = self.network.errors(observation[rows]).mean()
-            self.optimizer.zero_grad()
-            error.backward()
-            self.optimizer.step()
-            errors.append(error.detach())
+            errors.append(descend(self.optimizer, error))
         return torch.stack(errors).mean().item()
 
     def stateful(self) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from hpamdp.policies.high_level.options import CARDS, MetaCriticOptions
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.exploration import schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
+from hpamdp.policies.shared.gradients import descend
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import first_multiple, packed_states, replay_buffer, unpacked_states
@@ -196,9 +197,7 @@ class MetaCritic(RemembersDecisions):
             # Each member sees a random half of the decisions, so that the members stay different.
             is_seen = torch.rand(*q.shape[:2], 1, device=q.device, dtype=torch.float32) < 0.5 if len(q) > 1 else 1.0
         loss = ((q - target).square() * is_chosen * is_seen).sum(-1).mean()
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        self.optimizer.step()
+        descend(self.optimizer, loss)
         polyak_update(self.target_critics, self.critics, self.options.tau)
         polyak_update(self.target_perception, self.perception, self.options.tau)
         return loss.detach()

@@ -37,6 +37,7 @@ from hpamdp.devices import Device, checked_device
 from hpamdp.policies.high_level.options import CARDS, OptionCriticOptions
 from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.policies.shared.exploration import schedule
+from hpamdp.policies.shared.gradients import descend
 from hpamdp.policies.shared.networks import mlp, polyak_update
 from hpamdp.policies.shared.replay import first_multiple, replay_buffer
 from hpamdp.policies.shared.selector_memory import RemembersDecisions
@@ -185,9 +186,7 @@ class OptionCritic(RemembersDecisions):
         """Make one update of Q from steps `[batch_size]`; return the loss."""
         q = _of_option(self.critic(rows["state"]), rows["option"])
         loss = (q - self.target(rows)).square().mean()
-        self.optimizers["critic"].zero_grad(set_to_none=True)
-        loss.backward()
-        self.optimizers["critic"].step()
+        descend(self.optimizers["critic"], loss)
         polyak_update(self.target_critic, self.critic, self.options.tau)
         return loss.detach()
 
@@ -208,9 +207,7 @@ class OptionCritic(RemembersDecisions):
         logit = _of_option(self.termination(state), option)
         should_end = (advantage < 0.0).float()
         loss = F.binary_cross_entropy_with_logits(logit, should_end, weight=advantage.abs() * is_open)
-        self.optimizers["termination"].zero_grad(set_to_none=True)
-        loss.backward()
-        self.optimizers["termination"].step()
+        descend(self.optimizers["termination"], loss)
         return logit.detach().sigmoid().mean()
 
 

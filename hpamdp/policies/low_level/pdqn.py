@@ -363,20 +363,19 @@ class PDQN(ReplayLearner):
         terminated = batch["next", keys.TERMINATED].squeeze(-1)
         discounts = step_discounts(batch, self.options.gamma) * torch.ones_like(batch["next", keys.REWARD])
         reward, last, discount = n_step_returns(rows["reward"], discounts.squeeze(-1), done, self.options.n_step)
-        next_state = rows["next_state"]
         rows["reward"] = reward
-        rows["next_state"] = next_state.gather(-2, last.unsqueeze(-1).expand_as(next_state))
         rows["discount"] = discount * ~terminated.gather(-1, last)
-        for name in ("option_ended", "next_option"):
+        for name in ("option_ended", "next_option", "next_state", "next_action_mask"):
             if name in rows.keys():
-                rows[name] = rows[name].gather(-1, last)
+                rows[name] = _at_times(rows[name], last)
         if self.memory_key is not None and self.options.n_step > 1:
-            memory = rows["memory"]
-            rows["last_memory"] = memory.gather(-2, last.unsqueeze(-1).expand_as(memory))
-        if "next_action_mask" in rows.keys():
-            mask = rows["next_action_mask"]
-            rows["next_action_mask"] = mask.gather(-2, last.unsqueeze(-1).expand_as(mask))
+            rows["last_memory"] = _at_times(rows["memory"], last)
         return rows
+
+
+def _at_times(values: Tensor, time: Tensor) -> Tensor:
+    """Return values `[*B, T, ...]` at times `[*B, T]`."""
+    return values.take_along_dim(time.reshape(*time.shape, *[1] * (values.ndim - time.ndim)), time.ndim - 1)
 
 
 def n_step_returns(reward: Tensor, discount: Tensor, done: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:

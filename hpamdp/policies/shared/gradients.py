@@ -101,6 +101,14 @@ def adam(rate: float, *modules: nn.Module, weight_decay: float | None = None) ->
     return torch.optim.AdamW(learned, lr=rate, weight_decay=weight_decay, fused=True)
 
 
+def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
+    """Take one step of an optimizer down the gradient of a loss; return the loss without its graph."""
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    optimizer.step()
+    return loss.detach()
+
+
 def set_learning_rates(
     optimizers: Mapping[str, torch.optim.Optimizer], rates: Mapping[str, float], fraction: float
 ) -> None:
