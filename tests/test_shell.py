@@ -105,8 +105,13 @@ def ends_with(folder: Path, words: list[str], out: int, encoding: str, err: Path
         sys.stderr.close()
 
 
-def test_classes_are_found_in_the_working_directory_after_installed_packages(monkeypatch, tmp_path):
-    monkeypatch.setattr(sys, "path", ["/packages"])
+def test_a_clone_stays_first_where_python_looks_for_modules(monkeypatch, tmp_path):
+    root = str(CONF.parent)
+    monkeypatch.setattr(sys, "path", [root, "/packages"])
+    monkeypatch.chdir(root)
+    put_working_directory_last()
+    assert sys.path == [root, "/packages"]
+    monkeypatch.setattr(sys, "path", [str(tmp_path), root, "/packages", ""])
     monkeypatch.chdir(tmp_path)
     put_working_directory_last()
     assert sys.path == [root, "/packages", str(tmp_path)]
