@@ -204,10 +204,11 @@ def test_a_killed_run_loses_no_more_than_the_minutes_between_two_checkpoints(tmp
         ("resume=", "resume: empty; give the output folder of a run"),
         ("low.checkpoint=", "low.checkpoint: empty"),
         ("hydra.run.dir=", "hydra.run.dir: the working directory"),
+        ("hydra.sweep.dir=", "hydra.sweep.dir: the working directory"),
     ],
 )
 def test_an_empty_folder_name_is_refused_in_one_line(word, line, command):
-    code, _, err = command(word, *SMALL, "low=random")
+    code, _, err = command(*(["-m"] if "sweep" in word else []), word, *SMALL, "low=random")
     assert code == 2 and err.count("\n") == 1 and line in err
 
 

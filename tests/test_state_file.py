@@ -38,6 +38,11 @@ def test_nested_values_are_read_back_exactly(tmp_path):
     assert_same(parts_of(tmp_path / "a"), STATE)
 
 
+def test_a_number_with_the_stride_of_a_column_is_written(tmp_path):
+    write(tmp_path / "a", {"x": torch.arange(6).reshape(1, 6)[:, 3]})
+    assert StateFile(tmp_path / "a").read("x").tolist() == [3]
+
+
 def test_the_same_values_make_the_same_bytes_and_shared_weights_are_stored_once(tmp_path):
     weight = torch.rand(1000)
     for name in ("a", "b"):

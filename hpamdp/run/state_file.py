@@ -93,7 +93,9 @@ class _Packer:
             self._names[memory] = name
             dense = tensor.detach().cpu().contiguous()
             storage = dense.untyped_storage().data_ptr()
-            self.tensors[name] = dense.clone() if storage in self._storages else dense
+            # One number counts as contiguous whatever its stride, but with some strides it has no view as bytes.
+            is_copied = storage in self._storages or dense.numel() == 1
+            self.tensors[name] = dense.clone(memory_format=torch.contiguous_format) if is_copied else dense
             self._storages.add(storage)
         return self._names[memory]
 

@@ -44,21 +44,28 @@ class SweepFolderCallback(Callback):
     path: ClassVar[Path | None] = None
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Refuse `resume=auto` without a fixed folder."""
-        _check_fixed(config, "hydra.run.dir")
+        """Refuse the working directory as the run's folder, and `resume=auto` without a fixed folder."""
+        _own_folder(config, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Remember the sweep's folder, and refuse `resume=auto` if it is not fixed."""
-        _check_fixed(config, "hydra.sweep.dir")
-        SweepFolderCallback.path = Path(os.path.abspath(config.hydra.sweep.dir))
+        """Remember the sweep's folder, and refuse the same."""
+        SweepFolderCallback.path = _own_folder(config, "hydra.sweep.dir")
 
 
-def _check_fixed(config: DictConfig, name: str) -> None:
-    """Exit if `resume=auto` would never find the run again, because each start makes a folder of its own."""
+def _own_folder(config: DictConfig, name: str) -> Path:
+    """Return the folder. Exit if it is the working directory, or if `resume=auto` would never find the run again.
+
+    Without a fixed folder each start makes a folder of its own.
+    """
     settings: Any = OmegaConf.to_container(OmegaConf.select(config, name.rpartition(".")[0]), resolve=False)
     if config.resume == RESUME_AUTO and "${now:" in str(settings["dir"]):
         warn(f"resume=auto: goes on with the run in a folder, so give {name}")
         sys.exit(MISTAKE)
+    folder = Path(os.path.abspath(OmegaConf.select(config, name)))
+    if folder.resolve() == Path.cwd():
+        warn(f"{name}: the working directory; give a folder of its own, or leave {name} out")
+        sys.exit(MISTAKE)
+    return folder
 
 
 @dataclass
