@@ -250,3 +250,12 @@ def test_a_new_episode_is_counted_and_has_the_keys_of_the_tensor_functions():
         key = counter_rng.rng_key(counter_rng.seed_tensor(seed), stream, environment, torch.from_numpy(integers[3]))
         assert np.array_equal(bits[i].view(np.int32), key.bits.numpy())
         assert steps[i] == key.step & 0xFFFFFFFF
+
+
+def test_rules_that_only_a_kernel_has_are_not_overridden_in_silence():
+    class Other(PlatformEnv):
+        def act(self, *args):
+            return super().act(*args)
+
+    with pytest.raises(TypeError, match=r"^Other: overrides act, but only the kernel of PlatformEnv has rules$"):
+        Other(num_envs=2)

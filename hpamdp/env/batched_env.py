@@ -755,6 +755,11 @@ class KernelEnv(BatchedEnv[EpisodeState]):
         raise NotImplementedError
 
     def _may_use_kernel(self) -> bool:
+        owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
+        other = [name for name in ("start", "act", "observe") if getattr(type(self), name) is not getattr(owner, name)]
+        if other:
+            name = type(self).__name__
+            raise TypeError(f"{name}: overrides {', '.join(other)}, but only the kernel of {owner.__name__} has rules")
         return True
 
     def leave_kernel(self) -> None:

@@ -94,7 +94,7 @@ def _act(floats: Any, integers: Any, row: Any, action: Any, length: Any, slips: 
 
 @part
 def _observe(floats: Any, integers: Any, row: Any, tiles: Any, observation: Any) -> None:
-    """Write what is observed of a row: `rules.observe`."""
+    """Write what is observed of a row."""
     x, y = floats[_X, row], floats[_Y, row]
     observation[0], observation[1] = TWO * y - ONE, TWO * x - ONE
     observation[2] = TWO * _F(integers[_COFFEE, row]) - ONE
