@@ -282,3 +282,10 @@ def test_the_name_that_0_3_had_for_practice_is_read():
     del saved["agent"]["practice"]
     saved["agent"]["uniform_option_steps"] = 77
     assert read_saved(saved).run.agent.practice == 77
+
+
+def test_a_setting_that_a_saved_run_lacks_has_its_default_and_not_the_value_of_todays_recipe():
+    saved = make_config(["env=gymnasium", "env.id=CartPole-v1", "low=hppo"]).to_dict()
+    assert saved["env"].pop("terminates_at_limit") and saved["env"].pop("reward_clip") == 100.0
+    env = read_saved(saved, trust=True).env.settings
+    assert env["terminates_at_limit"] is False and env["reward_clip"] == 10.0

@@ -11,7 +11,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from hpamdp.complaints import as_json
-from hpamdp.config.components import GROUPS, TARGET
+from hpamdp.config.components import GROUPS, TARGET, card_named, defaults_of, model_of
 from hpamdp.config.compose import check, choosing, chosen_names, compose, is_name, plain_groups
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import AgentConfig, Config
@@ -65,7 +65,12 @@ def read_saved(
     values = {name: value for name, value in saved.items() if name not in (*GROUPS, _CHOICES)}
     for group in groups:
         own = with_new_names(group, saved[group], today[group])
-        values[group] = {**today[group], **own, TARGET: today[group][TARGET]}
+        values[group] = {
+            **today[group],
+            **_later_defaults(group, today[group], own),
+            **own,
+            TARGET: today[group][TARGET],
+        }
     for name, value in given.items():
         _set(values, name.split("."), value)
     config = check(values, {**choices, **names})
@@ -77,6 +82,15 @@ def read_saved(
             "the command line, or add trust=true if you trust the file; in Python, give env or trust=True"
         )
     return config
+
+
+def _later_defaults(group: str, today: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the defaults of the settings that the saved run did not have yet, whatever today's recipe takes."""
+    target = str(today[TARGET])
+    later = today.keys() - own.keys()
+    if not later or card_named(target) is None:
+        return {}
+    return {name: value for name, value in defaults_of(model_of(target, group)).items() if name in later}
 
 
 def needs_trust(config: Config) -> bool:
