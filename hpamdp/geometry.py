@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import Any
 
 import torch
@@ -145,26 +144,41 @@ class PlaneGeometry(Contexts):
 
     def fits(self, observation_dim: int, parameter_dims: Sequence[int]) -> str:
         """Return in words what does not fit a problem of this size, empty if all does."""
-        num, revealed = len(parameter_dims), self.revealed
-        named = {
-            "vectors": tuple(chain(*self.vectors)),
-            "redundant": self.redundant,
-            "revealed": () if revealed is None else revealed.entries,
-        }
-        for name, entries in named.items():
-            if len({*entries}) < len(entries) or not {*entries} <= {*range(observation_dim)}:
-                return f"{name} {entries}, but must be different entries of {observation_dim}"
-        expected = [self.num_contexts, num, 2]
+        revealed = self.revealed
+        showing, last_action = ((), ()) if revealed is None else (revealed.entries, revealed.last_action)
+        entries = [entry for pair in self.vectors for entry in pair]
+        expected = [self.num_contexts, len(parameter_dims), 2]
         shape = expected if self.directions is None else list(self.directions.shape)
-        if shape != expected:
-            return f"directions have shape {shape}, but must be {expected}"
-        for name, of_actions in (
-            ("kinds", self.kinds),
-            ("last actions", () if revealed is None else revealed.last_action),
-        ):
-            if len(of_actions) not in (0, num):
-                return f"{len(of_actions)} {name}, but must be {num}"
-        return ""
+        dims_of_kinds = set(zip(self.kinds, parameter_dims, strict=False))
+        misfits = {
+            f"vectors {self.vectors}, but must be different entries of {observation_dim}": (
+                any(not 0 <= entry < observation_dim for entry in entries) or len(set(entries)) < len(entries)
+            ),
+            f"redundant entries {self.redundant}, but must be whole vectors and other entries of {observation_dim}": (
+                any(not 0 <= entry < observation_dim for entry in self.redundant)
+                or any((x in self.redundant) != (y in self.redundant) for x, y in self.vectors)
+            ),
+            f"{len(self.origins)} origins for {len(self.vectors)} vectors": (
+                len(self.origins) not in (0, len(self.vectors))
+            ),
+            f"{len(self.kinds)} kinds, but must be {len(parameter_dims)}": (
+                len(self.kinds) not in (0, len(parameter_dims))
+            ),
+            f"kinds {self.kinds} with {tuple(parameter_dims)} parameters, but a kind must have one number of them": (
+                len(dims_of_kinds) > len(set(self.kinds))
+            ),
+            f"directions have shape {shape}, but must be {expected}": shape != expected,
+            "directions are both known and revealed, but must be one of them": (
+                revealed is not None and self.directions is not None
+            ),
+            f"revealed by the entries {showing}, but must be different entries of {observation_dim}": (
+                any(not 0 <= entry < observation_dim for entry in showing) or len(set(showing)) < len(showing)
+            ),
+            f"revealed by {len(last_action)} entries of the last action, but must be {len(parameter_dims)}": (
+                revealed is not None and len(last_action) != len(parameter_dims)
+            ),
+        }
+        return next((text for text, is_wrong in misfits.items() if is_wrong), "")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -50,6 +50,15 @@ _BOOKKEEPING = (
 )
 
 
+class _WithoutAliases(yaml.SafeLoader):
+    """Refuses aliases, which no run writes: a short file of somebody else could stand for values without end."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("an alias")
+        return super().compose_node(parent, index)
+
+
 def is_saved_agent(path: Path) -> bool:
     """Return whether a file begins like the checkpoints and policies of this version.
 
@@ -68,7 +77,7 @@ def saved_config(folder: Path) -> dict[str, Any]:
         text = read_regular(folder / CONFIG_NAME, MAX_TEXT_BYTES)
         if not text.endswith(b"\n"):  # cut off in the middle, which may still be yaml
             return {}
-        config = yaml.safe_load(text)
+        config = _WithoutAliases(text).get_single_data()
     except Exception:  # PyYAML raises errors of any kind, such as a KeyError for `!!bool x`
         return {}
     return config if isinstance(config, dict) else {}

@@ -19,7 +19,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
 from hpamdp.run.continuation import rest_of
-from hpamdp.run.folder import locked, remove_run
+from hpamdp.run.folder import locked, moved_aside
 from hpamdp.run.loggers import TensorboardLogger, WandbLogger
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
@@ -76,23 +76,40 @@ def test_a_run_that_overwrites_another_and_is_killed_leaves_nothing_of_the_other
 def test_a_run_that_is_refused_destroys_nothing(tmp_path, monkeypatch, without_login):  # noqa: F811
     start(tmp_path / "run")
     before = contents(tmp_path / "run")
-    refused = [["low=pdqn", "low.batch_size=0"], ["high=none"], ["high=ucb", "resume=nowhere"]]
+    refused = [["low=pdqn", "low.batch_size=0"], ["high=none"], ["high=ucb", "resume=nowhere"], ["logger=wandb"]]
+    monkeypatch.setenv("WANDB_MODE", "sometimes")  # which is found last, when the logger starts
     for words in refused:
         with pytest.raises(ConfigError):
             start(tmp_path / "run", "overwrite=true", *words)
         assert contents(tmp_path / "run") == before, words
-    monkeypatch.setenv("WANDB_MODE", "sometimes")  # which is found last, when the logger starts
     for word in (f"resume={tmp_path / 'run'}", "total_frames=256"), (f"resume={tmp_path / 'run'}", "total_frames=64"):
         with pytest.raises(ConfigError):
             run(compose_config([*word, "logger=wandb"]), tmp_path / "run", [*word, "logger=wandb"])
         assert contents(tmp_path / "run") == before
 
 
+def test_a_move_that_fails_halfway_brings_the_earlier_run_back(tmp_path, monkeypatch):
+    for name in ("summary.json", "checkpoint.safetensors", "config.yaml", "metrics.csv"):
+        (tmp_path / name).write_text(name)
+    before, rename = contents(tmp_path), Path.rename
+
+    def full(self, target):
+        if self.name == "metrics.csv":
+            raise OSError("no space left")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", full)
+    with pytest.raises(OSError, match="no space"), moved_aside(tmp_path):
+        pass
+    assert contents(tmp_path) == before
+
+
 def test_a_folder_that_a_list_of_figures_names_is_never_deleted(tmp_path):
     (tmp_path / "run" / "thesis").mkdir(parents=True)
     (tmp_path / "run" / "metrics.csv").write_text("frames\n")
     (tmp_path / "run" / ".figures").write_text("thesis\n..\nlearning_curves.png\n")
-    remove_run(tmp_path / "run")
+    with moved_aside(tmp_path / "run"):
+        pass
     assert [*(tmp_path / "run").iterdir()] == [tmp_path / "run" / "thesis"]
 
 
@@ -102,6 +119,9 @@ def test_folders_of_loggers_that_a_run_did_not_have_and_a_users_own_lock_are_nev
     for name in own:
         (tmp_path / "run" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "run" / name).write_text("mine")
+    with pytest.raises(OSError, match="full"), locked(tmp_path / "run"), moved_aside(tmp_path / "run"):
+        (tmp_path / "run" / CONFIG_NAME).write_text("choices: {logger: wandb}\n")
+        raise OSError("full")
     with locked(tmp_path / "run"):
         start(tmp_path / "run", "overwrite=true")
     assert [(tmp_path / "run" / name).read_text() for name in own] == ["mine"] * len(own)

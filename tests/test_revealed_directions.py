@@ -252,11 +252,11 @@ def test_one_model_of_both_boats_does_not_see_which_of_them_it_is():
 @pytest.mark.parametrize(
     ("changes", "misfit"),
     [
-        ({"directions": torch.zeros(1, 2, 2)}, r"directions have shape \[1, 2, 2\], but must be \[1, 3, 2\]"),
-        ({"revealed": RevealedDirections((2, 3), (0, 1))}, "2 last actions, but must be 3"),
+        ({"directions": torch.zeros(1, 3, 2)}, "directions are both known and revealed"),
+        ({"revealed": RevealedDirections((2, 3), (0, 1))}, "revealed by 2 entries of the last action, but must be 3"),
         (
             {"revealed": RevealedDirections((2, 3, 4), (0, 1), last_option=1)},
-            r"revealed \(2, 3, 4, 0, 1, 1\), but must be",
+            r"revealed by the entries \(2, 3, 4, 0, 1, 1\), but must be",
         ),
     ],
 )

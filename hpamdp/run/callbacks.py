@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import numbers
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -11,15 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from hpamdp.cards import CallbackCard
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import replacing
 from hpamdp.messages import as_code, first_line, warn
-from hpamdp.run import state_file
 from hpamdp.run.callbacks_options import CARDS, PatienceOptions, TimeLimitOptions
 from hpamdp.run.checkpoint import progress_of
+from hpamdp.run.state_checks import check_numbers
 from hpamdp.run_files import BEST_NAME
 from hpamdp.settings import SettingError
 
@@ -69,11 +71,14 @@ class Callback:
         return {}
 
     def state(self) -> dict[str, Any]:
-        """Return what a checkpoint has to hold: numbers, text, tensors, and lists and mappings of them."""
+        """Return what a checkpoint has to hold: real numbers, dense tensors of them and mappings of these.
+
+        Names and types must always be the same. NaN may stand for a value that is not known yet.
+        """
         return {}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`."""
+        """Continue from a `state`, whose names and types have been checked."""
 
 
 class BestAgent(Callback):
@@ -303,29 +308,69 @@ def metrics_of(callbacks: Mapping[str, Callback], trainer: Trainer) -> dict[str,
     for name, callback in callbacks.items():
         with mistakes_explained(name):
             metrics = callback.metrics(trainer)
+        if not isinstance(metrics, Mapping):
+            raise CallbackError(f"{name}.metrics: must return numbers by their names, not {type(metrics).__name__}")
         for metric, value in metrics.items():
             where = f"{name}.metrics: {metric}={value!r:.60}"
+            if not isinstance(metric, str) or not metric or not metric.isprintable():
+                raise CallbackError(f"{where}: the name must be a text in one line")
             if f"{OWN}{metric}" in row:
                 raise CallbackError(f"{where}: another callback has a metric of this name")
-            number = float(value)
-            if not math.isfinite(number):
-                raise CallbackError(f"{first_line(where)}: must be a finite number")
-            row[f"{OWN}{metric}"] = number
+            row[f"{OWN}{metric}"] = _finite_number(where, value)
     return row
 
 
-def states_of(callbacks: Mapping[str, Callback]) -> dict[str, Any]:
-    """Return copies of the states of all callbacks by name.
+def _finite_number(where: str, value: Any) -> float:
+    try:
+        number = math.nan if isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise CallbackError(f"{first_line(where)}: must be a finite number")
+    return number
+
+
+def states_of(
+    callbacks: Mapping[str, Callback], before: Mapping[str, dict[str, Any]] | None = None
+) -> dict[str, dict[str, Any]]:
+    """Return copies of the states of all callbacks, with Python's own numbers.
+
+    Args:
+        callbacks: by name.
+        before: their states when the run began; None if it begins now.
 
     Raises:
-        CallbackError: a checkpoint cannot hold a state.
+        CallbackError: a checkpoint cannot hold a state, or a resumed run would refuse it beside the one from before.
     """
     states = {}
     for name, callback in callbacks.items():
         with mistakes_explained(name):
-            states[name] = copy.deepcopy(callback.state())
+            state = callback.state()
+        states[name] = _savable(f"{name}.state", state)
         try:
-            state_file.check(f"{name}.state", states[name])
-        except TypeError as error:
-            raise CallbackError(str(error)) from error
+            check_numbers(f"{name}.state", states[name], (before or states)[name])
+        except ValueError as error:
+            raise CallbackError(f"{error}, as when the run began") from error
     return states
+
+
+def _is_plain(value: Tensor) -> bool:
+    has_numbers = value.layout == torch.strided and not value.is_meta
+    return has_numbers and not value.is_complex() and not value.is_quantized
+
+
+def _savable(where: str, value: Any) -> Any:
+    if isinstance(value, Mapping):
+        wrong = [name for name in value if not isinstance(name, str)]
+        if wrong:
+            raise CallbackError(f"{where}: {wrong[0]!r:.60} must be a text, as the name of a value")
+        return {name: _savable(f"{where}.{name}", inner) for name, inner in value.items()}
+    if isinstance(value, Tensor) and _is_plain(value):
+        return value.detach().clone()
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, numbers.Real):
+        return int(value) if isinstance(value, numbers.Integral) else float(value)
+    raise CallbackError(
+        f"{where} is of type {type(value).__name__}, but must be a real number, a dense tensor or a mapping of them"
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 import traceback
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from hpamdp.config.errors import ConfigError
-from hpamdp.files import remove_link, replacing
+from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.run_files import (
     BEST_NAME,
     CHECKPOINT_NAME,
@@ -24,6 +25,7 @@ from hpamdp.run_files import (
     EVALUATION_NAME,
     FIGURES_NAME,
     FILM_NAME,
+    MAX_TEXT_BYTES,
     METRICS_NAME,
     OLD_NAMES,
     POLICY_NAME,
@@ -51,6 +53,10 @@ _OTHERS = (
 )
 # Folders of loggers, named after these.
 _OF_LOGGERS = (TENSORBOARD_NAME, WANDB_NAME)
+# In the first line of each `error.txt` that is written here.
+_TRACEBACK = b"Traceback (most recent call last):"
+# Folder of an earlier run while a new one starts in its place.
+_ASIDE_NAME = ".hpamdp-replaced"
 _LOCK_NAME = ".hpamdp-lock"
 
 
@@ -87,7 +93,9 @@ def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
         ConfigError: the folder is refused.
     """
     if not _is_of_a_run(folder):
-        foreign = [path.name for path in written_by_a_run(folder)]
+        foreign = [path.name for path in written_by_a_run(folder) if path.name != ERROR_NAME]
+        if has_foreign_error(folder):
+            foreign.append(ERROR_NAME)
         if foreign:
             raise ConfigError(
                 f"{folder}: holds {', '.join(foreign)}, which no run has written and a run would replace; take another "
@@ -102,7 +110,7 @@ def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
 
 def _is_of_a_run(folder: Path) -> bool:
     """Return whether a file says by its contents that a run has written it, since others use the same names."""
-    if is_config_of_run(saved_config(folder)):
+    if is_config_of_run(saved_config(folder)) or _aside(folder).exists():
         return True
     if {"finished", "frames"} <= saved_summary(folder).keys():
         return True
@@ -133,13 +141,42 @@ def mark_unfinished(folder: Path) -> None:
             partial.write_text(json.dumps({**summary, "finished": False}, indent=2) + "\n")
 
 
-def remove_run(folder: Path) -> None:
-    """Delete what an earlier run has written into a folder. Files that no run writes stay."""
-    for path in written_by_a_run(folder):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
+@contextmanager
+def moved_aside(folder: Path) -> Iterator[None]:
+    """Move an earlier run aside, and delete it after the block or bring it back if the block fails.
+
+    Files that no run writes stay in the folder.
+
+    Raises:
+        OSError: the folder cannot be written to; the earlier run stays.
+    """
+    aside = _aside(folder)
+    _delete(aside)
+    earlier = written_by_a_run(folder)
+    if earlier:
+        aside.mkdir()
+    others = {*folder.iterdir()} - {*earlier}
+    try:
+        for path in earlier:
+            path.rename(aside / path.name)
+    except BaseException:
+        _bring_back(folder)
+        raise
+    try:
+        yield
+    except BaseException:
+        for path in {*written_by_a_run(folder)} - others:
+            _delete(path)
+        _bring_back(folder)
+        raise
+    _delete(aside)
+
+
+def _bring_back(folder: Path) -> None:
+    aside = _aside(folder)
+    for path in aside.iterdir() if aside.is_dir() else ():
+        path.rename(folder / path.name)
+    _delete(aside)
 
 
 def is_about_folder(error: OSError, folder: Path) -> bool:
@@ -153,10 +190,35 @@ def is_about_folder(error: OSError, folder: Path) -> bool:
     return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
-def write_error(folder: Path, error: BaseException) -> None:
-    """Write an error's traceback into the folder of a run or a sweep, if that is possible."""
+def write_error(folder: Path, error: BaseException) -> bool:
+    """Write an error's traceback into the folder of a run or a sweep, and return whether that was possible.
+
+    A file of that name that somebody else has written stays.
+    """
+    if has_foreign_error(folder):
+        return False
     with suppress(OSError), replacing(folder / ERROR_NAME) as partial:
         partial.write_text("".join(traceback.format_exception(error)))
+        return True
+    return False
+
+
+def remove_error(folder: Path) -> None:
+    """Remove the file that `write_error` wrote, if there is one."""
+    if not has_foreign_error(folder):
+        (folder / ERROR_NAME).unlink(missing_ok=True)
+
+
+def has_foreign_error(folder: Path) -> bool:
+    """Return whether the folder has an `error.txt` that `write_error` has not written."""
+    file = folder / ERROR_NAME
+    if not os.path.lexists(file):
+        return False
+    try:
+        beginning, _, _ = read_regular(file, MAX_TEXT_BYTES, follow_links=False).partition(b"\n")
+    except OSError:
+        return True
+    return _TRACEBACK not in beginning
 
 
 def written_by_a_run(folder: Path) -> list[Path]:
@@ -169,4 +231,16 @@ def written_by_a_run(folder: Path) -> list[Path]:
     of_logger = [name for name in _OF_LOGGERS if logger in (None, name)]
     names = [*_MARKS, *_OTHERS, *of_logger, *listed_figures(folder), FIGURES_NAME, CONFIG_NAME]
     paths = [folder / name for name in names]
-    return [path for path in dict.fromkeys(paths) if path.exists() or path.is_symlink()]
+    found = [path for path in dict.fromkeys(paths) if path.exists() or path.is_symlink()]
+    return [path for path in found if path.name != ERROR_NAME or not has_foreign_error(folder)]
+
+
+def _aside(folder: Path) -> Path:
+    return folder / _ASIDE_NAME
+
+
+def _delete(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

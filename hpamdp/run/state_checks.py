@@ -60,6 +60,21 @@ def check_like(where: str, saved: Any, own: Any) -> None:
         raise ValueError(f"{where} is {type(saved).__name__}, but must be {type(own).__name__}")
 
 
+def check_numbers(where: str, saved: Any, own: Any) -> None:
+    """Refuse nested tensors and numbers whose names or types differ from `own`. Sizes of tensors may differ.
+
+    Raises:
+        ValueError: the values are refused; the message names the first one.
+    """
+    if isinstance(own, Mapping):
+        for name, value in check_names(saved, own, where).items():
+            check_numbers(f"{where}.{name}", value, own[name])
+    elif isinstance(own, Tensor):
+        check_form(where, saved, own, any_size=True)
+    elif not isinstance(saved, int | float):
+        raise ValueError(f"{where} is {saved!r:.40}, but must be a number")
+
+
 def check_names(saved: object, own: Mapping[str, Any], where: str = "a state dict") -> Mapping[str, Any]:
     """Return nested values if their names are the names of `own`.
 

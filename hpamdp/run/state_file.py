@@ -20,7 +20,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save
@@ -31,7 +30,7 @@ from hpamdp.run_files import METADATA_KEY
 
 
 def write(path: Path, state: Mapping[str, Any]) -> None:
-    """Write nested dicts, lists and tuples of tensors, numbers, text and None; numbers of NumPy become Python's.
+    """Write nested dicts, lists and tuples of tensors, numbers, text and None.
 
     Tensors of the same memory are stored once.
 
@@ -48,15 +47,6 @@ def write(path: Path, state: Mapping[str, Any]) -> None:
         partial.write_bytes(data)
 
 
-def check(name: str, value: Any) -> None:
-    """Refuse what no file can hold.
-
-    Raises:
-        TypeError: see `write`.
-    """
-    _Packer().packed(name, value)
-
-
 class _Packer:
     """Turn nested values into JSON values, and collect their tensors by name."""
 
@@ -66,8 +56,6 @@ class _Packer:
         self._storages: set[int] = set()
 
     def packed(self, name: str, value: Any) -> Any:
-        if isinstance(value, np.generic):
-            value = value.item()
         if isinstance(value, Tensor):
             return {"$tensor": self._named(name, value)}
         if isinstance(value, Mapping):

@@ -26,7 +26,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.files import replacing
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, MISTAKE, one_line, reason_of, say, warn
-from hpamdp.run.folder import is_about_folder, locked, write_error
+from hpamdp.run.folder import has_foreign_error, is_about_folder, locked, write_error
 from hpamdp.run.stopping import exits_explained, pass_on_signal
 from hpamdp.run_files import ERROR_NAME, saved_summary
 from hpamdp.shell import path_setting
@@ -219,13 +219,13 @@ def report(start: str, error: BaseException | None = None) -> int:
     _print_tally(jobs)
     for job in failed:
         folder = Path(job.folder)
-        told = folder / ERROR_NAME
-        warn(f"{job.overrides}: {job.reason} ({_shown(told if told.exists() else folder)})")
+        is_told = os.path.exists(folder / ERROR_NAME) and not has_foreign_error(folder)
+        warn(f"{job.overrides}: {job.reason} ({_shown(folder / ERROR_NAME if is_told else folder)})")
     if is_stopped or (error is not None and len(failed) < len(jobs)):
         if error is not None and not is_stopped:
-            write_error(sweep_dir, error)
+            told = sweep_dir / ERROR_NAME if write_error(sweep_dir, error) else sweep_dir
             reason = one_line("".join(traceback.format_exception_only(error)))
-            warn(f"The sweep broke off: {reason} ({_shown(sweep_dir / ERROR_NAME)})")
+            warn(f"The sweep broke off: {reason} ({_shown(told)})")
         say(f"To go on: the same command with {path_setting('hydra.sweep.dir', _shown(sweep_dir))}")
         return INTERRUPTED if is_stopped else FAILED
     if not failed:

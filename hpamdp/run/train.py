@@ -20,11 +20,10 @@ from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import CollectionError
 from hpamdp.run.compatibility import need_of_evaluations, settings_without_effect
 from hpamdp.run.continuation import rest_of
-from hpamdp.run.folder import check_no_training, check_unused
+from hpamdp.run.folder import check_no_training, check_unused, remove_error
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.stopping import ProgramExitError, exits_explained
 from hpamdp.run.trainer import DivergedError, Trainer
-from hpamdp.run_files import ERROR_NAME
 from hpamdp.shell import path_setting, program
 
 
@@ -95,7 +94,7 @@ def go_on(
     score, source = rest_of(config, output_dir, name)
     if score is not None:
         return score, False, 0
-    (output_dir / ERROR_NAME).unlink(missing_ok=True)
+    remove_error(output_dir)
     if source is not None:
         say(f"Going on from {source}")
     code = run(cfg, output_dir, overrides, source or start, config=config, may_overwrite=True, tell=tell)

@@ -25,8 +25,9 @@ from hpamdp.run import checkpoint
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, metrics_of, mistakes_explained, named, states_of
 from hpamdp.run.collection.base import Collection
-from hpamdp.run.folder import mark_unfinished, remove_run
+from hpamdp.run.folder import mark_unfinished, moved_aside
 from hpamdp.run.recorder import Recorder
+from hpamdp.run.state_checks import check_numbers
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
 from hpamdp.run.summary import KEPT_FRAMES, KEPT_SCORE
 from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME
@@ -119,20 +120,19 @@ class Trainer:
         try:
             self.recorder.set_state(saved.states["recorder"])
             self._restore_callbacks(saved.states["callbacks"])
-        except (ValueError, TypeError, KeyError) as error:
-            raise ConfigError(
-                f"{source}: does not fit this run ({type(error).__name__}: {first_line(error)})"
-            ) from error
+        except ValueError as error:
+            raise ConfigError(f"{source}: does not fit this run ({first_line(error)})") from error
         self._saved = saved
 
     def _restore_callbacks(self, states: Mapping[str, Any]) -> None:
         """Set the saved states of callbacks. A callback without a saved state begins as in a new run.
 
         Raises:
-            ValueError: a state is of another callback. It may raise other errors.
+            ValueError: a state is of another callback, or holds invalid numbers.
         """
         for name, callback in self.callbacks.items():
             if name in states:
+                check_numbers(name, states[name], self._states_of_callbacks[name])
                 callback.set_state(states[name])
         dropped = [name for name, state in states.items() if state and name not in self.callbacks]
         if dropped:
@@ -147,20 +147,24 @@ class Trainer:
             is_own: whether the folder holds the continued run. Otherwise an earlier run there is deleted.
 
         Raises:
-            ConfigError: the logger refuses its settings.
+            ConfigError: the logger refuses its settings; the folder stays as it was.
         """
         if self.output_dir is None:
             return
-        if not is_own:
-            self.output_dir.mkdir(parents=True, exist_ok=True)
-            remove_run(self.output_dir)
-        self.recorder.start()
-        with replacing(self.output_dir / CONFIG_NAME) as partial:
-            partial.write_text(self.config.to_yaml())
         if is_own:
+            self.recorder.start()
+            self._write_config(self.output_dir)
             mark_unfinished(self.output_dir)
-        else:
+            return
+        self.output_dir.mkdir(parents=True, exist_ok=True)
+        with moved_aside(self.output_dir):
+            self._write_config(self.output_dir)
+            self.recorder.start()
             self.recorder.metrics.keep_resumed()
+
+    def _write_config(self, folder: Path) -> None:
+        with replacing(folder / CONFIG_NAME) as partial:
+            partial.write_text(self.config.to_yaml())
 
     def stop(self, reason: str = "") -> None:
         """End training after the current batch. The run counts as finished.
@@ -389,7 +393,7 @@ class Trainer:
         if self.output_dir is None:
             return
         try:
-            self._states_of_callbacks = states_of(self.callbacks)
+            self._states_of_callbacks = states_of(self.callbacks, self._states_of_callbacks)
         finally:  # an error in a callback's code costs no training
             self._write_checkpoint(self.output_dir, collection)
 
