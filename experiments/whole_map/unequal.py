@@ -16,20 +16,15 @@ import numpy as np
 import torch
 import yaml
 from torch import Tensor
-from torchrl.data import Binary, TensorSpec
 
 import hpamdp
 from experiments.options import train_rooms
-from hpamdp import keys
 from hpamdp.env.batched_env import Action
 from hpamdp.env.boatdock import episode, harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.task import CONGRUENT, NOT_CHOSEN, BoatState
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
-from hpamdp.env.office import rules as office_rules
-from hpamdp.env.office.environment import OfficeEnv
-from hpamdp.env.office.options import GOALS, OfficeOptions
 from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.env.rooms.options import RoomsOptions
 from hpamdp.env.rooms.rules import RoomsState
@@ -65,36 +60,6 @@ class WeakBoatEnv(BoatDockEnv):
         return after, episode.reward_of(state, after, self.rules)
 
 
-class _PlantOptions(OfficeOptions):
-    def facts(self, title: str) -> ProblemFacts:
-        return ProblemFacts(title=title, option_names=(*GOALS, "plant"), has_choice=True)
-
-
-class PlantOfficeEnv(OfficeEnv):
-    """Office with a fourth goal that is always open, a plant: an agent that goes for it takes and delivers nothing."""
-
-    Options = _PlantOptions
-
-    def act(self, state: Any, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[Any, Tensor]:
-        """Return the states after one move and the rewards `[N]`."""
-        takes = action.option < len(GOALS)
-        after, reward = super().act(state, action._replace(option=action.option.clamp(max=2)), rng, is_idle)
-        kept = {name: torch.where(takes, getattr(after, name), getattr(state, name)) for name in ("coffee", "mail")}
-        outcome = torch.where(takes, after.outcome, office_rules.ON_THE_WAY)
-        reward = torch.where(takes, reward, reward.clamp(max=office_rules.STEP_REWARD))
-        return after._replace(**kept, outcome=outcome), reward
-
-    def masks(self) -> dict[str, Tensor]:
-        """Return which goals are open."""
-        is_open = office_rules.open_goals(self._state)
-        return {keys.OPTION_MASK: torch.cat([is_open, torch.ones_like(is_open[:, :1])], -1)}
-
-    def _knowledge_specs(self) -> dict[str, TensorSpec]:
-        num = len(GOALS) + 1
-        spec = Binary(num, shape=(self.num_envs, num), dtype=torch.bool, device=self.device)
-        return super()._knowledge_specs() | {keys.OPTION_MASK: spec}
-
-
 class _SlippersOptions(RoomsOptions):
     def facts(self, title: str) -> ProblemFacts:
         return ProblemFacts(title=title, option_names=("skates", "boots", "slippers"), has_choice=True)
@@ -112,10 +77,6 @@ class SlippersRoomsEnv(RoomsEnv):
 
 
 BOATS = {"high": "meta_critic", "low": "hyar", "recipe": "boatdock_hyar"}
-OFFICE = {
-    **{"high": "meta_critic", "low": "hppo", "recipe": "office_hppo", "env.tiles": 20, "env.chooses_goal": True},
-    **{"exploration": "counts", "exploration.resolution": 1, "exploration.weight": 25, "eval.layouts": 100},
-}
 ROOMS_WORDS = [*train_rooms.COMMON[1:], *train_rooms.SELECTORS["meta_critic"], *train_rooms.LEARNERS["hppo"]]
 ROOMS = {name: yaml.safe_load(value) for name, _, value in (word.partition("=") for word in ROOMS_WORDS)}
 ROOMS |= {"high": "meta_critic", "low": "hppo"}
@@ -125,8 +86,6 @@ CASES: dict[str, dict[str, Any]] = {
     "weak": {"env": WeakBoatEnv, **BOATS},
     "noisy": {"env": BoatDockEnv, **BOATS, "env.motor_noise": [0.6, 0.0]},
     "crippled": {"env": BoatDockEnv, **BOATS, **CRIPPLED},
-    "office": {"env": OfficeEnv, **OFFICE},
-    "plant": {"env": PlantOfficeEnv, **OFFICE},
     "rooms": {"env": RoomsEnv, **ROOMS},
     "rooms, curves": {"env": RoomsEnv, **ROOMS, "agent.practice": "curves"},
     "slippers": {"env": SlippersRoomsEnv, **ROOMS},
