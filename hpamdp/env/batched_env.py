@@ -250,9 +250,16 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _may_use_kernel(self) -> bool:
         """Return whether the tensors are on the CPU, and rules neither compiled nor replaced by a subclass."""
-        owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
-        are_its_own = all(getattr(type(self), name) is getattr(owner, name) for name in ("start", "act", "observe"))
-        return self._is_on_cpu and not self._is_compiled and are_its_own
+        return self._is_on_cpu and not self._is_compiled and not self._replaced_rules()
+
+    def _class_of_kernel(self) -> type:
+        """Return the class whose rules the kernel states."""
+        return next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
+
+    def _replaced_rules(self) -> list[str]:
+        """Return the names of the rules that a subclass of the kernel's class overrides."""
+        owner, rules = self._class_of_kernel(), ("start", "act", "observe")
+        return [name for name in rules if getattr(type(self), name) is not getattr(owner, name)]
 
     def leave_kernel(self) -> None:
         """Let the tensor functions move the environments from here on."""
@@ -755,11 +762,10 @@ class KernelEnv(BatchedEnv[EpisodeState]):
         raise NotImplementedError
 
     def _may_use_kernel(self) -> bool:
-        owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
-        other = [name for name in ("start", "act", "observe") if getattr(type(self), name) is not getattr(owner, name)]
-        if other:
-            name = type(self).__name__
-            raise TypeError(f"{name}: overrides {', '.join(other)}, but only the kernel of {owner.__name__} has rules")
+        replaced = self._replaced_rules()
+        if replaced:
+            name, owner = type(self).__name__, self._class_of_kernel().__name__
+            raise TypeError(f"{name}: overrides {', '.join(replaced)}, but only the kernel of {owner} has rules")
         return True
 
     def leave_kernel(self) -> None:
