@@ -47,16 +47,7 @@ class WeakBoatEnv(BoatDockEnv):
         strength = torch.where(held == CONGRUENT, 1.0 / 3.0, 1.0)
         position = (state.x, state.y, state.fuel, state.goal_x, state.goal_y)
         pressed = physics.press(*position, dir_x, dir_y, action.parameters.squeeze(-1), strength=strength)
-        after = state._replace(
-            x=pressed.x,
-            y=pressed.y,
-            velocity_x=pressed.speed * dir_x,
-            velocity_y=pressed.speed * dir_y,
-            fuel=pressed.fuel,
-            controller=held,
-            presses=state.presses + 1,
-            outcome=pressed.outcome,
-        )
+        after = episode.after_press(state, pressed, dir_x, dir_y, held)
         return after, episode.reward_of(state, after, self.rules)
 
 

@@ -108,7 +108,15 @@ def act(
         duration = duration.clamp(max=physics.MAX_DURATION)
     dir_x, dir_y = harbour.direction_of(rules, controller, state.keymap, key)
     pressed = physics.press(state.x, state.y, fuel, state.goal_x, state.goal_y, dir_x, dir_y, duration)
-    after = state._replace(
+    after = after_press(state, pressed, dir_x, dir_y, controller)
+    return after, reward_of(state, after, rules)
+
+
+def after_press(
+    state: BoatState, pressed: physics.Press, dir_x: Tensor, dir_y: Tensor, controller: Tensor
+) -> BoatState:
+    """Return the boats after a press in a unit direction, with the controllers that they have now, `[N]` each."""
+    return state._replace(
         x=pressed.x,
         y=pressed.y,
         velocity_x=pressed.speed * dir_x,
@@ -118,7 +126,6 @@ def act(
         presses=state.presses + 1,
         outcome=pressed.outcome,
     )
-    return after, reward_of(state, after, rules)
 
 
 def reward_of(before: BoatState, after: BoatState, rules: Rules) -> Tensor:
