@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -177,8 +178,8 @@ class _Objective:
 
         values = {name: _suggested(trial, name, each) for name, each in self.space.items()}
         report, seeds = _Report(trial), {"seed": self.seed + trial.number, "eval.seed": self.seed}
-        with TemporaryDirectory() as folder:
-            kept = {"folder": folder, "offline.eval_every": 0, "eval.layouts": 1} if self.by == "data" else {}
+        with TemporaryDirectory() if self.by == "data" else nullcontext() as folder:
+            kept = {} if folder is None else {"folder": folder, "offline.eval_every": 0, "eval.layouts": 1}
             try:
                 train(self.env, callbacks=[report], progress=False, **{**seeds, **kept, **self.fixed, **values})
             except (ConfigError, DivergedError) as error:
@@ -190,7 +191,7 @@ class _Objective:
                 raise TrialPruned
             if not report.is_over or report.score is None:
                 raise KeyboardInterrupt
-            if self.by == "score":
+            if folder is None:
                 return report.score
             (row,) = judge(folder, **{name: each for name, each in self.fixed.items() if name.split(".")[0] == "data"})
             return float(row["return"])
