@@ -5,7 +5,7 @@ import torch
 from conftest import global_generators_unmoved
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from toy_bandits import CPU, SPECS, by_sign, due, ended, play
+from toy_bandits import CPU, SPECS, against_sign, by_sign, due, ended, play
 
 from hpamdp import keys
 from hpamdp.policies.high_level.actor import LOG_PROB, WEIGHT, Actor
@@ -68,6 +68,13 @@ def test_meta_critic_learns_from_options_that_others_chose():
         root = due(torch.rand(50, 2) * 2 - 1, option=torch.randint(2, (50,)))
         means = by_sign(root[keys.OBSERVATION]).gather(-1, root[keys.OPTION].unsqueeze(-1)).squeeze(-1)
         critic.learn(ended(root, means + 0.5 * torch.randn(50)))
+    assert greedy_regret(critic) < 0.2
+
+
+def test_meta_critic_does_not_learn_from_returns_that_are_out_of_date():
+    critic = make(MetaCritic, buffer_size=10_000)
+    play(critic, against_sign, 3000, 30, noise=0.5)
+    play(critic, by_sign, 3000, 30, noise=0.5)
     assert greedy_regret(critic) < 0.2
 
 

@@ -19,24 +19,27 @@ from hpamdp.specs import PAMDPSpecs
 TOTAL = 3000
 
 
-def practised(time_constants: list[float], plateaus: list[float], chosen: int) -> np.ndarray:
-    """Return the part of the decisions that each option gets if the selector always chooses one of them.
+def practised(
+    time_constants: list[float], plateaus: list[float], chosen: int, lengths: tuple[int, ...] = (1, 1, 1)
+) -> np.ndarray:
+    """Return the part of the steps that each option gets if the selector always chooses one of them.
 
-    An option's return rises from -1 to its plateau with its own practice.
+    An option's return rises from -1 to its plateau with its own practice. Its decisions have the same length.
     """
     rng = np.random.default_rng(0)
     tau, plateau = np.array(time_constants), np.array(plateaus)
     practice = CurvePractice(len(tau), TOTAL)
     own = np.zeros(len(tau))
-    for done in range(0, TOTAL, 20):
-        p = practice.probabilities(done).double().numpy()
+    while own.sum() < TOTAL:
+        p = practice.probabilities(int(own.sum())).double().numpy()
         left = np.eye(len(tau))[chosen] * (1.0 - p.sum())
         option = rng.choice(len(tau), 20, p=(p + left) / (p + left).sum())
         value = -1.0 + (plateau + 1.0) * (1.0 - np.exp(-own / tau))
         returns = value[option] + rng.normal(0.0, 0.8, 20)
-        practice.add(torch.tensor(option), torch.tensor(option), torch.tensor(returns))
-        own += np.bincount(option, minlength=len(tau))
-    return own / TOTAL
+        of_step = option.repeat(np.array(lengths)[option])
+        practice.add(torch.tensor(of_step), torch.tensor(option), torch.tensor(returns))
+        own += np.bincount(of_step, minlength=len(tau))
+    return own / own.sum()
 
 
 def test_an_option_that_improves_slowly_practises_most_though_the_selector_prefers_another_one():
@@ -49,6 +52,10 @@ def test_options_that_have_stopped_improving_leave_the_second_half_to_the_select
 
 def test_a_fruitless_option_practises_little():
     assert practised([100.0, 100.0, 100.0], [3.3, 3.3, -1.0], chosen=0)[2] < 0.1
+
+
+def test_options_practise_for_equally_many_steps_though_the_decisions_of_one_are_longer():
+    assert practised([50.0, 50.0], [3.3, 3.3], chosen=0, lengths=(1, 5))[1] == pytest.approx(0.27, abs=0.04)
 
 
 def test_an_option_that_nobody_may_choose_does_not_keep_the_selector_waiting():

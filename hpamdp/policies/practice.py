@@ -6,8 +6,8 @@ first, and the others never practise enough to show what they can do. So another
 - A curve is fitted to the returns of each option over its own practice.
 - Of the options behind the best one, the one that would gain most from the practice that is left practises, if it would
   gain more than the best one does: the more it would gain, the more often.
-- Otherwise, in the first half of the run all options practise equally, except those whose curve stays out of reach of
-  the best one. In the second half the selector chooses, so that learners practise where they will be used.
+- Otherwise, in the first half of the run all options practise for equally many steps, except those whose curve stays out
+  of reach of the best one. In the second half the selector chooses, so that learners practise where they will be used.
 
 Sources: Heidari, Kearns and Roth 2016, *Tight Policy Regret Bounds for Improving and Decaying Bandits*, and Metelli,
 Trovo, Pirola and Restelli 2022, *Stochastic Rising Bandits*: options whose reward rises with their own pulls, compared
@@ -34,13 +34,15 @@ NUM_BINS = 100
 FIRST_BINS = 4
 """Bins that every option fills first, before any curve is fitted."""
 UNIFORM_UNTIL = 0.5
-"""Fraction of the run in which all options that could become the best one practise equally."""
+"""Fraction of the run in which all options that could become the best one practise for equally many steps."""
 ALWAYS_UNIFORM = 0.05
-"""Fraction of the decisions that are uniform practice throughout. They find options that begin to improve late."""
+"""Fraction of the decisions that are equal practice throughout. They find options that begin to improve late."""
 CLEAR_ADVANTAGE = 0.4
 """Difference of gains, in standard deviations of a return, from which the option behind gets all decisions."""
-OUT_OF_REACH = 3.0
+OUT_OF_REACH = 2.0
 """Distance to the best option, in standard deviations of a return, from which an option need not practise."""
+RECENT_BINS = 10
+"""Bins of an option's own practice that tell how long its decisions are now."""
 
 
 class Practice(nn.Module):
@@ -134,10 +136,11 @@ class CurvePractice(Practice):
         gains_most = gain == gain.max()
         advantage = ((gain.max() - gain[level.argmax()]) / (CLEAR_ADVANTAGE * deviation)).clamp(max=1.0)
         probability = advantage * gains_most / gains_most.sum()
+        equal_steps = 1.0 / self._decision_steps()
         if is_first_half:
             is_in_reach |= ~self.counts.any(-1)  # its first episode still goes on
-            probability += (1.0 - advantage) * is_in_reach / is_in_reach.sum()
-        return (ALWAYS_UNIFORM / len(level) + (1.0 - ALWAYS_UNIFORM) * probability).float()
+            probability += (1.0 - advantage) * is_in_reach * equal_steps / (is_in_reach * equal_steps).sum()
+        return (ALWAYS_UNIFORM * equal_steps / equal_steps.sum() + (1.0 - ALWAYS_UNIFORM) * probability).float()
 
     def curves(self, steps: int) -> tuple[Tensor, Tensor]:
         """Return each option's return now, and its gain from so many more steps of practice, `[num_options]` each.
@@ -166,6 +169,13 @@ class CurvePractice(Practice):
     def _bin(self) -> Tensor:
         """Return the bin `[num_options]` that each option's next return belongs to."""
         return (self.own_steps / self.width).long().clamp(max=NUM_BINS - 1)
+
+    def _decision_steps(self) -> Tensor:
+        """Return the mean length `[num_options]` of each option's recent decisions in steps, at least 1."""
+        first = (self._bin() - RECENT_BINS).clamp(min=0)
+        is_recent = torch.arange(NUM_BINS, device=first.device) >= first.unsqueeze(-1)
+        decisions = (self.counts * is_recent).sum(-1)
+        return ((self.own_steps - first * self.width) / decisions.clamp(min=1.0)).clamp(min=1.0)
 
     def _noise(self) -> Tensor:
         """Return the variance of the returns within a bin, a scalar; at least a thousandth of that of all returns."""

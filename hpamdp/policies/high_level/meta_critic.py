@@ -152,9 +152,15 @@ class MetaCritic(RemembersDecisions):
     def _sample(self) -> TensorDictBase:
         size = self.options.batch_size
         if self.links is None:
-            return unpacked_states(self.buffer.sample(size), self.specs)
+            return unpacked_states(self.buffer[self._later_half(size)], self.specs)
         num_past = self.options.burn_in + self.options.sequence_length
         return unpacked_states(sample_with_past(self.buffer, size, num_past), self.specs)
+
+    def _later_half(self, num: int) -> Tensor:
+        """Return the places `[num]` of random decisions, but none of the first half: their returns are out of date."""
+        num_written = self.buffer.write_count
+        age = torch.randint(min(len(self.buffer), num_written - int(self.num_decisions) // 2), (num,))
+        return (num_written - 1 - age) % self.options.buffer_size
 
     def rows(self, decisions: TensorDictBase) -> TensorDict:
         """Return what is stored of decisions `[*B]`."""
