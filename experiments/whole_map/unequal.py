@@ -71,7 +71,7 @@ BOATS = {"high": "meta_critic", "low": "hyar", "recipe": "boatdock_hyar"}
 ROOMS_WORDS = [*train_rooms.COMMON[1:], *train_rooms.SELECTORS["meta_critic"], *train_rooms.LEARNERS["hppo"]]
 ROOMS = {name: yaml.safe_load(value) for name, _, value in (word.partition("=") for word in ROOMS_WORDS)}
 ROOMS |= {"high": "meta_critic", "low": "hppo"}
-CRIPPLED = {"env.boats": ["incongruent1", "congruent", "crippled"], "env.controllers": {"crippled": [0.0, 5.0, 10.0]}}
+CRIPPLED = {"env.boats": ["incongruent1", "congruent", "crippled"], "+env.controllers": {"crippled": [0.0, 5.0, 10.0]}}
 CASES: dict[str, dict[str, Any]] = {
     "boats": {"env": BoatDockEnv, **BOATS},
     "weak": {"env": WeakBoatEnv, **BOATS},
