@@ -7,6 +7,8 @@ from typing import Any
 
 # Settings that files of 0.3 have by another name. H-PPO still has an `lr_final`, which is a rate.
 _NEW_NAMES = {"agent.uniform_option_steps": "practice", "low.lr_final": "lr_final_fraction"}
+# Settings that some classes have no longer; they changed no result but its rounding.
+_GONE = ("env.compile_rules",)
 # Names of settings in Stable-Baselines3, CleanRL and Spinning Up, and ours.
 _ELSEWHERE: dict[str, tuple[str, ...]] = {
     "learning_rate": ("lr", "actor_lr", "critic_lr"),
@@ -84,5 +86,6 @@ def no_member(owner: object, name: str) -> AttributeError:
 
 def with_new_names(group: str, settings: Mapping[str, Any], known: Collection[str]) -> dict[str, Any]:
     """Return the settings of a group of a saved run under today's names, which are known."""
+    settings = {name: value for name, value in settings.items() if name in known or f"{group}.{name}" not in _GONE}
     new = {name: _NEW_NAMES.get(f"{group}.{name}", name) for name in settings if name not in known}
     return {new.get(name, name): value for name, value in settings.items()}

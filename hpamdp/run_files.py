@@ -109,10 +109,11 @@ def listed_figures(folder: Path) -> list[str]:
 def flat_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of a saved config by their dotted names, except those that change no result."""
     flat = _flat(config)
+    left_out = {f"env.{name}" for name in ENV_WITHOUT_INFLUENCE}
     return {
         name: value
         for name, value in flat.items()
-        if name.removeprefix("choices.").partition(".")[0] not in _BOOKKEEPING
+        if name.removeprefix("choices.").partition(".")[0] not in _BOOKKEEPING and name not in left_out
     }
 
 

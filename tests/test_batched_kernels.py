@@ -1,4 +1,4 @@
-"""The kernels of the field's domains against their rules, the tensor functions, which are the truth."""
+"""The kernels of the field's domains against their published rules as tensor functions."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
+from tensor_rules import with_tensor_rules
 
 from hpamdp import keys
 from hpamdp.env import counter_rng, kernels
@@ -55,33 +56,25 @@ PROBLEMS = {
     "sliding": (SlidingEnv, {"max_steps": st.sampled_from([3, 201])}, 1e-4),
 }
 
-KERNEL_ALONE = [
-    PlatformEnv,
-    OfficeEnv,
-    PinballEnv,
-    CircuitEnv,
-]  # their own tests compare these with rules in other forms
 
-
-def play(env, num_steps: int, tolerance: float) -> tuple[set[int], int]:
+def play(env, ruled, num_steps: int, tolerance: float) -> tuple[set[int], int]:
     """Compare steps and resets with the rules; return the outcomes met and how many rows differ by more than rounding.
 
     A row may differ where a threshold is met to within rounding, as when two bodies just touch.
     """
-    assert env.rows is not None
     td = env.reset()
     outcomes, num_different = set(), 0
     for _ in range(num_steps):
         td = env.rand_action(td)
         before = env.state
-        moved, reward, _ = env.advance(before, *env.action_leaves(td), before.outcome != 0)
-        fresh = env.restart(moved, moved.outcome != 0)
+        moved, reward, _ = ruled.advance(before, *env.action_leaves(td), before.outcome != 0)
+        fresh = ruled.restart(moved, moved.outcome != 0)
         td, root = env.step_and_maybe_reset(td)
         pairs = [
             *zip(env.state, fresh, strict=True),
             (td["next", keys.REWARD], reward.unsqueeze(-1)),
-            (td["next", "observation"], env.observe(moved)),
-            (root["observation"], env.observe(fresh)),
+            (td["next", "observation"], ruled.observe(moved)),
+            (root["observation"], ruled.observe(fresh)),
             (td["next", keys.OUTCOME], moved.outcome),
             (td["next", keys.TRUNCATED], (moved.outcome == len(env.outcomes) - 1).unsqueeze(-1)),
             (td["next", keys.DONE], (moved.outcome != 0).unsqueeze(-1)),
@@ -105,9 +98,11 @@ def play(env, num_steps: int, tolerance: float) -> tuple[set[int], int]:
 def test_a_kernel_does_what_the_rules_say_with_all_settings(name, data, seed, is_evaluation):
     problem, choices, tolerance = PROBLEMS[name]
     env = problem(200, seed=seed, first_env=5, **data.draw(st.fixed_dictionaries(choices)))
+    ruled = with_tensor_rules(env, seed)
     if is_evaluation:
         env.seed_evaluation(seed)
-    assert play(env, 2 if name == "goal" else 4, tolerance)[1] <= 3
+        ruled.seed_evaluation(seed)
+    assert play(env, ruled, 2 if name == "goal" else 4, tolerance)[1] <= 3
 
 
 @pytest.mark.parametrize(
@@ -115,7 +110,8 @@ def test_a_kernel_does_what_the_rules_say_with_all_settings(name, data, seed, is
 )
 def test_the_comparison_meets_every_outcome_but_the_rarest(name):
     problem, _, tolerance = PROBLEMS[name]
-    outcomes, num_different = play(problem(2000, seed=1, max_steps=4), 5 if name == "goal" else 12, tolerance)
+    env = problem(2000, seed=1, max_steps=4)
+    outcomes, num_different = play(env, with_tensor_rules(env, 1), 5 if name == "goal" else 12, tolerance)
     assert len(outcomes) >= len(problem.outcomes) - 1
     assert num_different <= 12
 
@@ -124,7 +120,8 @@ def test_the_comparison_meets_every_outcome_but_the_rarest(name):
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_a_million_random_steps_agree(name):
     problem, _, tolerance = PROBLEMS[name]
-    assert play(problem(50_000, seed=2), 20, tolerance)[1] <= 500
+    env = problem(50_000, seed=2)
+    assert play(env, with_tensor_rules(env, 2), 20, tolerance)[1] <= 500
 
 
 @pytest.mark.parametrize("problem", [GoalEnv, PinballEnv, OfficeEnv, BoatDockEnv])
@@ -164,7 +161,7 @@ def test_a_row_is_the_same_to_the_bit_in_every_batch(problem):
                     assert torch.equal(own, column[row : row + 1])
 
 
-@pytest.mark.parametrize("problem", KERNEL_ALONE)
+@pytest.mark.parametrize("problem", [PlatformEnv, OfficeEnv, PinballEnv, CircuitEnv, GoalEnv, MovingEnv, CatchPointEnv])
 def test_a_kernel_alone_serves_tensors_on_another_device(problem):
     here, there = (problem(5, seed=3, max_steps=4) for _ in range(2))
     there._is_on_cpu = False  # so that all tensors are moved, here from the CPU to it
@@ -182,7 +179,7 @@ def test_a_kernel_alone_serves_tensors_on_another_device(problem):
 
 
 def test_a_subclass_with_rules_of_its_own_has_no_kernel():
-    class Level(GoalEnv):
+    class Level(BoatDockEnv):
         def observe(self, state):
             return torch.zeros_like(super().observe(state))
 

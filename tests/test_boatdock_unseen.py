@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from scripts import load_script
 from tensordict import TensorDict
 
 import hpamdp
@@ -272,9 +274,8 @@ def test_the_ceiling_is_the_best_plans_mean_score_and_two_boats_raise_it():
 )
 def test_the_kernel_does_what_the_tensor_functions_do(settings, is_evaluation):
     settings = {"seed": 3, "sensor_noise": 2.0, "motor_noise": 0.1, **settings}
-    kernel, tensors = (UnseenBoatsEnv(64, first_env=5, **settings) for _ in range(2))
-    tensors.leave_kernel()
-    assert kernel.rows is not None and tensors.rows is None
+    study = load_script(Path(__file__).resolve().parent.parent / "experiments" / "generalisation" / "session_rules.py")
+    kernel, tensors = (env(64, first_env=5, **settings) for env in (UnseenBoatsEnv, study.TensorSessions))
     if is_evaluation:
         kernel.seed_evaluation(7), tensors.seed_evaluation(7)
     ours, theirs = kernel.reset(), tensors.reset()

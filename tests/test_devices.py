@@ -23,12 +23,8 @@ from toy_steps import SPECS, sample
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.batched_env import Action
 from hpamdp.env.boatdock import episode
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.catch_point.environment import CatchPointEnv
-from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
-from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.policies.low_level.hyar import LATENT
 from hpamdp.policies.low_level.paddpg import SCORES
 from hpamdp.policies.shared.gradients import gradients_of
@@ -112,20 +108,6 @@ def test_losses_and_their_gradients_stay_on_their_device(name):
         with Answers():
             _, gradients = gradients_of(loss_of, list(getattr(learner, part).parameters()), *inputs)
         assert {gradient.device for gradient in gradients if gradient is not None} == {META}
-
-
-@pytest.mark.parametrize("problem", [CatchPointEnv, HardMoveEnv, MovingEnv, SlidingEnv])
-def test_rules_stay_on_their_device(problem):
-    # Not those of Goal, whose ticks go on for as long as a tensor says so.
-    env = problem(4)
-    if problem is HardMoveEnv:
-        env.motions = env.motions.to(META)
-    number = torch.zeros(4, dtype=torch.int32, device=META)
-    rng = counter_rng.rng_key(counter_rng.seed_tensor(0, META), counter_rng.TRAINING, number, number)
-    state = env.start(number, rng)
-    parameters = torch.zeros(4, max(env.parameter_dims), device=META)
-    after, reward = env.act(state, Action(number.long(), parameters, None), rng, number.bool())
-    assert {column.device for column in (*state, *after, reward, env.observe(after))} == {META}
 
 
 def test_the_boats_rules_stay_on_their_device():

@@ -344,6 +344,7 @@ def test_the_same_command_after_a_requeue_goes_on_with_its_run(tmp_path, command
         ({"kwargs": {"a": 1, "b": 2}}, {"kwargs": {"b": 2, "a": 1.0}}, []),
         ({"kwargs": {"a": [math.nan]}}, {"kwargs": {"a": [math.nan]}}, []),
         ({"id": "Toy-v0", "new": None, "kwargs": {}}, {"id": "Toy-v0"}, []),
+        ({"noise": 1.0}, {"noise": 1.0, "compile_rules": True}, []),
     ],
 )
 def test_other_values_of_an_environments_own_arguments_make_another_run(env, saved, names):

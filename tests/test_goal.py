@@ -9,6 +9,7 @@ import torch
 from batched_players import action, agrees, is_unchanged, play, random_player, snapshot
 from conftest import make_config
 from goal_players import act, place, trained_player
+from tensor_rules import goal
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
@@ -89,7 +90,7 @@ def test_a_goal_pays_fifty_and_every_other_end_costs_the_balls_distance():
     reading = act(env, [1, 1, 1], [[0.0], [0.0], [0.0]])
     assert reading[keys.OUTCOME].tolist() == [rules.GOAL, rules.CAUGHT, rules.OUT]
     state = env.state
-    costs = (-rules.goal_distance(state)).tolist()
+    costs = (-goal.goal_distance(state)).tolist()
     assert reading[keys.REWARD].squeeze(-1).tolist() == [50.0, costs[1], costs[2]]
     assert reading[keys.TERMINATED].all() and not reading[keys.TRUNCATED].any()
     results = env.results(reading.select(*env.result_keys))
@@ -109,7 +110,7 @@ def test_the_last_action_is_not_played_and_truncates():
     assert reading[keys.OUTCOME].tolist()[1] == rules.TIME_LIMIT
     assert all(torch.equal(env.env_state()[name][1], before[name][1]) for name in rules.COLUMNS)
     assert (env.state.ball_x != before["ball_x"]).tolist() == [True, False]
-    assert reading[keys.REWARD][1].item() == -rules.goal_distance(env.state)[1].item()
+    assert reading[keys.REWARD][1].item() == -goal.goal_distance(env.state)[1].item()
     # After it, the episode stays as it is and earns nothing.
     over = snapshot(env)
     reading = act(env, [1, 1], [[0.0], [0.0]])
@@ -130,7 +131,7 @@ def test_numbers_of_an_episode_are_never_drawn_twice():
     one = torch.tensor([12345], dtype=torch.int32)
     rng = counter_rng.rng_key(one[0], counter_rng.NOISE, one, one)
     ticks = torch.arange(400, dtype=torch.int32)
-    drawn = [rules.random_numbers(rng, torch.tensor([steps], dtype=torch.int32), ticks) for steps in range(100)]
+    drawn = [goal.random_numbers(rng, torch.tensor([steps], dtype=torch.int32), ticks) for steps in range(100)]
     numbers = torch.stack(drawn).flatten()
     assert numbers.unique().numel() > 0.985 * numbers.numel()  # of 2^23 values, 240,000 rarely meet by chance
     assert numbers.abs().max() < 1.0
@@ -167,13 +168,3 @@ def test_repairs_change_what_is_done_and_seen():
     kicks = [act(env, [0] * 200, [[-0.5, -0.5]] * 200)[keys.OBSERVATION] for env in (plain, repaired)]
     ball_y = rules.OBSERVATION_NAMES.index("ball_y")
     assert (kicks[0][:, ball_y] > kicks[1][:, ball_y]).float().mean() > 0.9
-
-
-@pytest.mark.slow
-def test_compiled_ticks_play_the_same_episodes():
-    envs = [GoalEnv(64, compile_rules=compiled, noise=0.0) for compiled in (False, True)]
-    readings = []
-    for env in envs:
-        env.reset()
-        readings.append(act(env, [0] * 64, [[4.0, 0.0]] * 64))
-    torch.testing.assert_close(readings[0][keys.OBSERVATION], readings[1][keys.OBSERVATION], rtol=1e-3, atol=1e-3)

@@ -370,7 +370,7 @@ def drawn(vectors: torch.Tensor, **settings) -> torch.Tensor:
 
 
 def test_the_picture_is_drawn_from_the_vector_of_the_same_state():
-    for settings in ({}, {"progress": True}, {"compile_rules": False, "max_steps": 40}):
+    for settings in ({}, {"progress": True}, {"catches": 3, "max_steps": 40}):
         vector, seen = (CatchPointEnv(16, seed=3, observation=kind, **settings) for kind in ("vector", "picture"))
         a, b = vector.reset(), seen.reset()
         torch.manual_seed(0)

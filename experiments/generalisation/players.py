@@ -31,7 +31,7 @@ def trip_scores(env: UnseenBoatsEnv) -> Tensor:
     options = env.options
     player = Explorer(
         env.num_envs,
-        env.rules.fleet,
+        env.options.fleet,
         num_boats=options.boats,
         trips=options.trips,
         shortest_press=options.shortest_press,

@@ -1,11 +1,10 @@
 """Kernels: loops over the rows of a batch that Numba compiles for one core of the CPU.
 
-The rules of most problems are tensor functions, which run on CPU and CUDA, compile and differentiate. Without
-compilation each operation reads and writes whole columns, and takes microseconds even for one row.
+Each tensor operation reads and writes whole columns, and takes microseconds even for one row. A kernel states the rules
+for one row, and takes each row through a whole step. So it is fast with one environment and with a million.
 
-A kernel states the same rules for one row, and takes each row through a whole step. So it is fast with one environment
-and with a million. A test compares each kernel with its tensor functions. Platform, Office, Pinball and circuits have
-their kernels alone (`KernelEnv`).
+Most problems have their kernels alone (`KernelEnv`). Some also have tensor functions, which run on CPU and CUDA,
+compile and differentiate. A test compares the two.
 
 Random numbers equal those of `counter_rng` bit for bit. Numba caches the machine code on disk, so only the first run on
 a machine compiles.

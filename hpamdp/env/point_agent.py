@@ -1,4 +1,4 @@
-"""A point agent in the plane and a fixed target: the rules that Catch Point and Hard Move share.
+"""A point agent in the plane and a fixed target: what Catch Point and Hard Move share. `point_kernel` has its rules.
 
 Source: the code of Li et al. 2022 (HyAR), arXiv:2109.05490.
 """
@@ -7,11 +7,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import torch
 from torch import Tensor
-
-from hpamdp.env import counter_rng
-from hpamdp.env.counter_rng import RngKey
 
 OBSERVATION_NAMES = ("vx", "vy", "target_dx", "target_dy")
 VECTORS = ((0, 1), (2, 3))  # places of (x, y) pairs in the observation
@@ -57,29 +53,6 @@ class PointState(Located, Protocol):
     @property
     def target_y(self) -> Tensor:
         """The targets' y."""
-
-
-def start(rng: RngKey) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return x and y of the agent and of the target, uniform in (-1, 1), `[N]` each."""
-    x, y, target_x, target_y = (2.0 * counter_rng.uniform(rng, index) - 1.0 for index in range(4))
-    return x, y, target_x, target_y
-
-
-def move(state: PointState, force_x: Tensor, force_y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return x, y, vx and vy after one step under a force, `[N]` each."""
-    vx = _DRAG * state.vx + _GAIN * force_x
-    vy = _DRAG * state.vy + _GAIN * force_y
-    return state.x + _TICK * vx, state.y + _TICK * vy, vx, vy
-
-
-def squared_distance(state: PointState, x: Tensor, y: Tensor) -> Tensor:
-    """Return the squared distance `[N]` between the target and an agent at (x, y)."""
-    return (state.target_x - x).square() + (state.target_y - y).square()
-
-
-def observe(state: PointState) -> Tensor:
-    """Return the observation `[N, 4]` with the entries OBSERVATION_NAMES."""
-    return torch.stack([state.vx, state.vy, state.target_x - state.x, state.target_y - state.y], -1)
 
 
 def observation_bounds(max_steps: int) -> tuple[list[float], list[float]]:

@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from hpamdp.env import point_pictures
-from hpamdp.env.batched_env import BatchedEnv, EpisodeColumns
+from hpamdp.env.batched_env import EpisodeColumns, KernelEnv
 from hpamdp.env.canvas import FAINT, PAPER
 from hpamdp.env.point_agent import Located
 
@@ -30,7 +30,7 @@ class PointColumns(EpisodeColumns, Located, Protocol):
 PointEpisode = TypeVar("PointEpisode", bound=PointColumns)
 
 
-class PointEnv(BatchedEnv[PointEpisode], Generic[PointEpisode]):
+class PointEnv(KernelEnv[PointEpisode], Generic[PointEpisode]):
     """A batch of environments in which a point must reach a target.
 
     For the constructor's arguments and errors see `BatchedEnv`.

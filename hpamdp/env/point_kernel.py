@@ -19,7 +19,7 @@ HIT_REWARD = _F(point_agent.HIT_REWARD)
 
 @inlined
 def start(floats: Any, row: Any, bits: Any, step: Any) -> None:
-    """Place agent and target uniformly in the square, as `point_agent.start` does."""
+    """Place agent and target uniformly in the square."""
     floats[X, row] = TWO * uniform(bits, step, 0) - ONE
     floats[Y, row] = TWO * uniform(bits, step, 1) - ONE
     floats[TARGET_X, row] = TWO * uniform(bits, step, 2) - ONE
@@ -29,7 +29,7 @@ def start(floats: Any, row: Any, bits: Any, step: Any) -> None:
 
 @inlined
 def move(floats: Any, row: Any, force_x: Any, force_y: Any) -> Any:
-    """Move by one step, as `point_agent.move` does, and return the squared distance from the target."""
+    """Move by one step, and return the squared distance from the target."""
     vx, vy = _DRAG * floats[VX, row] + _GAIN * force_x, _DRAG * floats[VY, row] + _GAIN * force_y
     x, y = floats[X, row] + _TICK * vx, floats[Y, row] + _TICK * vy
     floats[X, row], floats[Y, row], floats[VX, row], floats[VY, row] = x, y, vx, vy
@@ -38,7 +38,7 @@ def move(floats: Any, row: Any, force_x: Any, force_y: Any) -> Any:
 
 @inlined
 def observe(floats: Any, row: Any, observation: Any) -> None:
-    """Write the first four entries of the observation, as `point_agent.observe` does."""
+    """Write the first four entries of the observation."""
     observation[0], observation[1] = floats[VX, row], floats[VY, row]
     observation[2] = floats[TARGET_X, row] - floats[X, row]
     observation[3] = floats[TARGET_Y, row] - floats[Y, row]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from published_rules import catch_point
 from torch import Tensor
 
 from adapters import DirectAdapter, chosen, limited
@@ -29,8 +30,10 @@ class DomainAdapter(DirectAdapter):
         self, state: rules.CatchPointState, steps: Sequence[dict[str, Any]]
     ) -> tuple[rules.CatchPointState, dict[str, Tensor]]:
         discrete, parameters = chosen(steps, state.x)
-        after, reward = rules.act(state, discrete, parameters.squeeze(-1), catches=PUBLISHED_CATCHES, late_end=True)
+        after, reward = catch_point.act(
+            state, discrete, parameters.squeeze(-1), catches=PUBLISHED_CATCHES, late_end=True
+        )
         return limited(after, 25, rules.TIME_LIMIT), {"reward": reward}
 
     def observe(self, state: rules.CatchPointState) -> Tensor:
-        return rules.observe(state, progress=False)
+        return catch_point.observe(state, progress=False)

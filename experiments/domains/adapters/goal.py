@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from published_rules import goal
 from torch import Tensor
 
 from adapters import DirectAdapter, chosen
@@ -26,7 +27,7 @@ class DomainAdapter(DirectAdapter):
 
     def __init__(self, recording: dict[str, Any]) -> None:
         super().__init__(recording)
-        self._aim = rules.hard_goal_aim if recording["domain"] == "hard_goal" else rules.goal_aim
+        self._aim = goal.hard_goal_aim if recording["domain"] == "hard_goal" else goal.goal_aim
 
     def act(self, state: rules.GoalState, steps: Sequence[dict[str, Any]]) -> tuple[rules.GoalState, dict[str, Tensor]]:
         discrete, parameters = chosen(steps, state.ball_x, 2)
@@ -40,9 +41,9 @@ class DomainAdapter(DirectAdapter):
             return drawn[ticks.long()][:, :, rows]
 
         moves = torch.ones(len(steps), dtype=torch.bool)
-        after, ticks = rules.act(state, self._aim(discrete, parameters), moves, numbers)
-        return after, {"reward": rules.reward(state, after), "ticks": ticks}
+        after, ticks = goal.act(state, self._aim(discrete, parameters), moves, numbers)
+        return after, {"reward": goal.reward(state, after), "ticks": ticks}
 
     def observe(self, state: rules.GoalState) -> Tensor:
         """Return the observations as they are recorded, not scaled."""
-        return rules.observe(state, is_scaled=False)
+        return goal.observe(state, is_scaled=False)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from published_rules import gym_hybrid
 from torch import Tensor
 
 from adapters import DirectAdapter, chosen
@@ -39,8 +40,8 @@ class DomainAdapter(DirectAdapter):
         parameter = parameters.squeeze(-1)
         low, high = (torch.tensor([*side, 0.0]).to(parameter) for side in (rules.PARAMETER_LOW, rules.PARAMETER_HIGH))
         parameter = parameter.clamp(low[discrete], high[discrete])
-        after, reward = rules.act(state, discrete, parameter, slides=self.slides, max_steps=PUBLISHED_STEPS)
+        after, reward = gym_hybrid.act(state, discrete, parameter, slides=self.slides, max_steps=PUBLISHED_STEPS)
         return after, {"reward": reward}
 
     def observe(self, state: rules.VehicleState) -> Tensor:
-        return rules.observe(state, PUBLISHED_STEPS)
+        return gym_hybrid.observe(state, PUBLISHED_STEPS)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from published_rules import hard_move, points
 from torch import Tensor
 
 from adapters import DirectAdapter, chosen, limited
@@ -35,8 +36,8 @@ class DomainAdapter(DirectAdapter):
         self, state: rules.HardMoveState, steps: Sequence[dict[str, Any]]
     ) -> tuple[rules.HardMoveState, dict[str, Tensor]]:
         discrete, parameters = chosen(steps, state.x)
-        after, reward = rules.act(state, discrete, parameters.squeeze(-1), self.motions.to(state.x.dtype))
+        after, reward = hard_move.act(state, discrete, parameters.squeeze(-1), self.motions.to(state.x.dtype))
         return limited(after, 30, rules.TIME_LIMIT), {"reward": reward}
 
     def observe(self, state: rules.HardMoveState) -> Tensor:
-        return rules.observe(state)
+        return points.observe(state)

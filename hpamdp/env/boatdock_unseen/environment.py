@@ -19,13 +19,13 @@ from torchrl.data import Binary, Bounded, TensorSpec, Unbounded
 from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.base import Metric
-from hpamdp.env.batched_env import Action, BatchedEnv, StateArrays
+from hpamdp.env.batched_env import KernelEnv, StateArrays
 from hpamdp.env.boatdock import harbour, task
 from hpamdp.env.boatdock_unseen import fleet, kernel, planner, rules
 from hpamdp.env.boatdock_unseen.options import CARDS, FAMILIES, UnseenBoatsOptions
-from hpamdp.env.boatdock_unseen.rules import SessionRules, SessionState
+from hpamdp.env.boatdock_unseen.rules import SessionState
 from hpamdp.env.counter_rng import RngKey
-from hpamdp.env.rng_streams import EVALUATION, TRAINING, folded
+from hpamdp.env.rng_streams import folded
 from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry, RevealedDirections
 
@@ -36,7 +36,7 @@ SESSION_SCORE, SESSION_SUCCESS = "session_score", "session_success"  # entries o
 _FIRST_TRIPS = 2  # whose scores have metrics of their own
 
 
-class UnseenBoatsEnv(BatchedEnv[SessionState]):
+class UnseenBoatsEnv(KernelEnv[SessionState]):
     """Dock unknown boats in `num_envs` harbours at once.
 
     An episode is a session of `trips` trips. Each trip is an episode of the boats' task, with a layout and a tank of
@@ -68,6 +68,8 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
     result_keys = (keys.OUTCOME, SESSION_SCORE, SESSION_SUCCESS)
     action_names = ("key", "durations")
     row_kernel = staticmethod(kernel.advance)
+    state_type = SessionState
+    num_columns = (16, 12)
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score of a trip"),
         Metric("score_trip_1", "score of the first trip"),
@@ -86,18 +88,9 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
 
     def _prepare(self) -> None:
         options = self.options
-        self.rules = SessionRules(
-            options.fleet,
-            options.trips,
-            options.reward,
-            options.motor_noise,
-            options.sensor_noise,
-            options.frame == "first_press",
-        )
         self.max_steps = options.trips * task.MAX_PRESSES
         self.parameter_low = (options.shortest_press,) * task.NUM_KEYS
         self.parameter_high = (task.MAX_DURATION,) * task.NUM_KEYS
-        self._fleet_seed = counter_rng.seed_tensor(options.fleet_seed, self.device)
         self._trip_scores = torch.full(
             (self.num_envs, options.trips), torch.nan, device=self.device, dtype=torch.float32
         )
@@ -134,48 +127,10 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
             return Unbounded(shape=shape, device=self.device, dtype=torch.float32)
         return Bounded(0.0, 1.0, shape=shape, device=self.device, dtype=torch.float32)
 
-    def start(self, episode: Tensor, rng: RngKey) -> SessionState:
-        """Return the states at the start of sessions."""
-        layout = harbour.sample_layout(self._session_rng(episode, 0))
-        return rules.start(episode, layout, self._draw_boats(episode), has_choice=self._chooses)
-
-    def act(self, state: SessionState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[SessionState, Tensor]:
-        """Return the states after one press, and the rewards `[N]`."""
-        next_layout = harbour.sample_layout(self._session_rng(state.episode, state.trip + 1))
-        duration = action.parameters.squeeze(-1)
-        return rules.act(
-            state, action.option, action.discrete, duration, next_layout=next_layout, rng=rng, rules=self.rules
-        )
-
-    def observe(self, state: SessionState) -> Tensor:
-        """Return the observations, `[N, 22]`."""
-        rng = self._noise_rng(state) if self.rules.sensor_noise > 0.0 else None
-        return rules.observe(state, rng, self.rules)
-
-    def extras(self, state: SessionState) -> Sequence[Tensor]:
-        """Return the entries `extra_names`."""
-        trips = self.options.trips
-        return state.trip_ended.to(torch.bool), state.total_score / trips, state.docked.to(torch.float32) / trips
-
     def _session_rng(self, episode: Tensor, number: Tensor | int) -> RngKey:
         """Return one of the random-number keys of each session, `[N]`."""
         numbered = episode * rules.NUMBERS_PER_SESSION + number
         return counter_rng.rng_key(self._seed, self._streams[0], self._environment, numbered)
-
-    def _draw_boats(self, episode: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the bits of both boats of each session, int32 `[N]` each. Those of training are even, others odd."""
-        first, second = (self._session_rng(episode, rules.FIRST_BOAT + number) for number in range(2))
-        if self._streams[0] == EVALUATION and self.options.scored_boats == "new":
-            return first.bits | 1, second.bits | 1
-        size = self.options.fleet_size
-        if size is None:
-            return first.bits & -2, second.bits & -2
-        number = (counter_rng.uniform(first, 0) * size).to(torch.int32).clamp(max=size - 1)
-        beside = (counter_rng.uniform(first, 1) * (size - 1)).to(torch.int32).clamp(max=max(size - 2, 0))
-        other = (number + 1 + beside) % size
-        fleet_key = torch.full_like(episode, rules.FLEET)
-        drawn = (counter_rng.rng_key(self._fleet_seed, TRAINING, each, fleet_key).bits & -2 for each in (number, other))
-        return next(drawn), next(drawn)
 
     @property
     def geometry(self) -> PlaneGeometry:
@@ -186,7 +141,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         """
         names = ["start_x", "start_y", "trip", "boat", "last_boat", "last_key_1", "last_key_2", "last_key_3"]
         names += ["last_duration", "moved_x", "moved_y", "last_score"]
-        if self.rules.sensor_noise == 0.0:
+        if self.options.sensor_noise == 0.0:
             # The boat's place and the goal's offset tell the goal, and the displacement the velocity's direction.
             names += ["goal_x", "goal_y", "velocity_x", "velocity_y"]
         entry = {name: number for number, name in enumerate(rules.OBSERVATION_NAMES)}
@@ -209,7 +164,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
         """Return the pictures of one session, in which boats move as they do in the task."""
         from hpamdp.env.boatdock_unseen import film  # only films need it
 
-        return film.film(track, fps, size, self.rules, self.options.boats)
+        return film.film(track, fps, size, self.options)
 
     def page(self, seed: int) -> SessionPage:
         """Return the page on which people sail sessions.
@@ -224,7 +179,7 @@ class UnseenBoatsEnv(BatchedEnv[SessionState]):
     def known_boats(self, state: SessionState) -> list[fleet.Boats]:
         """Return what the boats of each session do, which no agent is told: the first and, with two, the second."""
         bits = (state.first_boat, state.second_boat)[: self.options.boats]
-        return [fleet.boats(each, self.rules.fleet) for each in bits]
+        return [fleet.boats(each, self.options.fleet) for each in bits]
 
     def _on_start(self, mask: Tensor) -> None:
         self._trip_scores[mask] = torch.nan

@@ -13,11 +13,12 @@ from hpamdp.env.boatdock import film as boat_film
 from hpamdp.env.boatdock import physics, task
 from hpamdp.env.boatdock.film import Engine
 from hpamdp.env.boatdock_unseen import fleet
-from hpamdp.env.boatdock_unseen.rules import SessionRules, SessionState
+from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
+from hpamdp.env.boatdock_unseen.rules import SessionState
 
 
 def film(
-    track: Sequence[Mapping[str, Tensor]], fps: float, size: int, rules: SessionRules, num_boats: int
+    track: Sequence[Mapping[str, Tensor]], fps: float, size: int, options: UnseenBoatsOptions
 ) -> Iterator[np.ndarray]:
     """Yield the pictures of one session, uint8 `[size, size, 3]` each.
 
@@ -25,8 +26,7 @@ def film(
         track: the states at the start and after every press, columns `[1]`.
         fps: pictures per second.
         size: width and height of a picture, px.
-        rules: rules of the sessions.
-        num_boats: boats of a session.
+        options: settings of the sessions.
     """
     states = [SessionState(*(columns[name] for name in SessionState._fields)) for columns in track]
     trip: list[SessionState] = [states[0]]
@@ -35,21 +35,19 @@ def film(
             break
         trip.append(after)
         if after.trip_ended.item():
-            yield from _trip(trip, fps, size, rules, num_boats)
+            yield from _trip(trip, fps, size, options)
             trip = [after]
     if len(trip) > 1 or len(states) == 1:
-        yield from _trip(trip, fps, size, rules, num_boats)
+        yield from _trip(trip, fps, size, options)
 
 
-def _trip(
-    states: Sequence[SessionState], fps: float, size: int, rules: SessionRules, num_boats: int
-) -> Iterator[np.ndarray]:
+def _trip(states: Sequence[SessionState], fps: float, size: int, options: UnseenBoatsOptions) -> Iterator[np.ndarray]:
     """Yield the pictures of one trip, from the states at its start and after each of its presses."""
     boat = int(states[-1].last_boat) if len(states) > 1 else 0
-    own = fleet.boats(states[0].second_boat if boat == 1 else states[0].first_boat, rules.fleet)
+    own = fleet.boats(states[0].second_boat if boat == 1 else states[0].first_boat, options.fleet)
     degrees = torch.rad2deg(torch.atan2(own.directions[0, :, 1], own.directions[0, :, 0])).tolist()
-    name = f"trip {int(states[0].trip) + 1} of {rules.trips}"
-    name += f", boat {boat + 1}" if num_boats > 1 else ""
+    name = f"trip {int(states[0].trip) + 1} of {options.trips}"
+    name += f", boat {boat + 1}" if options.boats > 1 else ""
     shown = task.Rules(boats=task.Boats((name,), (tuple(degrees),)))
     track = [_as_boat(states[0])]
     for after in states[1:]:

@@ -1,6 +1,6 @@
 """The rules of sessions for one row, and the loop over all rows that Numba compiles.
 
-It states what `rules` and `fleet` say of columns, for the CPU alone; a test compares the two.
+A test compares it with the tensor functions in experiments/generalisation/session_rules.py and `fleet`.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _begin_trip(floats: Any, integers: Any, row: Any, trip: Any, settings: Any) 
 
 @inlined
 def _start(floats: Any, integers: Any, row: Any, settings: Any) -> None:
-    """Begin a session in a row, as `rules.start` does for columns."""
+    """Begin a session in a row."""
     kernels.new_episode(integers, row, settings)
     for column in range(AT.velocity_x, AT.frame_y + 1):
         floats[column, row] = ZERO
@@ -159,7 +159,7 @@ def _start(floats: Any, integers: Any, row: Any, settings: Any) -> None:
 
 @inlined
 def _act(floats: Any, integers: Any, row: Any, option: Any, key: Any, duration: Any, settings: Any) -> Any:
-    """Press a key in a row, as `rules.act` does for columns, and return the reward."""
+    """Press a key in a row, and return the reward."""
     boat = integers[AT.boat, row]
     if boat == task.NOT_CHOSEN:
         boat = int32(option)
@@ -227,7 +227,7 @@ def _act(floats: Any, integers: Any, row: Any, option: Any, key: Any, duration: 
 
 @inlined
 def _observe(floats: Any, integers: Any, row: Any, settings: Any, observation: Any) -> None:
-    """Write the observation of a row, as `rules.observe` does for columns."""
+    """Write the observation of a row."""
     for place in range(_NUM_COORDINATES):
         observation[place] = floats[place, row]
     observation[_MOVED], observation[_MOVED + 1] = floats[AT.moved_x, row], floats[AT.moved_y, row]

@@ -70,8 +70,6 @@ class UnseenBoatsOptions(ProblemOptions):
 
     The velocity and the seconds of the last press are seen without noise, so they still show where its key pushes.
     """
-    compile_rules: bool = False
-    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
     @model_validator(mode="after")
     def _check_fleet(self) -> Self:

@@ -16,11 +16,9 @@ from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 
 from hpamdp.env import point_agent
-from hpamdp.env.batched_env import Action
 from hpamdp.env.catch_point import kernel, picture, rules
 from hpamdp.env.catch_point.options import CARDS, PUBLISHED_CATCHES, CatchPointOptions
 from hpamdp.env.catch_point.rules import CatchPointState
-from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
 from hpamdp.observation_entries import ObservationEntry
@@ -52,6 +50,8 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     parameter_low = (-1.0,)
     parameter_high = (1.0,)
     row_kernel = staticmethod(kernel.advance)
+    state_type = CatchPointState
+    num_columns = (6, 4)
     target_radius = point_agent.HIT_RADIUS
 
     def __init__(
@@ -135,21 +135,6 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     def geometry(self) -> PlaneGeometry | None:
         """The speed and the way to the target; where a move points is its parameter. None with pictures."""
         return None if self._shows_picture else PlaneGeometry(vectors=point_agent.VECTORS)
-
-    def start(self, episode: Tensor, rng: RngKey) -> CatchPointState:
-        """Return states with agent and target anywhere in the square."""
-        return rules.start(episode, rng)
-
-    def act(
-        self, state: CatchPointState, action: Action, rng: RngKey, is_idle: Tensor
-    ) -> tuple[CatchPointState, Tensor]:
-        """Return the states after one action and the rewards `[N]`."""
-        catches, late_end = self.options.catches, self.options.late_end
-        return rules.act(state, action.discrete, action.parameters.squeeze(-1), catches=catches, late_end=late_end)
-
-    def observe(self, state: CatchPointState) -> Tensor:
-        """Return the observations `[N, 4]`, or `[N, 6]` with `progress`."""
-        return rules.observe(state, progress=self.options.progress)
 
     def scripted_action(self, state: CatchPointState) -> tuple[Tensor, Tensor]:
         """Return the action of the hand-written player and its parameter, `[N]` each."""

@@ -1,6 +1,6 @@
 """The rules of Catch Point for one row, and the loop over all rows that Numba compiles.
 
-It states what `rules` says of columns, for the CPU alone; a test compares the two.
+A test compares it with the tensor functions in experiments/domains/published_rules.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _FORCE, _PI, _SIX, _TWELVE = _F(rules._FORCE), _F(math.pi), _F(6.0), _F(12.0)
 
 @part
 def _act(floats: Any, integers: Any, row: Any, action: Any, given: Any, settings: Any) -> Any:
-    """Take an action in a row and return its outcome and reward: `rules.act`."""
+    """Take an action in a row and return its outcome and reward."""
     is_catch = action == rules.CATCH
     force = ZERO if is_catch else _FORCE
     sin, cos = sin_cos(_PI * given)

@@ -25,8 +25,6 @@ class CatchPointOptions(ProblemOptions):
     """Whether the agent observes its misses and the time, `[N, 6]` instead of `[N, 4]`, as in DLPA's code."""
     observation: Literal["vector", "picture"] = "vector"
     """Whether the agent observes a vector, or the same drawn as a picture, uint8 `[N, 12288]` (`[3, 64, 64]`)."""
-    compile_rules: bool = False
-    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
     def facts(self, title: str) -> ProblemFacts:
         """Return what these settings tell of the problem, which errors call `title`."""

@@ -16,16 +16,15 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env.base import Metric
-from hpamdp.env.batched_env import Action, BatchedEnv
-from hpamdp.env.counter_rng import RngKey
+from hpamdp.env.batched_env import KernelEnv
 from hpamdp.env.goal import kernel, rendering, rules
 from hpamdp.env.goal.options import ACTIONS, CARDS, HARD_GOAL_ACTIONS, GoalOptions, HardGoalOptions, HardSlip, Slip
-from hpamdp.env.goal.rules import Aim, GoalState
+from hpamdp.env.goal.rules import GoalState
 from hpamdp.geometry import Symmetries, make_symmetries
 from hpamdp.settings import Settings
 
 
-class GoalEnv(BatchedEnv[GoalState]):
+class GoalEnv(KernelEnv[GoalState]):
     """Score against a keeper on `num_envs` half pitches at once.
 
     Action leaves:
@@ -56,6 +55,8 @@ class GoalEnv(BatchedEnv[GoalState]):
     parameter_high: Sequence[float] = rules.PARAMETER_HIGH
     slips: ClassVar[tuple[str, ...]] = get_args(Slip)
     row_kernel = staticmethod(kernel.advance)
+    state_type = GoalState
+    num_columns = (14, 3)
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("success", "goals", "share"),
         Metric("return", "return"),
@@ -71,12 +72,6 @@ class GoalEnv(BatchedEnv[GoalState]):
 
     def _prepare(self) -> None:
         self.limit_terminates = self.options.limit == "terminated"
-        self._tick, self._random_numbers = rules.masked_tick, rules.random_numbers
-
-    def _compile(self) -> None:
-        """Compile what a tick does; an action is a loop over ticks."""
-        self._tick = torch.compile(rules.masked_tick, **rules.COMPILE_ARGUMENTS)
-        self._random_numbers = torch.compile(rules.random_numbers, **rules.COMPILE_ARGUMENTS)
 
     @property
     def _is_scaled(self) -> bool:
@@ -86,33 +81,6 @@ class GoalEnv(BatchedEnv[GoalState]):
         """Return the noise, the form of the observation, which slips are repaired, and which problem it is."""
         repaired = [slip in self.options.repaired for slip in get_args(HardSlip)]
         return [self.options.noise, self._is_scaled, *repaired, isinstance(self, HardGoalEnv)]
-
-    def start(self, episode: Tensor, rng: RngKey) -> GoalState:
-        """Return the states in which episodes begin."""
-        return rules.start(episode, rng)
-
-    def act(self, state: GoalState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[GoalState, Tensor]:
-        """Return the states after one action, and the rewards `[N]`."""
-
-        def numbers(ticks: Tensor, rows: Tensor) -> Tensor:
-            return self._random_numbers(rng._replace(bits=rng.bits[rows]), state.steps[rows], ticks)
-
-        after, _ = rules.act(
-            state,
-            self._aim(action.discrete, action.parameters),
-            ~is_idle,
-            numbers,
-            noise=self.options.noise,
-            max_steps=self.max_steps,
-            tick=self._tick,
-        )
-        return after, rules.reward(state, after, repairs_distance="goal_distance" in self.options.repaired)
-
-    def observe(self, state: GoalState) -> Tensor:
-        """Return the observations `[N, 17]`."""
-        return rules.observe(
-            state, is_scaled=self._is_scaled, repairs_projection="keeper_projection" in self.options.repaired
-        )
 
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
         """Return the published initial parameters, scaled to [-1, 1], as a linear function of the observation.
@@ -198,9 +166,6 @@ class GoalEnv(BatchedEnv[GoalState]):
         """Return the signs that the parameters get: only x of a kick keeps its own."""
         return torch.tensor([1.0] + [-1.0] * (len(self.parameter_low) - 1), dtype=torch.float32)
 
-    def _aim(self, discrete: Tensor, parameters: Tensor) -> Aim:
-        return rules.goal_aim(discrete, parameters, kicks_to_point="kick_to" in self.options.repaired)
-
 
 class HardGoalEnv(GoalEnv):
     """Goal with eleven actions: a kick and ten shots, each at one stretch of the goal line.
@@ -228,11 +193,3 @@ class HardGoalEnv(GoalEnv):
         # Each foot's five stretches change places, and with them their parameters.
         shots = torch.arange(1, 11).reshape(2, 5).flip(-1).flatten()
         return torch.cat([torch.zeros(1, dtype=torch.long), shots]), torch.cat([torch.arange(2), shots + 1])
-
-    def _aim(self, discrete: Tensor, parameters: Tensor) -> Aim:
-        return rules.hard_goal_aim(
-            discrete,
-            parameters,
-            kicks_to_point="kick_to" in self.options.repaired,
-            has_middle="middle_shots" in self.options.repaired,
-        )

@@ -1,6 +1,6 @@
 """The rules of Goal and Hard Goal as loops over rows that Numba compiles.
 
-It states what `rules` says of columns, for the CPU alone; a test compares the two. Ticks are played in lanes, a row in
+A test compares it with the tensor functions in experiments/domains/published_rules. Ticks are played in lanes, a row in
 each: a tick of all lanes is loops without branches, which become vector instructions. Where an action is over, the next
 row takes the lane, so that no row waits for another's. Every lane does the same, so that no row depends on its lane.
 """
@@ -95,7 +95,7 @@ def _clip(value: Any, limit: Any) -> Any:
 def _pushed(
     vx: Any, vy: Any, effort: Any, angle: Any, drawn: Any, drawn_x: Any, drawn_y: Any, noise: Any, limit: Any
 ) -> Any:
-    """Return a velocity after a push: `rules._accelerate`."""
+    """Return a velocity after a push."""
     sin, cos = sin_cos(angle + angle * noise * drawn)
     jolt = noise * _length(vx, vy)
     push_x = _clip(effort * cos + jolt * drawn_x, limit)
@@ -105,7 +105,7 @@ def _pushed(
 
 @inlined
 def _draw(lanes: Any, numbers: Any, j: Any, step: Any) -> None:
-    """Draw the random numbers in (-1, 1) of a tick: `rules.random_numbers`."""
+    """Draw the random numbers in (-1, 1) of a tick."""
     bits, index = uint32(numbers[_BITS * _LANES + j]), numbers[_INDEX * _LANES + j]
     for place in range(rules.NUMBERS_PER_TICK):
         lanes[(_DRAWN + place) * _LANES + j] = TWO * kernels.uniform(bits, step, index + place) - ONE
@@ -114,7 +114,7 @@ def _draw(lanes: Any, numbers: Any, j: Any, step: Any) -> None:
 
 @inlined
 def _play(lanes: Any, j: Any, noise: Any) -> None:
-    """Let the players move: `rules._play`."""
+    """Let the players move."""
     player_noise, ball_noise = noise * _PLAYER_NOISE, noise * _BALL_NOISE
     player_x, player_y = lanes[AT.player_x * _LANES + j], lanes[AT.player_y * _LANES + j]
     player_vx, player_vy = lanes[AT.player_vx * _LANES + j], lanes[AT.player_vy * _LANES + j]
@@ -154,7 +154,7 @@ def _play(lanes: Any, j: Any, noise: Any) -> None:
 
 @inlined
 def _keep(lanes: Any, j: Any, noise: Any) -> None:
-    """Let the keepers move: `rules._keep`."""
+    """Let the keepers move."""
     keeper_noise = noise * _PLAYER_NOISE
     keeper_x, keeper_y = lanes[AT.keeper_x * _LANES + j], lanes[AT.keeper_y * _LANES + j]
     ball_x, ball_y = lanes[AT.ball_x * _LANES + j], lanes[AT.ball_y * _LANES + j]
@@ -198,7 +198,7 @@ def _overlap(lanes: Any, j: Any, one: Any, other: Any, touch: Any) -> Any:
 
 @inlined
 def _collide(lanes: Any, j: Any, one: Any, other: Any, one_v: Any, other_v: Any, touch: Any) -> None:
-    """Let two bodies bounce off each other where they overlap: `rules._collide`."""
+    """Let two bodies bounce off each other where they overlap."""
     overlap = _overlap(lanes, j, one, other, touch)
     one_x, one_y = lanes[one * _LANES + j], lanes[(one + 1) * _LANES + j]
     other_x, other_y = lanes[other * _LANES + j], lanes[(other + 1) * _LANES + j]
@@ -233,7 +233,7 @@ def _end(lanes: Any, j: Any, is_kick: Any) -> Any:
 
 @part
 def _tick(lanes: Any, numbers: Any, step: Any, noise: Any) -> Any:
-    """Move the bodies in all lanes by one tick, `rules.tick`, and return how many of their actions are over."""
+    """Move the bodies in all lanes by one tick, and return how many of their actions are over."""
     num_touching = int32(0)
     for j in range(_LANES):
         _draw(lanes, numbers, j, step)
@@ -261,7 +261,7 @@ def _tick(lanes: Any, numbers: Any, step: Any, noise: Any) -> Any:
 
 @part
 def _aim(action: Any, first: Any, second: Any, settings: Any) -> Any:
-    """Return the point that an action aims at: `rules.goal_aim` and `hard_goal_aim`."""
+    """Return the point that an action aims at."""
     if settings[IS_HARD] != 0.0:
         stretches = _REPAIRED if settings[HAS_MIDDLE] != 0.0 else _STRETCHES
         stretch = max(action - 1, 0) % len(stretches)
@@ -288,7 +288,7 @@ def _goal_distance(body: Any, is_repaired: Any) -> Any:
 
 @part
 def _start(floats: Any, row: Any, bits: Any, step: Any) -> None:
-    """Put everyone where an episode begins: `rules.start`."""
+    """Put everyone where an episode begins."""
     y = _HALF_WIDTH * (TWO * kernels.uniform(bits, step, 0) - ONE)
     angle = math.atan2(-y, _LENGTH)
     ball_x, ball_y = _REACH * math.cos(angle), y + _REACH * math.sin(angle)
@@ -302,7 +302,7 @@ def _start(floats: Any, row: Any, bits: Any, step: Any) -> None:
 
 @part
 def _observe(body: Any, settings: Any, observation: Any) -> None:
-    """Write what is observed of a row: `rules.observe`."""
+    """Write what is observed of a row."""
     across, along = body[AT.ball_y] - body[AT.keeper_y], body[AT.ball_x] - body[AT.keeper_x]
     distance = max(_length(along, across), _TINY)
     top = _POST if settings[REPAIRS_PROJECTION] != 0.0 else TWO * _POST

@@ -37,8 +37,6 @@ class GoalOptions(ProblemOptions):
     line, the distance is 14.02 too large. `keeper_projection`: this entry of the observation is clipped to
     [-7.01, 14.02] instead of [-7.01, 7.01].
     """
-    compile_rules: bool = False
-    """Compile the ticks instead of using the kernel, for a GPU; the first action takes about a minute."""
 
     @property
     def discrete_names(self) -> tuple[str, ...]:

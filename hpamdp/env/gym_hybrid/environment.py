@@ -12,8 +12,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from hpamdp.env.batched_env import Action
-from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.gym_hybrid import kernel, rules
 from hpamdp.env.gym_hybrid.options import CARDS, PUBLISHED_STEPS, VehicleOptions
 from hpamdp.env.gym_hybrid.rules import VehicleState
@@ -33,6 +31,8 @@ class _VehicleEnv(PointEnv[VehicleState]):
     parameter_low = rules.PARAMETER_LOW
     parameter_high = rules.PARAMETER_HIGH
     row_kernel = staticmethod(kernel.advance)
+    state_type = VehicleState
+    num_columns = (7, 3)
     target_radius = rules.TARGET_RADIUS
     has_walls = True
     slides: ClassVar[bool]
@@ -70,19 +70,6 @@ class _VehicleEnv(PointEnv[VehicleState]):
     def geometry(self) -> PlaneGeometry:
         """The places of vehicle and target, and the heading."""
         return PlaneGeometry(vectors=rules.VECTORS)
-
-    def start(self, episode: Tensor, rng: RngKey) -> VehicleState:
-        """Return states with vehicle and target anywhere in the field, at rest."""
-        return rules.start(episode, rng)
-
-    def act(self, state: VehicleState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[VehicleState, Tensor]:
-        """Return the states after one action and the rewards `[N]`."""
-        parameter = action.parameters.squeeze(-1)
-        return rules.act(state, action.discrete, parameter, slides=self.slides, max_steps=self.max_steps)
-
-    def observe(self, state: VehicleState) -> Tensor:
-        """Return the observations `[N, 10]`."""
-        return rules.observe(state, self.max_steps)
 
     def scripted_action(self, state: VehicleState) -> tuple[Tensor, Tensor]:
         """Return the action of the hand-written player and its parameter, `[N]` each."""

@@ -1,6 +1,6 @@
 """The rules of Moving and Sliding as loops over rows that Numba compiles.
 
-It states what `rules` says of columns, for the CPU alone; a test compares the two. Blocks of rows are copied into
+A test compares it with the tensor functions in experiments/domains/published_rules. Blocks of rows are copied into
 lanes, one row each; loops over the lanes have no branches and become vector instructions. Every lane does the same, so
 that no row depends on its lane.
 """
@@ -60,7 +60,7 @@ def _length(x: Any, y: Any) -> Any:
 
 @inlined
 def _steer(speed: Any, heading: Any, course: Any, action: Any, given: Any, slides: Any) -> Any:
-    """Return speed, heading and course after an action: `rules._follow` and `rules._slide`."""
+    """Return speed, heading and course after an action."""
     is_turn, is_brake = action == rules.TURN, action == rules.BRAKE
     turned = heading + _RIGHT_ANGLE * given
     turned -= TURN * _F(np.floor(_TURNS * turned))
@@ -84,7 +84,7 @@ def _steer(speed: Any, heading: Any, course: Any, action: Any, given: Any, slide
 
 @part
 def _act(lanes: Any, numbers: Any, max_steps: Any, slides: Any) -> None:
-    """Take the actions of all lanes that move: `rules.act`."""
+    """Take the actions of all lanes that move."""
     for j in range(_LANES):
         moves, action = numbers[_MOVES * _LANES + j] != 0, numbers[_ACTION * _LANES + j]
         x, y, speed = lanes[_X * _LANES + j], lanes[_Y * _LANES + j], lanes[_SPEED * _LANES + j]
@@ -118,7 +118,7 @@ def _act(lanes: Any, numbers: Any, max_steps: Any, slides: Any) -> None:
 
 @part
 def _observe(lanes: Any, numbers: Any, latest: Any, seen: Any) -> None:
-    """Write what is observed of all lanes, columns as those of the lanes: `rules.observe`."""
+    """Write what is observed of all lanes, columns as those of the lanes."""
     for j in range(_LANES):
         x, y = lanes[_X * _LANES + j], lanes[_Y * _LANES + j]
         target_x, target_y = lanes[_TARGET_X * _LANES + j], lanes[_TARGET_Y * _LANES + j]
@@ -133,7 +133,7 @@ def _observe(lanes: Any, numbers: Any, latest: Any, seen: Any) -> None:
 
 @part
 def _start(lanes: Any, numbers: Any, j: Any, bits: Any, step: Any) -> None:
-    """Put vehicle and target of a lane anywhere in the field: `rules.start`."""
+    """Put vehicle and target of a lane anywhere in the field."""
     lanes[_TARGET_X * _LANES + j] = _TARGET_BOUND * (TWO * kernels.uniform(bits, step, 0) - ONE)
     lanes[_TARGET_Y * _LANES + j] = _TARGET_BOUND * (TWO * kernels.uniform(bits, step, 1) - ONE)
     lanes[_X * _LANES + j] = TWO * kernels.uniform(bits, step, 2) - ONE

@@ -22,8 +22,6 @@ class VehicleOptions(ProblemOptions):
 
     The time is observed, and the reward at the limit is -1.
     """
-    compile_rules: bool = False
-    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
     def facts(self, title: str) -> ProblemFacts:
         """Return what these settings tell of the problem, which errors call `title`."""

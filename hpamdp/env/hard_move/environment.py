@@ -12,8 +12,6 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import point_agent
-from hpamdp.env.batched_env import Action
-from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.hard_move import kernel, rules
 from hpamdp.env.hard_move.options import CARDS, HardMoveOptions
 from hpamdp.env.hard_move.rules import HardMoveState
@@ -47,6 +45,8 @@ class HardMoveEnv(PointEnv[HardMoveState]):
     observation_names = point_agent.OBSERVATION_NAMES
     target_radius = point_agent.HIT_RADIUS
     row_kernel = staticmethod(kernel.advance)
+    state_type = HardMoveState
+    num_columns = (6, 3)
 
     def _prepare(self) -> None:
         n = self.options.n
@@ -99,18 +99,6 @@ class HardMoveEnv(PointEnv[HardMoveState]):
             kinds=tuple(kinds.tolist()),
             has_mirror=True,
         )
-
-    def start(self, episode: Tensor, rng: RngKey) -> HardMoveState:
-        """Return states with agent and target anywhere in the square."""
-        return rules.start(episode, rng)
-
-    def act(self, state: HardMoveState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[HardMoveState, Tensor]:
-        """Return the states after one action and the rewards `[N]`."""
-        return rules.act(state, action.discrete, action.parameters.squeeze(-1), self.motions)
-
-    def observe(self, state: HardMoveState) -> Tensor:
-        """Return the observations `[N, 4]`."""
-        return rules.observe(state)
 
     def scripted_action(self, state: HardMoveState) -> tuple[Tensor, Tensor]:
         """Return the action of the hand-written player and its parameter, `[N]` each."""

@@ -1,6 +1,6 @@
 """The rules of Hard Move for one row, and the loop over all rows that Numba compiles.
 
-It states what `rules` says of columns, for the CPU alone; a test compares the two.
+A test compares it with the tensor functions in experiments/domains/published_rules.
 """
 
 from __future__ import annotations

@@ -39,8 +39,6 @@ class HardMoveOptions(ProblemOptions):
     """Steps after which an episode is truncated. HyAR has 30, DLPA's code 25."""
     rounded_directions: bool = True
     """Whether the actuators' directions are rounded to three decimals, as in the published code."""
-    compile_rules: bool = False
-    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
     def facts(self, title: str) -> ProblemFacts:
         """Return what these settings tell of the problem, which errors call `title`.

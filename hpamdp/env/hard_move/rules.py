@@ -1,4 +1,4 @@
-"""The rules of Hard Move as pure functions on columns, in the dtype of the state.
+"""The motions of Hard Move, the columns of its state, and its hand-written player. `kernel` has the rules.
 
 Source: Li et al. 2022 (HyAR), arXiv:2109.05490, after Chandak et al. 2019, arXiv:1902.00183. The rules are those of
 HyAR's code.
@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import point_agent
-from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.hard_move.options import directions
 
 OUTCOMES = ("going on", "reached", "time limit")
@@ -51,37 +50,6 @@ def motions(n: int, *, rounded: bool) -> Tensor:
     sets = torch.tensor(list(itertools.product((0.0, 1.0), repeat=n)), dtype=torch.float64)
     sums = sets @ torch.tensor(directions(n, rounded), dtype=torch.float64)
     return sums / sums.norm(dim=-1).max()
-
-
-def start(episode: Tensor, rng: RngKey) -> HardMoveState:
-    """Return the initial states of the episodes with these numbers, int32 `[N]`."""
-    x, y, target_x, target_y = point_agent.start(rng)
-    zeros = torch.zeros_like(x)
-    none = torch.zeros_like(episode)
-    return HardMoveState(x, y, zeros, zeros, target_x, target_y, none, none, episode)
-
-
-def act(state: HardMoveState, discrete: Tensor, parameter: Tensor, motions: Tensor) -> tuple[HardMoveState, Tensor]:
-    """Return the states after one action in every environment, and the rewards, `[N]`.
-
-    Args:
-        state: states before the action.
-        discrete: sets of actuators, int64 `[N]`.
-        parameter: strength of the push, `[N]`. Negative values push backwards.
-        motions: motions of the sets, `[2^n, 2]`.
-    """
-    force_x, force_y = (_FORCE * parameter.unsqueeze(-1) * motions[discrete]).unbind(-1)
-    x, y, vx, vy = point_agent.move(state, force_x, force_y)
-    squared = point_agent.squared_distance(state, x, y)
-    is_hit = squared <= point_agent.HIT_RADIUS * point_agent.HIT_RADIUS
-    reward = torch.where(is_hit, point_agent.HIT_REWARD, 0.0) - squared
-    outcome = torch.where(is_hit, REACHED, GOING_ON).int()
-    return state._replace(x=x, y=y, vx=vx, vy=vy, steps=state.steps + 1, outcome=outcome), reward
-
-
-def observe(state: HardMoveState) -> Tensor:
-    """Return the observation `[N, 4]`: velocity, and target - agent."""
-    return point_agent.observe(state)
 
 
 class Script:
