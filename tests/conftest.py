@@ -20,13 +20,17 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.cli import main
 from hpamdp.config import outside_jobs
-from hpamdp.config.command_line import search_word
+from hpamdp.config.command_line import parsed_words, search_word
+from hpamdp.config.components import GROUPS
 from hpamdp.config.compose import read
-from hpamdp.config.schema import Config
+from hpamdp.config.schema import Config, RunConfig
 from hpamdp.data.human import released_file
 from hpamdp.data.human.released_file import HumanData
 from hpamdp.env.boatdock import harbour, planner
@@ -97,8 +101,9 @@ def compose_config(overrides: Sequence[str]) -> DictConfig:
     Runs are not filmed unless a test asks for it, which saves it half a second.
     """
     overrides = [*([] if any(word.startswith("film=") for word in overrides) else ["film=false"]), *overrides]
-    own = [] if any(word.startswith("hydra.searchpath=") for word in overrides) else [OWN]
-    return pickle.loads(_composed(*own, *overrides))
+    if any(word.startswith("hydra.searchpath=") for word in overrides):
+        return pickle.loads(_composed(*overrides))
+    return with_values([OWN, *overrides], lambda words: pickle.loads(_composed(*words)))
 
 
 @cache
@@ -106,6 +111,36 @@ def _composed(*overrides: str) -> bytes:
     """Compose the words of each test once."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return pickle.dumps(compose("config", [*overrides], return_hydra_config=True))
+
+
+def with_values(words: Sequence[str], composed: Callable[[Sequence[str]], DictConfig]) -> DictConfig:
+    """Compose the choices of yaml files among words, and then set the other words as Hydra sets them.
+
+    Few tests have choices of their own, and composing takes fifty times as long as setting values. Where a value cannot
+    be set, all words are composed, which says why.
+    """
+    try:
+        overrides = [_parsed(word) for word in words]
+        cfg = composed([word for word, each in zip(words, overrides, strict=True) if not _is_value(each)])
+        for each in filter(_is_value, overrides):
+            OmegaConf.update(cfg, each.key_or_group, each.value(), merge=True)
+    except (HydraException, OmegaConfBaseException):
+        return composed(words)
+    cfg.hydra.overrides.task = [word for word in words if not word.startswith("hydra.")]
+    return cfg
+
+
+@cache
+def _parsed(word: str) -> Override:
+    return parsed_words([word])[0]
+
+
+def _is_value(override: Override) -> bool:
+    """Return whether a word sets a value that chooses no yaml file and refers to no other value."""
+    name = override.key_or_group
+    is_setting = "." in name or (name in RunConfig.model_fields and name not in (*GROUPS, "callbacks"))
+    is_plain = override.type == OverrideType.CHANGE and not override.is_sweep_override() and override.package is None
+    return is_setting and is_plain and not name.startswith("hydra.") and "${" not in override.input_line
 
 
 def make_config(overrides: Sequence[str]) -> Config:
@@ -201,7 +236,7 @@ def best_scores_planned_once() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def words_composed_once() -> Iterator[None]:
-    """Have Python code compose the same words once, which takes a third of a short run.
+    """Have Python code compose the same choices once, which takes a third of a short run.
 
     Words that choose a class or add a folder are composed each time.
     """
@@ -213,11 +248,15 @@ def words_composed_once() -> Iterator[None]:
         return file.is_file() if file.parent.is_dir() else not name.startswith("hydra.")
 
     def compose_once(words: Sequence[str], conf: Path) -> DictConfig:
-        if not all(is_of_the_package(word, conf) for word in words):
+        if conf != CONF or not all(is_of_the_package(word, conf) for word in words):
             return compose_words(words, conf)
-        if tuple(words) not in composed:
-            composed[tuple(words)] = pickle.dumps(compose_words(words, conf))
-        return pickle.loads(composed[tuple(words)])
+
+        def once(words: Sequence[str]) -> DictConfig:
+            if tuple(words) not in composed:
+                composed[tuple(words)] = pickle.dumps(compose_words(words, conf))
+            return pickle.loads(composed[tuple(words)])
+
+        return with_values(words, once)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(outside_jobs, "_compose", compose_once)
