@@ -22,6 +22,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import HydraException
+from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -31,6 +32,7 @@ from hpamdp.config.command_line import parsed_words, search_word
 from hpamdp.config.components import GROUPS
 from hpamdp.config.compose import read
 from hpamdp.config.schema import Config, RunConfig
+from hpamdp.config.yaml_files import CompletedFiles
 from hpamdp.data.human import released_file
 from hpamdp.data.human.released_file import HumanData
 from hpamdp.env.boatdock import harbour, planner
@@ -260,6 +262,24 @@ def words_composed_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(outside_jobs, "_compose", compose_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def yaml_files_read_once() -> Iterator[None]:
+    """Have Hydra read each yaml file of conf/ and of the tests once, which takes a third of a composition."""
+    read_file, read_before = CompletedFiles.load_config, {}
+
+    def read_once(self, config_path: str) -> ConfigResult:
+        if Path(self.path) not in (CONF, *OWN_FOLDERS):
+            return read_file(self, config_path)
+        file = self.provider, self.path, config_path
+        if file not in read_before:
+            read_before[file] = pickle.dumps(read_file(self, config_path))
+        return pickle.loads(read_before[file])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CompletedFiles, "load_config", read_once)
         yield
 
 
