@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
+from conftest import make_config
 from gymnasium_players import action, make, step
 
 from hpamdp import keys
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.run.assemble import assemble
 
 
 def masked(num_workers: int) -> GymnasiumEnv:
@@ -49,6 +52,13 @@ def test_processes_give_the_same_steps_as_one_process(maker, quick_workers):
                 assert (one.maybe_reset(after) == other.maybe_reset(same)).all()
     finally:
         other.close()
+
+
+def test_processes_of_a_problem_are_refused_within_those_of_a_collector(quick_workers):
+    words = ["env=gymnasium", "env.id=hpamdp/Moving-v0", "env.num_workers=2", "num_envs=4", "eval.layouts=4"]
+    line = r"^collector=multi: env=gymnasium starts processes itself; use collector=single$"
+    with pytest.raises(ConfigError, match=line):
+        assemble(make_config([*words, "high=none", "low=hppo", "collector=multi"]))
 
 
 def test_a_fault_in_a_worker_is_told_as_in_one_process(quick_workers, recwarn):

@@ -140,7 +140,6 @@ REFUSED = [
     # Workers.
     ("collector=multi collector.num_workers=3", "collector.num_workers=3: must divide num_envs=4"),
     (SCALED + "collector.ahead=true", "collector.ahead=true: env=gymnasium learns the scale"),
-    (SCALED + "env.num_workers=2", "collector=multi: env=gymnasium starts processes itself; use collector=single"),
     # Observations of others.
     (
         GYMNASIUM + "env.entry_point=toy_environments:TickingGoal env.observation_keys=[2]",
