@@ -1,6 +1,8 @@
 """What goes together: pairs that cannot be are refused in one line, and those that can do what they are for."""
 
 import math
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -48,12 +50,26 @@ def test_a_ceiling_with_changes_that_options_never_make_is_told_in_one_line(caps
     )
 
 
+def words_of(low: str) -> list[str]:
+    return [*SMALL, "high=uniform", f"low={low}", *SHORT[low]]
+
+
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Path:
-    """Return the output folder of a tiny run of H-PPO."""
-    folder = tmp_path_factory.mktemp("runs") / "hppo"
-    train(make_config([*SMALL, "high=uniform", "low=hppo", *SHORT["hppo"]]), folder)
-    return folder
+def run_of(tmp_path_factory) -> Callable[[str], tuple[Path, AssembledRun]]:
+    """Return a function that trains a learner in a tiny run, once, and returns the run's folder and its parts."""
+
+    @cache
+    def trained(low: str) -> tuple[Path, AssembledRun]:
+        folder = tmp_path_factory.mktemp("runs") / low
+        return folder, train(make_config(words_of(low)), folder)
+
+    return trained
+
+
+@pytest.fixture
+def trained(run_of) -> Path:
+    """The output folder of a tiny run of H-PPO."""
+    return run_of("hppo")[0]
 
 
 @pytest.mark.parametrize("words", ["low=random", "low=hppo low.hidden_dims=[8]", "low=hppo agent.sharing=shared"])
@@ -90,11 +106,11 @@ def test_frozen_learners_of_another_run_stay_as_they_are_while_the_selector_lear
 
 
 @pytest.mark.parametrize("low", ["hppo", "pdqn"])
-def test_learners_of_another_run_bring_their_networks_and_begin_their_schedules_afresh(low, tmp_path):
-    words = [*SMALL, "high=uniform", f"low={low}", *SHORT[low]]
-    trained = copied(train(make_config(words), tmp_path / "first").agent.learners)
+def test_learners_of_another_run_bring_their_networks_and_begin_their_schedules_afresh(low, run_of, tmp_path):
+    folder, first = run_of(low)
+    words, trained = words_of(low), copied(first.agent.learners)
     fresh = copied(make(make_config(words), tmp_path / "fresh").agent.learners)
-    parts = make(make_config([*words, f"low.checkpoint={tmp_path / 'first'}"]), tmp_path / "second")
+    parts = make(make_config([*words, f"low.checkpoint={folder}"]), tmp_path / "second")
     loaded = copied(parts.agent.learners)
     assert trained["0.frames"] > 0
     progress = parts.agent.learners[0].progress
@@ -104,11 +120,10 @@ def test_learners_of_another_run_bring_their_networks_and_begin_their_schedules_
         assert torch.equal(value, (fresh if name in restarted else trained)[name]), name
 
 
-def test_a_learner_of_another_run_fills_its_replay_before_it_updates(tmp_path):
-    words = [*SMALL, "high=uniform", "low=pdqn", *SHORT["pdqn"]]
-    parts = train(make_config(words), tmp_path / "first")
-    frames = min(int(learner.frames) for learner in parts.agent.learners)
-    again = [*words, f"low.checkpoint={tmp_path / 'first'}", f"low.warmup_steps={frames}"]
+def test_a_learner_of_another_run_fills_its_replay_before_it_updates(run_of, tmp_path):
+    folder, first = run_of("pdqn")
+    frames = min(int(learner.frames) for learner in first.agent.learners)
+    again = [*words_of("pdqn"), f"low.checkpoint={folder}", f"low.warmup_steps={frames}"]
     parts = make(make_config(again), tmp_path / "second")
     before = [int(learner.updates) for learner in parts.agent.learners]
     batch = parts.env.rollout(2, parts.policy, break_when_any_done=False)
