@@ -31,8 +31,10 @@ from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import begin, run
 from hpamdp.run.trainer import Trainer
 
-SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=320", "eval.layouts=4", "eval.every=32", "low=random"]
-PLATFORM = [*SMALL[:-1], "env=platform", "high=none", "low=hppo", "low.minibatch_size=8", "low.hidden_dims=[8]"]
+SIZES = ["num_envs=8", "steps_per_batch=4", "total_frames=320", "eval.layouts=4", "eval.every=32"]
+SMALL = [*SIZES, "env=catch_point", "env.max_steps=5", "high=none", "low=random"]
+PLATFORM = [*SIZES, "env=platform", "env.max_steps=20", "high=none", "low=hppo", "low.minibatch_size=8"]
+PLATFORM += ["low.hidden_dims=[8]"]
 
 
 def start(folder: Path, *words: str) -> int:
@@ -309,7 +311,8 @@ def interrupt_at(batch: int, monkeypatch) -> None:
 
 
 def test_a_resumed_run_counts_on_and_knows_its_best_agent(tmp_path, monkeypatch):
-    words = [*PLATFORM, "total_frames=960", "save_best=true", "callbacks=[{name:patience,evaluations:4},recording]"]
+    words = [*PLATFORM, "env.max_steps=200", "total_frames=960", "save_best=true"]
+    words += ["callbacks=[{name:patience,evaluations:4},recording]"]
     assert run(compose_config(words), tmp_path / "whole", words) == 0
     with monkeypatch.context() as patch:
         interrupt_at(STOPPED_AT, patch)

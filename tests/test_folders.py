@@ -27,7 +27,7 @@ from hpamdp.run.trainer import Trainer
 from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, differing_settings, flat_settings
 
 TINY = ["num_envs=8", "steps_per_batch=4", "total_frames=128", "log_every=32", "eval.layouts=4", "eval.every=0"]
-TINY += ["high=ucb", "low=random"]
+TINY += ["env=catch_point", "env.max_steps=5", "high=none", "low=random"]
 
 
 def start(folder: Path, *words: str) -> int:
@@ -76,7 +76,7 @@ def test_a_run_that_overwrites_another_and_is_killed_leaves_nothing_of_the_other
 def test_a_run_that_is_refused_destroys_nothing(tmp_path, monkeypatch, without_login):  # noqa: F811
     start(tmp_path / "run")
     before = contents(tmp_path / "run")
-    refused = [["low=pdqn", "low.batch_size=0"], ["high=none"], ["high=ucb", "resume=nowhere"], ["logger=wandb"]]
+    refused = [["low=pdqn", "low.batch_size=0"], ["high=ucb"], ["seed=1", "resume=nowhere"], ["logger=wandb"]]
     monkeypatch.setenv("WANDB_MODE", "sometimes")  # which is found last, when the logger starts
     for words in refused:
         with pytest.raises(ConfigError):

@@ -43,7 +43,8 @@ def human_batch(path: str, rest_to_rest: bool = False, **env):
 
 def overrides(path: str, low: str, high: str = "human") -> list[str]:
     plans = ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"] if low in ("dlpa", "pets") else []
-    plans += ["low.greedy_samples=8", "low.max_sequences=8"] if low == "pets" else []
+    plans += ["low.greedy_samples=8", "low.max_sequences=8", "low.num_members=2"] if low == "pets" else []
+    plans += ["low.transition_dims=[16]", "low.outcome_dims=[16]"] if low == "pets" else []
     return [*SMALL, f"data.path={path}", f"low={low}", f"high={high}", *plans]
 
 
