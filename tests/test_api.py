@@ -24,7 +24,7 @@ import hpamdp
 from hpamdp.env.errors import ProblemError
 from hpamdp.run_files import CHECKPOINT_NAME, METRICS_NAME
 
-TINY = {"total_frames": 1024, "num_envs": 32, "steps_per_batch": 16, "eval.layouts": 4, "progress": False}
+TINY = {"total_frames": 512, "num_envs": 32, "steps_per_batch": 8, "eval.layouts": 4, "film": False, "progress": False}
 OWN = {**TINY, "env.max_steps": 5, "low": "hppo"}
 
 
@@ -137,7 +137,7 @@ def test_training_without_a_folder_writes_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     agent = hpamdp.train("platform", low="hppo", **TINY)
     assert not [*tmp_path.iterdir()]
-    assert agent.history[-1]["frames"] == 1024
+    assert agent.history[-1]["frames"] == 512
     assert isinstance(agent.policy, TensorDictModuleBase)
 
 
@@ -160,10 +160,10 @@ def test_an_interrupted_training_in_a_folder_goes_on_with_resume_auto(tmp_path):
 
     arguments = {**TINY, "low": "hppo", "folder": tmp_path / "run"}
     agent = hpamdp.train("platform", callbacks=[Stop()], **arguments)
-    assert agent.history[-1]["frames"] < 1024
-    assert hpamdp.train("platform", resume="auto", **arguments).history[-1]["frames"] == 1024
+    assert agent.history[-1]["frames"] < 512
+    assert hpamdp.train("platform", resume="auto", **arguments).history[-1]["frames"] == 512
     again = hpamdp.train("platform", resume="auto", **arguments)  # nothing is left to do
-    assert again.history[-1]["frames"] == 1024
+    assert again.history[-1]["frames"] == 512
 
 
 def test_a_resumed_run_in_a_new_folder_keeps_its_rows_even_if_it_ends_before_its_first_own_one(tmp_path):
@@ -173,18 +173,18 @@ def test_a_resumed_run_in_a_new_folder_keeps_its_rows_even_if_it_ends_before_its
 
     arguments = {**TINY, "low": "hppo"}
     first = hpamdp.train("platform", folder=tmp_path / "a", **arguments)
-    longer = {name: value for name, value in arguments.items() if name not in ("low", "env")} | {"total_frames": 2048}
+    longer = {name: value for name, value in arguments.items() if name not in ("low", "env")} | {"total_frames": 1024}
     with pytest.raises(RuntimeError, match="once"):
         hpamdp.train(resume=tmp_path / "a", folder=tmp_path / "b", callbacks=Fails(), **longer)
     last = hpamdp.train(resume=tmp_path / "b", folder=tmp_path / "c", **longer)
     frames = [row["frames"] for row in last.history]
-    assert frames[: len(first.history)] == [row["frames"] for row in first.history] and frames[-1] == 2048
+    assert frames[: len(first.history)] == [row["frames"] for row in first.history] and frames[-1] == 1024
 
 
 def test_a_resumed_run_tells_that_schedules_have_ended(tmp_path, capsys):
-    hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **{**TINY, "low.anneal_steps": 1024})
-    hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 2048})
-    assert "but low.anneal_steps stay at 1,024" in capsys.readouterr().err
+    hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **{**TINY, "low.anneal_steps": 512})
+    hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 1024})
+    assert "but low.anneal_steps stay at 512" in capsys.readouterr().err
 
 
 def test_the_environment_of_a_run_that_was_an_object_is_not_taken_for_the_same_in_silence(tmp_path, capsys):
@@ -196,7 +196,7 @@ def test_the_environment_of_a_run_that_was_an_object_is_not_taken_for_the_same_i
 
 @pytest.mark.parametrize("env", ["hpamdp/Platform-v0", {"name": "platform", "max_steps": 20}])
 def test_a_problem_may_be_an_id_or_a_dict(env):
-    assert hpamdp.train(env, low="hppo", high=None, **TINY).history[-1]["frames"] == 1024
+    assert hpamdp.train(env, low="hppo", high=None, **TINY).history[-1]["frames"] == 512
 
 
 def test_a_torchrl_problem_and_a_learners_class_are_trained():
@@ -246,7 +246,7 @@ def test_an_agent_that_was_trained_on_an_object_needs_it_again(tmp_path):
         hpamdp.load(tmp_path / "run")
     agent = hpamdp.load(tmp_path / "run", env=Reach)
     assert agent.evaluate(episodes=3)["steps"] == 5.0
-    assert {row["frames"] for row in agent.history} == {0.0, 1024.0}
+    assert {row["frames"] for row in agent.history} == {0.0, 512.0}
     assert (tmp_path / "run" / METRICS_NAME).is_file() and (tmp_path / "run" / CHECKPOINT_NAME).is_file()
 
 
@@ -390,7 +390,7 @@ def test_bounds_of_an_environment_that_were_edited_are_told_of_wherever_an_agent
         ),
     }
     monkeypatch.setattr(Reach, space, other[space])
-    more = {**TINY, "total_frames": 2048}
+    more = {**TINY, "total_frames": 1024}
     uses = [
         lambda: hpamdp.load(tmp_path / "run", lambda: Reach()),
         lambda: hpamdp.train(lambda: Reach(), resume=tmp_path / "run", folder=tmp_path / "more", **more),
@@ -577,7 +577,7 @@ def test_random_numbers_stay_the_callers(tmp_path):
     hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **TINY)
     with global_generators_unmoved(), torch.no_grad():
         hpamdp.load("hppo_platform")
-        hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 2048})
+        hpamdp.train(resume=tmp_path / "run", folder=tmp_path / "more", **{**TINY, "total_frames": 1024})
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 import hpamdp
 from hpamdp.run import checkpoint
 
-TINY = {"total_frames": 1024, "num_envs": 32, "steps_per_batch": 16, "eval.layouts": 4}
+TINY = {"total_frames": 512, "num_envs": 32, "steps_per_batch": 8, "eval.layouts": 4, "film": False}
 MODULE = "tossing"  # its import leaves a mark
 CODE = """
 from pathlib import Path
@@ -59,7 +59,7 @@ def words_of(way: str, home: Path, to: str) -> list[str]:
     return {
         "watch": ["watch", run, *WATCH],
         "score": ["mode=eval", f"checkpoint={run}", "eval.layouts=4", f"hydra.run.dir={to}"],
-        "resume": [f"resume={run}", "total_frames=2048", f"hydra.run.dir={to}"],
+        "resume": [f"resume={run}", "total_frames=1024", f"hydra.run.dir={to}"],
     }[way]
 
 
@@ -85,8 +85,8 @@ def test_a_run_on_a_problem_of_ones_own_is_opened_from_python(permission, home, 
     monkeypatch.chdir(home)
     agent = hpamdp.load("run", **permission)
     assert agent.evaluate(episodes=3)["steps"] > 0
-    more = hpamdp.train(resume="run", progress=False, total_frames=2048, **permission)
-    assert more.history[-1]["frames"] == 2048
+    more = hpamdp.train(resume="run", progress=False, total_frames=1024, **permission)
+    assert more.history[-1]["frames"] == 1024
 
 
 @pytest.mark.parametrize("way", ["score", "resume"])
@@ -103,7 +103,7 @@ def test_python_reads_no_folder_of_a_file_without_trust(file, home, unread):
         hpamdp.load(home / file)
     assert str(home / "own") in str(raised.value) and "\n" not in str(raised.value)
     with pytest.raises(hpamdp.ConfigError, match="trust=true"):
-        hpamdp.train(resume=str(home / file), total_frames=2048)
+        hpamdp.train(resume=str(home / file), total_frames=1024)
 
 
 def test_play_reads_no_folder_of_an_agents_file_without_trust(home, unread, command):

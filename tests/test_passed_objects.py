@@ -16,7 +16,7 @@ from hydra.core.config_store import ConfigStore
 
 import hpamdp
 
-TINY = {"total_frames": 1024, "num_envs": 8, "steps_per_batch": 64, "eval.layouts": 4, "progress": False}
+TINY = {"total_frames": 512, "num_envs": 32, "steps_per_batch": 8, "eval.layouts": 4, "film": False, "progress": False}
 OWN = {**TINY, "env.max_steps": 5, "low": "hppo"}
 WORKERS = {"collector": "multi"}
 PROCESSES = {"env.num_workers": 2}
@@ -65,7 +65,7 @@ def test_what_cannot_be_sent_to_processes_is_refused_in_one_line_and_nothing_is_
 
 
 def test_what_cannot_be_sent_is_trained_in_one_process():
-    assert hpamdp.train(with_lock("function"), **OWN).history[-1]["frames"] == 1024
+    assert hpamdp.train(with_lock("function"), **OWN).history[-1]["frames"] == 512
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_what_cannot_be_sent_is_trained_in_one_process():
 def test_a_problem_that_no_other_process_can_import_is_stepped_in_processes(form, processes):
     cls = own_class()
     env = {"class": cls, "function": lambda: cls(), "object": cls()}[form]
-    assert hpamdp.train(env, **OWN, **processes).history[-1]["frames"] == 1024
+    assert hpamdp.train(env, **OWN, **processes).history[-1]["frames"] == 512
 
 
 @pytest.mark.slow
@@ -86,7 +86,7 @@ def test_a_learner_and_a_selector_that_no_other_process_can_import_act_in_worker
         pass
 
     agent = hpamdp.train("boatdock", low=OwnLearner, high=OwnSelector, **TINY, **WORKERS)
-    assert "OwnSelector" in repr(agent) and agent.history[-1]["frames"] == 1024
+    assert "OwnSelector" in repr(agent) and agent.history[-1]["frames"] == 512
 
 
 @pytest.mark.slow
@@ -107,7 +107,7 @@ class Cell(gymnasium.Env):
 print(hpamdp.train(Cell, **{OWN | processes}).history[-1]["frames"])
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
-    assert done.stdout.split() == ["1024.0"], done.stderr
+    assert done.stdout.split() == ["512.0"], done.stderr
 
 
 @pytest.mark.slow
@@ -214,17 +214,17 @@ def test_another_choice_than_the_class_of_a_saved_agent_is_refused(of_classes, g
 
 def test_a_run_of_a_class_with_a_required_setting_is_resumed(of_classes, tmp_path, monkeypatch):
     forget(monkeypatch, low=Sized)
-    more = {**TINY, "total_frames": 2048}
+    more = {**TINY, "total_frames": 1024}
     agent = hpamdp.train(resume=of_classes, low=Sized, folder=tmp_path / "more", **more)
     assert agent._config.low.settings["width"] == 3
-    assert agent.history[-1]["frames"] == 2048
+    assert agent.history[-1]["frames"] == 1024
 
 
 def test_a_finished_run_of_passed_classes_comes_back_with_resume_auto(of_classes, monkeypatch):
     forget(monkeypatch, low=Sized, high=Softmax)
     given = {"low": {"name": Sized, "width": 3}, "high": Softmax, "folder": of_classes, "resume": "auto"}
     agent = hpamdp.train("boatdock", **given, **TINY)
-    assert agent.history[-1]["frames"] == 1024
+    assert agent.history[-1]["frames"] == 512
 
 
 def test_resume_auto_loads_no_finished_agent_of_another_config(tmp_path):
@@ -246,7 +246,7 @@ def test_resume_auto_searches_no_folder_that_only_the_saved_run_names(tmp_path):
     given = {**TINY, "low": "random", "high": Softmax, "folder": tmp_path / "run"}
     hpamdp.train("boatdock", config_dirs=[own], **given)
     (own / "high" / "Softmax.yaml").write_text("_target_: nowhere.Another\n")
-    assert hpamdp.train("boatdock", resume="auto", **given).history[-1]["frames"] == 1024
+    assert hpamdp.train("boatdock", resume="auto", **given).history[-1]["frames"] == 512
 
 
 def test_a_run_that_was_trained_on_an_object_asks_for_it_when_it_is_resumed(tmp_path):
@@ -254,6 +254,6 @@ def test_a_run_that_was_trained_on_an_object_asks_for_it_when_it_is_resumed(tmp_
     hpamdp.train(env, folder=tmp_path / "0", **OWN)
     line = r"^resume: .*: the agent was trained on an object from Python; pass it again as env$"
     with pytest.raises(hpamdp.ConfigError, match=line):
-        hpamdp.train(resume=tmp_path / "0", total_frames=2048, progress=False)
-    agent = hpamdp.train(env, resume=tmp_path / "0", total_frames=2048, progress=False)
-    assert agent.history[-1]["frames"] == 2048
+        hpamdp.train(resume=tmp_path / "0", total_frames=1024, progress=False)
+    agent = hpamdp.train(env, resume=tmp_path / "0", total_frames=1024, progress=False)
+    assert agent.history[-1]["frames"] == 1024
