@@ -6,8 +6,9 @@ first, and the others never practise enough to show what they can do. So another
 - A curve is fitted to the returns of each option over its own practice.
 - Of the options behind the best one, the one that would gain most from the practice that is left practises, if it would
   gain more than the best one does: the more it would gain, the more often.
-- Otherwise, in the first half of the run all options practise for equally many steps, except those whose curve stays out
-  of reach of the best one. In the second half the selector chooses, so that learners practise where they will be used.
+- Otherwise, in the first half of the run all options practise for equally many steps, except those whose curve stays
+  out of reach of the best one. In the second half the selector chooses, so that learners practise where they will be
+  used.
 
 Sources: Heidari, Kearns and Roth 2016, *Tight Policy Regret Bounds for Improving and Decaying Bandits*, and Metelli,
 Trovo, Pirola and Restelli 2022, *Stochastic Rising Bandits*: options whose reward rises with their own pulls, compared
