@@ -43,6 +43,18 @@ def test_the_greedy_policy_takes_mean_parameters_and_one_discrete_action_or_samp
     assert (learner.exported() is None) == (greedy_discrete == "sampled")
 
 
+def test_greedy_parameters_may_be_the_means_of_the_clipped_samples():
+    learner = make(greedy_parameters="clipped_mean")
+    with torch.no_grad():
+        learner.actor.parameter_head.bias[:4] = torch.tensor([-1.5, -1.0, 0.3, 0.9])
+    td = TensorDict({keys.OBSERVATION: torch.zeros(100_000, 4)}, [100_000])
+    sampled = learner.policy(td.clone())[RAW].clamp(-1.0, 1.0).mean(0)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        greedy = learner.policy(td)[RAW][0]
+    torch.testing.assert_close(greedy, sampled, atol=0.01, rtol=0.0)
+    assert greedy[1] > -0.9 and learner.exported() is None
+
+
 def random_rows(learner: HPPO, num: int, steps: int, done: torch.Tensor | None = None) -> TensorDict:
     """Return random transitions `[num, steps]` with actions of the policy, and ends where `done` or at random."""
     td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(num, steps, 4)}, [num, steps]))

@@ -79,6 +79,7 @@ class HPPO(OnPolicy, Learner):
             options.initial_scale,
             options.initial_parameters,
             vector_products=options.vector_products,
+            greedy_parameters=options.greedy_parameters,
         )
         products = [] if self.actor.products is None else [self.actor.products]
         self.critic = nn.Sequential(
@@ -341,7 +342,8 @@ class HPPO(OnPolicy, Learner):
 
     def exported(self) -> dict[str, Any] | None:
         """Return the actor, unless it samples or sees features: see `hpamdp.policies.shared.exported_policy`."""
-        if self.policy.samples_when_greedy or not self.perception.is_plain:
+        is_mean = self.options.greedy_parameters == "mean"
+        if self.policy.samples_when_greedy or not is_mean or not self.perception.is_plain:
             return None
         return exported_actor(self.actor, self.specs)
 

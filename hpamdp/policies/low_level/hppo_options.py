@@ -8,7 +8,14 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_
 from typing_extensions import Self
 
 from hpamdp.cards import ActionFeature, LearnerCard
-from hpamdp.policies.shared.options import Credit, HeadOptions, InitialParameters, MemoryOptions, OnPolicyOptions
+from hpamdp.policies.shared.options import (
+    Credit,
+    GreedyParameters,
+    HeadOptions,
+    InitialParameters,
+    MemoryOptions,
+    OnPolicyOptions,
+)
 from hpamdp.settings import Fraction, LearningRate, Schedule, ScheduleShape, Widths
 
 
@@ -86,8 +93,14 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     `summed` and `mixed` subtract what the other components contributed to it. A critic learns the contributions, whose
     sum (`summed`) or monotonic function (`mixed`) is the advantage of the whole action.
     """
+    greedy_parameters: GreedyParameters = "mean"
+    """Parameters of the greedy policy. `mean`: those of the Gaussian. `clipped_mean`: the mean of its clipped samples.
+
+    Actors learn by clipped samples. Near a bound the noise is a part of what they do: with the mean at the bound, half
+    of the samples lie inside. The mean alone would stay at the bound, and the greedy agent idle.
+    """
     greedy_discrete: Literal["most_probable", "sampled"] = "most_probable"
-    """Discrete action of the greedy policy; its parameters are the means. `sampled` draws it, as in the published code.
+    """Discrete action of the greedy policy. `sampled` draws it, as in the published code.
 
     Always taking the same one of two equally good actions may lead nowhere, as turning on the spot does.
     """

@@ -103,6 +103,7 @@ class AutoregressiveActor(HybridActor):
                 owner.to(mean.device),
                 Components((size,)),
                 None if part is None else part.distribution(value_logits),
+                self.greedy_parameters,
             )
             choice, raw = draw(distribution)
             choices.append(choice)
@@ -143,7 +144,7 @@ class AutoregressiveActor(HybridActor):
     def most_probable(
         self, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return the discrete actions that are most probable together, and their mean raw parameters.
+        """Return the discrete actions that are most probable together, and their greedy raw parameters.
 
         With more than 64 combinations, each component takes its own most probable choice, given those before it.
         """

@@ -17,7 +17,7 @@ from hpamdp.acting import is_greedy
 from hpamdp.policies.masks import masked_logits
 from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution, ValuePlaces
 from hpamdp.policies.shared.networks import InitialLayer, OutputLinear, VectorProducts
-from hpamdp.policies.shared.options import InitialParameters
+from hpamdp.policies.shared.options import GreedyParameters, InitialParameters
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -52,7 +52,7 @@ class DistributionActor(nn.Module):
     def most_probable(
         self, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return the most probable discrete actions and their mean raw parameters; arguments as for `act`."""
+        """Return the most probable discrete actions and their greedy raw parameters; arguments as for `act`."""
         discrete, raw, _ = self.act(HybridDistribution.mode, observation, mask, pair_mask)
         return discrete, raw
 
@@ -70,6 +70,7 @@ class HybridActor(DistributionActor):
         initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
         vector_products: whether the hidden layers also see `VectorProducts`.
         has_values: whether integer parameters with at most `MAX_VALUES` values have a categorical.
+        greedy_parameters: see `HybridDistribution`.
 
     Attributes:
         products: appends vector products to observations; None without `vector_products`.
@@ -95,6 +96,7 @@ class HybridActor(DistributionActor):
         *,
         vector_products: bool = False,
         has_values: bool = True,
+        greedy_parameters: GreedyParameters = "mean",
     ) -> None:
         super().__init__()
         if specs.has_pair_mask and not self.takes_pairs:
@@ -103,6 +105,7 @@ class HybridActor(DistributionActor):
                 "heads cannot heed; use autoregressive=true"
             )
         self.components = specs.components
+        self.greedy_parameters = greedy_parameters
         self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
         self.products = VectorProducts(specs) if vector_products else None
         self.num_inputs = specs.observation_dim if self.products is None else self.products.num_outputs
@@ -143,7 +146,8 @@ class HybridActor(DistributionActor):
         logits = masked_logits(self.discrete_head(hidden), mask)
         values = None if self.values is None else self.values.distribution(self.value_head(hidden))
         log_probs = self.components.log_softmax(logits)
-        return HybridDistribution(log_probs, mean, self.log_scale(raw_scale), self.owner, self.components, values)
+        log_scale, greedy = self.log_scale(raw_scale), self.greedy_parameters
+        return HybridDistribution(log_probs, mean, log_scale, self.owner, self.components, values, greedy)
 
     def hidden(self, observation: Tensor) -> Tensor:
         """Return the output of the hidden layers for observations `[*B, observation_dim]`."""
@@ -183,7 +187,7 @@ class HybridPolicy(TensorDictModuleBase):
         actor: gives the distribution.
         specs: sizes and bounds of the problem.
         writes_raw: whether to write the raw sample of the parameters as `RAW`, too.
-        samples_when_greedy: whether to sample greedy discrete actions as well; their parameters are the means.
+        samples_when_greedy: whether to sample greedy discrete actions as well, but not their parameters.
         bound: maps raw parameters to those that are executed, in [-1, 1].
         perception: what the actor sees of an observation. If None, the observation itself.
     """

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from hpamdp.components import Components
 from hpamdp.policies.masks import masked_logits, sample_index
+from hpamdp.policies.shared.options import GreedyParameters
 from hpamdp.specs import PAMDPSpecs
 
 # An integer parameter with at most this many values has a categorical. With more it has a Gaussian, and is rounded.
@@ -35,6 +36,7 @@ class HybridDistribution(NamedTuple):
         owner: the discrete action that each parameter belongs to, int64 `[num_parameters]`.
         components: of the action.
         values: categoricals of the integer parameters with few values; None if no parameter has one.
+        greedy_parameters: `mean`, or `clipped_mean`, that of the clipped samples.
     """
 
     discrete_log_probs: Tensor
@@ -43,6 +45,7 @@ class HybridDistribution(NamedTuple):
     owner: Tensor
     components: Components
     values: ValueDistribution | None = None
+    greedy_parameters: GreedyParameters = "mean"
 
     def sample(self) -> tuple[Tensor, Tensor]:
         """Sample discrete actions `[*B]` and the raw parameters of all of them, `[*B, num_parameters]`.
@@ -54,15 +57,15 @@ class HybridDistribution(NamedTuple):
         return discrete, raw if self.values is None else self.values.sampled(raw)
 
     def mode(self) -> tuple[Tensor, Tensor]:
-        """Return the most probable discrete action `[*B]` and the mean raw parameters `[*B, num_parameters]`.
+        """Return the most probable discrete action `[*B]` and the greedy raw parameters `[*B, num_parameters]`.
 
         Parameters with a categorical take the most probable value.
         """
-        return self.components.best(self.discrete_log_probs), self._central()
+        return self.components.best(self.discrete_log_probs), self._greedy()
 
     def sample_discrete(self) -> tuple[Tensor, Tensor]:
-        """Sample discrete actions `[*B]`, with the mean raw parameters `[*B, num_parameters]`."""
-        return self._sampled_discrete(), self._central()
+        """Sample discrete actions `[*B]`, with the greedy raw parameters `[*B, num_parameters]`."""
+        return self._sampled_discrete(), self._greedy()
 
     def sample_squashed(self) -> tuple[Tensor, Tensor]:
         """Sample squashed parameters in [-1, 1]; return them and their log-densities, each `[*B, num_parameters]`.
@@ -121,8 +124,10 @@ class HybridDistribution(NamedTuple):
         parts = self.discrete_log_probs.split(self.components.sizes, -1)
         return torch.stack([sample_index(part) for part in parts], -1)
 
-    def _central(self) -> Tensor:
-        return self.mean if self.values is None else self.values.most_probable(self.mean)
+    def _greedy(self) -> Tensor:
+        is_clipped = self.greedy_parameters == "clipped_mean"
+        raw = clipped_mean(self.mean, self.log_scale.exp()) if is_clipped else self.mean
+        return raw if self.values is None else self.values.most_probable(raw)
 
 
 class ValueDistribution(NamedTuple):
@@ -223,6 +228,14 @@ Draw: TypeAlias = Callable[[HybridDistribution], tuple[Tensor, Tensor]]
 def log_slope_of_tanh(raw: Tensor) -> Tensor:
     """Return log(1 - tanh(raw)^2), without loss of precision for large |raw|."""
     return 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
+
+
+def clipped_mean(mean: Tensor, scale: Tensor) -> Tensor:
+    """Return the means `[*B]` of Gaussian samples that are clipped to [-1, 1], given means and deviations `[*B]`."""
+    low, high = (-1.0 - mean) / scale, (1.0 - mean) / scale
+    below, above = (0.5 + 0.5 * torch.erf(end / math.sqrt(2.0)) for end in (low, -high))
+    density_low, density_high = (torch.exp(-0.5 * end.square()) / math.sqrt(2.0 * math.pi) for end in (low, high))
+    return above - below + mean * (1.0 - below - above) + scale * (density_low - density_high)
 
 
 def gaussian_log_density(standardised: Tensor, log_scale: Tensor) -> Tensor:

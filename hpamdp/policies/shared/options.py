@@ -161,6 +161,8 @@ class ScaleOptions(Settings):
 
 # Initial parameters: the problem's own convention, if it has one (`domain`), or the network's initial output (`none`).
 InitialParameters = Literal["domain", "none"]
+# Greedy parameters of a Gaussian policy: its mean, or the mean of its samples after they are clipped to the bounds.
+GreedyParameters = Literal["mean", "clipped_mean"]
 
 
 class EpsilonOptions(Settings):
