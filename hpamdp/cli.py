@@ -99,14 +99,9 @@ def _main() -> None:
 def _run_command(name: str, words: list[str]) -> int:
     """Run a command that has options of its own, and return its exit code."""
     command = importlib.import_module(_COMMANDS[name])
-    from hpamdp.run.stopping import ProgramExitError, exits_explained
-
     parser = _Parser(prog=f"{program()} {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
-    try:
-        with exits_explained(), problems_explained():
-            return command.main(words, parser)
-    except ProgramExitError as error:
-        _exit_with(str(error), FAILED)
+    with problems_explained():
+        return command.main(words, parser)
 
 
 class _Parser(argparse.ArgumentParser):
