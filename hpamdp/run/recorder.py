@@ -25,9 +25,7 @@ from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.loggers import EarlierRun, LenientLogger, Logger
 from hpamdp.run.summary import (
     EVALUATED_FRAMES,
-    ONE_ACTION,
-    ONE_OPTION,
-    SHORT_SIGHT,
+    REMARKS,
     WITHOUT_UPDATE,
     closing_table,
     short_sight,
@@ -229,9 +227,8 @@ class Recorder:
         summary |= {**self._callback_metrics, **ending}
         if self.config.run.mode != "eval":
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
-            summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])
-            summary[ONE_OPTION] = self._one_option()
-            summary[ONE_ACTION] = self.parts.evaluation.one_action
+            seen = short_sight(self.config.learners, measured["steps"])
+            summary[REMARKS] = [*seen, *self._one_option(), *self.parts.evaluation.one_action]
             summary["practised"] = self.parts.agent.practised()
         self.summary = summary
         if self.output_dir is not None:
