@@ -22,10 +22,10 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.config.command_line import CommandLine, completed, parse, saved_run
-from hpamdp.config.compose import conf_dir, job_overrides, read
+from hpamdp.config.compose import conf_dir, job_overrides
 from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.hydra_errors import explained, not_understood
-from hpamdp.config.schema import RESUME_AUTO, Config
+from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.messages import (
     FAILED,
@@ -166,7 +166,8 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
     output_dir = Path(job.runtime.output_dir)
     try:
         with locked(output_dir):
-            config = _checked(cfg)
+            is_new = cfg.resume is None and cfg.mode != "eval"  # a saved run completes other configs
+            config = compatibility.checked(cfg, job_overrides()) if is_new else None  # before torch is imported
             from hpamdp.run import train  # takes seconds, which a wrong setting need not wait for
 
             if cfg.resume == RESUME_AUTO:
@@ -188,24 +189,6 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
     if code:
         sys.exit(code)
     return None
-
-
-def _checked(cfg: DictConfig) -> Config | None:
-    """Check the config before torch is imported, and return it; None if a saved run completes it.
-
-    Raises:
-        ConfigError: a value is wrong, or values do not go together.
-    """
-    if cfg.resume is not None or cfg.mode == "eval":
-        return None
-    config, words = read(cfg), job_overrides()
-    compatibility.check_saved_run(config.run)
-    problem = compatibility.facts_of(config)
-    if problem is not None:
-        config = compatibility.with_selector(config, problem, words)
-    compatibility.check(config)
-    compatibility.check_effects(config.run.mode, words)
-    return config
 
 
 def _exit_with(mistake: str, code: int = MISTAKE) -> NoReturn:

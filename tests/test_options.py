@@ -131,4 +131,4 @@ def test_classes_of_a_user_that_groups_and_values_name_are_imported(tmp_path):
     assert yaml.safe_load((tmp_path / "out/config.yaml").read_text())["low"]["weight"] == 2.0
     with (tmp_path / "out/metrics.csv").open() as file:
         assert {row["own/weight"] for row in csv.DictReader(file)} == {"3.0"}
-    assert "low=mine has the settings weight" in python("go.py", *words, "--help", cwd=tmp_path).stdout
+    assert "Settings of low=mine\n  low.weight=2.0\n" in python("go.py", *words, "--help", cwd=tmp_path).stdout

@@ -241,8 +241,7 @@ class Agent:
         config = self._config_at(env, of_problem)
         seed = config.run.eval.seed if seed is None else seed
         asked = {"episodes": episodes, "seed": seed}
-        numbers = {name: int(value) if isinstance(value, np.integer) else value for name, value in asked.items()}
-        checked = validated(_Asked, numbers, "", "argument", "hpamdp.Agent.evaluate")
+        checked = validated(_Asked, asked, "", "argument", "hpamdp.Agent.evaluate")
         eval_config = config.run.eval.model_copy(update={"layouts": checked.episodes, "seed": checked.seed})
         evaluation = make_evaluation(config.with_run(eval=eval_config, film=False), self._env)
         try:

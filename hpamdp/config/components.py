@@ -71,7 +71,7 @@ class Component:
             `high=none`, `exploration=none` and `data=none`.
         settings: checked values by name.
         objects: further arguments of the constructor, from Python code. No file holds them.
-        options: the settings as a checked instance of the class's `Options`; None if it has no model.
+        options: the settings as a checked instance of the class's `Options`; None if it has none.
     """
 
     group: str
@@ -99,13 +99,6 @@ class Component:
         """What the class declares; if it has no card or there is no class, an empty card."""
         card = card_named(self.target) if isinstance(self.target, str) else getattr(self.target, "card", None)
         return card or _BASES[self.group][1]()
-
-    @property
-    def model(self) -> type[BaseModel] | None:
-        """The class's `Options`; None if it has no model."""
-        if isinstance(self.target, str):
-            return self.card.options
-        return settings_model(self.target) if self.target is not None and takes_settings_model(self.target) else None
 
     def with_settings(self, settings: Mapping[str, Any]) -> Component:
         """Return the component with other, allowed settings."""
@@ -179,8 +172,7 @@ def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "")
 
     class_name = _name_of(chosen)
     checked = validated(model, settings, prefix or f"{group}.", f"setting of {class_name}", class_name)
-    made = Component(group, name, chosen, dict(checked))
-    return made if made.model is None else dataclasses.replace(made, options=checked)
+    return Component(group, name, chosen, dict(checked), options=checked if isinstance(checked, Settings) else None)
 
 
 def check_base_class(group: str, name: str, target: object) -> None:

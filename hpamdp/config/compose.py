@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -163,21 +163,16 @@ def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
 
 def _learners_of_options(run: RunConfig, env: str) -> dict[str, tuple[str, dict[str, Any]]]:
     """Return each learner in `low.per_option`: its name, and its yaml file and recipe with the given settings."""
-    learners = {}
-
-    @cache  # somebody else's file may name a learner as often as it likes
-    def written(name: str) -> dict[str, Any]:
-        cfg = compose([choosing("env", env), choosing("low", name)])
-        return plain_groups(cfg, run.model_dump(), ["low"])["low"]
-
-    for option, choice in (run.low.per_option or {}).items():
-        where = f"low.per_option.{option}"
-        name, given = _name_and_settings(choice, where, "a learner", _NOT_PER_OPTION)
-        try:
-            learners[option] = name, {**written(name), **given}
-        except MissingChoiceError as error:
-            raise ConfigError(f"{where}={name}: there is no {file_of('low', name)}") from error
-    return learners
+    choices = {f"low.per_option.{option}": choice for option, choice in (run.low.per_option or {}).items()}
+    learners = _with_files(
+        choices,
+        "low",
+        "a learner",
+        lambda name: [choosing("env", env), choosing("low", name)],
+        run.model_dump(),
+        _NOT_PER_OPTION,
+    )
+    return dict(zip(run.low.per_option or {}, learners, strict=True))
 
 
 def listed_callbacks(choices: Sequence[Any], run: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
@@ -190,24 +185,49 @@ def listed_callbacks(choices: Sequence[Any], run: Mapping[str, Any]) -> list[tup
     Raises:
         ConfigError: an entry names no yaml file of the searched folders.
     """
-    callbacks = []
+    places = {f"callbacks.{i}": choice for i, choice in enumerate(choices)}
+    refused = {TARGET: _NAMED_BY_YAML}
+    return _with_files(places, CALLBACK, "a callback", lambda name: [f"+{choosing(CALLBACK, name)}"], run, refused)
 
-    @cache  # likewise
+
+def _with_files(
+    choices: Mapping[str, Any],
+    group: str,
+    what: str,
+    words: Callable[[str], list[str]],
+    run: Mapping[str, Any],
+    refused: Mapping[str, str],
+) -> list[tuple[str, dict[str, Any]]]:
+    """Return the name of each entry of a list or mapping, and its yaml file with the given settings.
+
+    Args:
+        choices: the entries by their places, such as `callbacks.0`.
+        group: the group of the yaml files.
+        what: what an entry must name.
+        words: returns the words that choose a yaml file.
+        run: values of the run, to which the yaml files may refer.
+        refused: settings that an entry may not have, with the advice for the error.
+
+    Raises:
+        ConfigError: an entry names no yaml file, or has a refused setting.
+    """
+
+    @cache  # somebody else's file may name a class as often as it likes
     def written(name: str) -> dict[str, Any]:
-        cfg = compose([f"+{choosing(CALLBACK, name)}"])
-        return plain_groups(cfg, run, [CALLBACK])[CALLBACK] if cfg.get(CALLBACK) else {}
+        cfg = compose(words(name))
+        return plain_groups(cfg, run, [group])[group] if cfg.get(group) else {}
 
-    for i, choice in enumerate(choices):
-        where = f"callbacks.{i}"
-        name, given = _name_and_settings(choice, where, "a callback", {TARGET: _NAMED_BY_YAML})
+    found = []
+    for where, choice in choices.items():
+        name, given = _name_and_settings(choice, where, what, refused)
         try:
             own = written(name)
         except MissingChoiceError as error:
-            raise ConfigError(f"{where}={name}: {no_such(f'file in conf/{CALLBACK}', name, error.known)}") from error
+            raise ConfigError(f"{where}={name}: {no_such(f'file in conf/{group}', name, error.known)}") from error
         if TARGET not in own:
-            raise ConfigError(f"{where}={name}: {file_of(CALLBACK, name)} names no class as {TARGET}")
-        callbacks.append((name, {**own, **given}))
-    return callbacks
+            raise ConfigError(f"{where}={name}: {file_of(group, name)} names no class as {TARGET}")
+        found.append((name, {**own, **given}))
+    return found
 
 
 def _name_and_settings(choice: Any, where: str, what: str, refused: Mapping[str, str]) -> tuple[str, dict[str, Any]]:

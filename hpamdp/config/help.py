@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from hpamdp.config.command_line import SEARCH, CommandLine, choices_in
-from hpamdp.config.components import CALLBACK, GROUPS, component
+from hpamdp.config.components import CALLBACK, GROUPS, component, model_of
 from hpamdp.config.compose import listed_callbacks, plain
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed
@@ -90,10 +90,10 @@ def _explained_choice(group: str, name: str, given: Mapping[str, Any], prefix: s
         chosen = component(group, name, given)
     except ConfigError:
         return ""
-    if chosen.model is None:
-        settings = f"the settings {', '.join(chosen.settings)}" if chosen.settings else "no settings"
-        return f"{group}={name} has {settings}\n\n"
-    lines = _explained(chosen.model, prefix, dict(chosen.settings))
+    if not chosen.settings:
+        return f"{group}={name} has no settings\n\n"
+    assert chosen.target is not None
+    lines = _explained(model_of(chosen.target, group), prefix, dict(chosen.settings))
     return "\n".join([f"Settings of {group}={name}", *lines, "", ""])
 
 

@@ -291,17 +291,11 @@ def checked_config(
     Raises:
         ConfigError: a wrong value.
     """
-    for group in GROUPS:
-        check_base_class(group, names[group], given[group].get(TARGET))
-    components: dict[str, Any] = {group: component(group, names[group], given[group]) for group in GROUPS}
-    low_of = {}
-    for option, (name, low) in learners.items():
-        check_base_class("low", name, low.get(TARGET))
-        low_of[option] = component("low", name, low, f"low.per_option.{option}.")
-    called = []
-    for i, (name, callback) in enumerate(callbacks):
-        check_base_class(CALLBACK, name, callback.get(TARGET))
-        called.append(component(CALLBACK, name, callback, f"callbacks.{i}."))
+    components: dict[str, Any] = {group: _chosen(group, names[group], given[group]) for group in GROUPS}
+    low_of = {
+        option: _chosen("low", name, low, f"low.per_option.{option}.") for option, (name, low) in learners.items()
+    }
+    called = [_chosen(CALLBACK, name, each, f"callbacks.{i}.") for i, (name, each) in enumerate(callbacks)]
     # With all their settings, so that a saved run keeps them if their yaml files change.
     if called:
         in_full_list = tuple({"name": each.name, **each.settings} for each in called)
@@ -310,3 +304,8 @@ def checked_config(
         in_full = {option: {**low.settings, "name": low.name} for option, low in low_of.items()}
         run = run.model_copy(update={"low": run.low.model_copy(update={"per_option": in_full})})
     return Config(run, **components, low_of=low_of, callbacks=tuple(called))
+
+
+def _chosen(group: str, name: str, given: Mapping[str, Any], prefix: str = "") -> Component:
+    check_base_class(group, name, given.get(TARGET))
+    return component(group, name, given, prefix)

@@ -21,7 +21,7 @@ from hpamdp.files import replacing
 from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run.callbacks_options import CARDS, PatienceOptions, TimeLimitOptions
 from hpamdp.run.checkpoint import progress_of
-from hpamdp.run.state_checks import check_numbers
+from hpamdp.run.state_checks import check_like
 from hpamdp.run_files import BEST_NAME
 from hpamdp.settings import SettingError
 
@@ -348,7 +348,7 @@ def states_of(
             state = callback.state()
         states[name] = _savable(f"{name}.state", state)
         try:
-            check_numbers(f"{name}.state", states[name], (before or states)[name])
+            check_like(f"{name}.state", states[name], (before or states)[name], loosely=True)
         except ValueError as error:
             raise CallbackError(f"{error}, as when the run began") from error
     return states

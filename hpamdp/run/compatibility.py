@@ -11,6 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from omegaconf import DictConfig
+
 from hpamdp.cards import CallbackCard, SelectorCard
 from hpamdp.complaints import as_json
 from hpamdp.config.components import (
@@ -18,12 +20,12 @@ from hpamdp.config.components import (
     Component,
     constructor_arguments,
 )
-from hpamdp.config.compose import RECIPE, setting_of, settings_in
+from hpamdp.config.compose import RECIPE, read, setting_of, settings_in
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.facts import ProblemFacts, ProblemOptions
 from hpamdp.pickling import why_unsendable
-from hpamdp.settings import OnlyWith, OwnSteps
+from hpamdp.settings import OnlyWith, OwnSteps, Settings
 
 # The choice that picks a selector automatically, and the selector that it picks if there are options.
 AUTO_SELECTOR, DEFAULT_SELECTOR = "auto", "ucb"
@@ -77,6 +79,28 @@ def check(config: Config) -> None:
     _refuse_first(_complaints(acting))
     if facts is not None:
         check_problem(config, facts)
+
+
+def checked(cfg: DictConfig, words: Sequence[str], objects: Mapping[str, Any] | None = None) -> Config:
+    """Return the checked config of a run that no saved run completes.
+
+    `high=auto` stays if only the built problem shows whether there are options.
+
+    Args:
+        cfg: the composed config.
+        words: words of the command line.
+        objects: arguments for the problem's constructor from Python code, if there are any.
+
+    Raises:
+        ConfigError: a value is wrong, or values do not go together.
+    """
+    config = read(cfg).with_objects(objects)
+    check_saved_run(config.run)
+    check_effects(config.run.mode, words)
+    facts = facts_of(config)
+    config = config if facts is None else with_selector(config, facts, words)
+    check(config)
+    return config
 
 
 def check_saved_run(run: RunConfig) -> None:
@@ -141,9 +165,10 @@ def _component_and_setting(config: Config, name: str) -> tuple[Component | None,
 def marks_of(config: Config, name: str) -> tuple[list[Any], Mapping[str, Any]]:
     """Return the marks in the type of a setting, such as `OwnSteps`, and all settings of its class."""
     component, setting = _component_and_setting(config, name)
-    if component is None or component.model is None or setting not in component.model.model_fields:
+    fields = {} if component is None or component.options is None else type(component.options).model_fields
+    if component is None or setting not in fields:
         return [], {}
-    return component.model.model_fields[setting].metadata, component.settings
+    return fields[setting].metadata, component.settings
 
 
 def _conditions(config: Config, name: str) -> list[str]:
@@ -186,7 +211,7 @@ def facts_of(config: Config) -> ProblemFacts | None:
     if isinstance(config.env.target, str):
         return options.facts(config.env.class_name) if isinstance(options, ProblemOptions) else None
     facts = getattr(config.env.target, "facts", None)
-    return None if facts is None or options is None else facts(options)
+    return facts(options) if facts is not None and isinstance(options, Settings) else None
 
 
 def with_selector(config: Config, problem: ProblemFacts, words: Sequence[str] = ()) -> Config:

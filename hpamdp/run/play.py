@@ -17,7 +17,7 @@ import torch
 
 from hpamdp.config.compose import package_dir, read
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.outside_jobs import composed, searched
+from hpamdp.config.outside_jobs import composed
 from hpamdp.config.saved import choices_of
 from hpamdp.config.schema import Config
 from hpamdp.env.play_page import EpisodeError, PlayPage
@@ -27,7 +27,6 @@ from hpamdp.run.assemble import make_env
 from hpamdp.run.checkpoint import find, progress_of
 from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
 from hpamdp.run.players import LoadedAgent, add_config_dir, load_agent, split_words, whole_number, with_config_dirs
-from hpamdp.run.resume import saved_choices
 from hpamdp.run_files import POLICY_NAME, saved_summary
 
 _DESCRIPTION = """\
@@ -152,8 +151,7 @@ def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) 
 
 def permissions(name: str, config: Config, settings: Sequence[str]) -> list[str]:
     """Return the user's words that an agent's config needs: guarded settings, `trust`, and folders of yaml files."""
-    with searched(settings):
-        is_same_problem = saved_choices(name, "checkpoint", [])["env"] == config.env.name
+    is_same_problem = choices_of(progress_of(find(name, "checkpoint"))["config"])["env"] == config.env.name
     given = [word.partition("=") for word in settings]
     return [
         f"{setting}={value}"

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hpamdp.complaints import as_json
 from hpamdp.config.components import GROUPS
-from hpamdp.config.compose import choosing, chosen_names, conf_dir, names_of, plain, read, read_run, setting_of
+from hpamdp.config.compose import choosing, chosen_names, conf_dir, names_of, plain, read_run, setting_of
 from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.outside_jobs import searched, searching
 from hpamdp.config.saved import choices_of, read_saved, upgraded
@@ -51,10 +51,7 @@ def resolve(
         ConfigError: a value is wrong, the checkpoint does not exist, or a word would change the saved agent or nothing.
     """
     if cfg.resume is None and cfg.mode != "eval":
-        config = read(cfg).with_objects(objects)
-        compatibility.check_saved_run(config.run)
-        compatibility.check_effects(config.run.mode, overrides)
-        return choose_selector(config, overrides), None
+        return choose_selector(compatibility.checked(cfg, overrides, objects), overrides), None
     run, folders = read_run(cfg)
     compatibility.check_saved_run(run)
     where = "resume" if run.resume is not None else "checkpoint"
@@ -141,24 +138,6 @@ def _plain_value(cfg: DictConfig, name: str) -> Any:
     return plain(value, name) if isinstance(value, DictConfig) else value
 
 
-def saved_choices(source: str, where: str, overrides: Sequence[str]) -> dict[str, str]:
-    """Return the choices of a saved run, to which the command line adds.
-
-    Args:
-        source: the run's output folder or its checkpoint.
-        where: the setting that names the source.
-        overrides: the words of the command line.
-
-    Raises:
-        ConfigError: the checkpoint does not exist, or a word would change the saved agent.
-    """
-    file = checkpoint.find(source, where)
-    saved = checkpoint.progress_of(file)["config"]
-    _changes(overrides, saved, file, where)
-    left_out = () if where == "resume" else _NOT_EVALUATED
-    return {group: name for group, name in choices_of(saved).items() if group not in left_out}
-
-
 def saved_words(source: str, where: str, words: Sequence[str]) -> list[str]:
     """Return the choices of a saved run as words, and its folders of yaml files if the words trust the run.
 
@@ -174,12 +153,15 @@ def saved_words(source: str, where: str, words: Sequence[str]) -> list[str]:
     """
     given = {setting_of(each): each.partition("=")[2] for each in words}
     file = checkpoint.find(source, where)
+    progress = checkpoint.progress_of(file)
+    _changes(words, progress["config"], file, where)
+    left_out = {*given, *(() if where == "resume" else _NOT_EVALUATED)}
+    choices = {group: name for group, name in choices_of(progress["config"]).items() if group not in left_out}
     folders = []
     if given.get("trust", "").lower() == "true" and "hydra.searchpath" not in given:
-        known = checkpoint.progress_of(file).get("config_dirs") or []
+        known = progress.get("config_dirs") or []
         folders = searching([folder for folder in known if os.path.isdir(folder)])
     with searched([*folders, *words]):
-        choices = {group: name for group, name in saved_choices(source, where, words).items() if group not in given}
         for group, name in choices.items():
             if not (conf_dir() / group / f"{name}.yaml").is_file() and name not in names_of(group):
                 raise _not_there(MissingChoiceError(f"{group}/{name}", names_of(group)), file)

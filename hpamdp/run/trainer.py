@@ -26,7 +26,7 @@ from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, metrics_of,
 from hpamdp.run.collection.base import Collection
 from hpamdp.run.folder import mark_unfinished, moved_aside
 from hpamdp.run.recorder import Recorder
-from hpamdp.run.state_checks import check_numbers
+from hpamdp.run.state_checks import check_like
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
 from hpamdp.run.summary import KEPT_FRAMES, KEPT_SCORE
 from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME
@@ -131,7 +131,7 @@ class Trainer:
         """
         for name, callback in self.callbacks.items():
             if name in states:
-                check_numbers(name, states[name], self._states_of_callbacks[name])
+                check_like(name, states[name], self._states_of_callbacks[name], loosely=True)
                 callback.set_state(states[name])
         dropped = [name for name, state in states.items() if state and name not in self.callbacks]
         if dropped:
