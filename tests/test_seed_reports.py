@@ -143,15 +143,6 @@ def test_from_five_seeds_on_the_mean_has_an_interval(tmp_path):
     assert f"{low:.3f} to {high:.3f}" in report_on([tmp_path]).table()
 
 
-def test_of_many_trials_with_one_seed_each_only_the_highest_are_shown(tmp_path):
-    for trial in range(25):
-        leave_run(tmp_path / str(trial), lr=0.001 * (trial + 1), scores=(float(trial),))
-    lines = report_on([tmp_path]).table().splitlines()
-    assert len(lines) == 12 and lines[1].startswith("24: low.lr=0.025 ") and lines[10].startswith("15: ")
-    assert lines[-1] == "score: the 10 highest of 25 configurations, one seed each, so without a deviation"
-    assert len(hpamdp.report(tmp_path)) == 25
-
-
 def test_another_metric_comes_from_the_summary_or_else_from_the_last_row(tmp_path):
     leave_run(tmp_path / "0")
     assert hpamdp.report(tmp_path, metric="eval/success")[0]["mean"] == 0.5
@@ -285,13 +276,3 @@ def test_a_mistake_costs_one_line(command, tmp_path, words, mistake):
     leave_run(tmp_path / "run")
     code, _, err = command("report", *words)
     assert code == 2 and err.startswith(mistake) and err.count("\n") == 1
-
-
-def test_the_texts_of_a_table_are_no_formulas_and_have_no_control_characters(tmp_path):
-    names = ["=SUM(A1)", "+1", "-1", "@a", "a\x1b[31m\nb", "c"]
-    for seed, name in enumerate(names):
-        leave_run(tmp_path / "runs" / name, seed=seed, scores=(-float(seed),))
-    hpamdp.report(tmp_path / "runs", to=tmp_path / "runs")
-    rows = read_table(tmp_path / "runs")
-    assert {row["folder"] for row in rows} == {"'=SUM(A1)", "'+1", "'-1", "'@a", r"a\x1b[31m\nb", "c"}
-    assert "-5.0" in {row["eval/score"] for row in rows}, "numbers stay"

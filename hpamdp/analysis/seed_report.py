@@ -27,10 +27,9 @@ from hpamdp.analysis.statistics import mean_interval, spread
 from hpamdp.complaints import no_such
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import regular_size, replacing
-from hpamdp.messages import duration, file_and_reason, one_line, say
+from hpamdp.messages import aligned, duration, file_and_reason, one_line, say
 from hpamdp.metrics_file import EVALUATION
 
-_FORMULA = ("=", "+", "-", "@")  # how a formula of a spreadsheet begins
 _DESCRIPTION = """\
 Compare runs by their means over seeds.
 
@@ -41,8 +40,6 @@ Compare runs by their means over seeds.
 DEFAULT_METRIC = "eval/score"
 TABLE_NAME, FIGURE_NAME = "report.csv", "report.png"
 _BEGINNING = b"configuration,folder,seed,state,"  # of a table
-# If more than _MANY configurations have one seed each, as the trials of a search do, only the highest are shown.
-_MANY, _MOST_TRIALS = 20, 10
 _LEAST_FOR_INTERVAL = 5  # seeds
 _MOST_NAMES, _LONGEST_NAME = 40, 60  # of the metrics that an error lists
 
@@ -70,35 +67,18 @@ class Report:
 
     def table(self) -> str:
         """Return a plain aligned table of the configurations, and below it what the reader should know of it."""
-        shown, is_search = self.shown()
         title = one_line(self.metric.removeprefix(EVALUATION))
-        rows = [_cells(configuration, is_search) for configuration in shown]
+        rows = [_cells(configuration) for configuration in self.configurations]
         header = ["", "seeds", title, "min", "max", "95 % interval of the mean", "steps", "CPU time"]
         header += ["unfinished", "failed"]
         kept = [i for i in range(len(header)) if i < 3 or any(row[i] for row in rows)]
-        cells = [[row[i] for i in kept] for row in [header, *rows]]
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        lines = ["   ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in cells]
-        return "\n".join([*lines, *self._notes(title, is_search)])
+        lines = aligned([[row[i] for i in kept] for row in [header, *rows]])
+        return "\n".join([*lines, *self._notes(title)])
 
-    def shown(self) -> tuple[list[Configuration], bool]:
-        """Return the configurations to show, and whether they are the highest of many with one seed each."""
-        is_one_problem = len({each.problem for each in self.configurations}) == 1
-        is_search = len(self.configurations) > _MANY and all(len(each.runs) == 1 for each in self.configurations)
-        if not (is_search and is_one_problem):
-            return self.configurations, False
-        scored = sorted((each for each in self.configurations if each.values), key=lambda each: -each.values[0])
-        return scored[:_MOST_TRIALS], True
-
-    def _notes(self, title: str, is_search: bool) -> list[str]:
+    def _notes(self, title: str) -> list[str]:
         num_seeds = [len(each.values) for each in self.configurations]
         notes = []
-        if is_search:
-            notes.append(
-                f"{title}: the {min(_MOST_TRIALS, sum(num_seeds))} highest of {len(num_seeds)} configurations, one "
-                "seed each, so without a deviation"
-            )
-        elif max(num_seeds) > 1:
+        if max(num_seeds) > 1:
             alone = ", without a deviation if there is only one" if 1 in num_seeds else ""
             notes.append(f"{title}: mean ± standard deviation over seeds{alone}")
         elif 1 in num_seeds:
@@ -138,8 +118,7 @@ class Report:
             writer = csv.DictWriter(file, rows[0])
             writer.writeheader()
             writer.writerows(rows)
-        shown, _ = self.shown()
-        drawn = draw(shown, self.metric)
+        drawn = draw(self.configurations, self.metric)
         if drawn is None:
             figure.unlink(missing_ok=True)
             return [table]
@@ -150,25 +129,16 @@ class Report:
     def _run_rows(self, folder: Path) -> list[dict[str, Any]]:
         return [
             {
-                "configuration": _as_cell(each.name),
-                "folder": _as_cell(os.path.relpath(run.folder, folder)),
+                "configuration": each.name,
+                "folder": one_line(os.path.relpath(run.folder, folder)),
                 "seed": run.seed,
                 "state": run.state,
-                _as_cell(self.metric): run.value,
+                self.metric: run.value,
                 **{name: run.effort(name) for name in ("frames", "wall_s", "cpu_s")},
             }
             for each in self.configurations
             for run in each.runs
         ]
-
-
-def _as_cell(text: str) -> str:
-    """Return a text for a table, with escapes for control characters.
-
-    An apostrophe comes first if a spreadsheet would take the text for a formula.
-    """
-    shown = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
-    return f"'{shown}" if shown.startswith(_FORMULA) else shown
 
 
 def report_on(folders: Iterable[Path | str], metric: str = DEFAULT_METRIC) -> Report:
@@ -231,13 +201,12 @@ def _mean_effort(runs: Sequence[SeedRun], name: str) -> float | None:
     return fmean(known) if known else None
 
 
-def _cells(configuration: Configuration, is_search: bool) -> list[str]:
+def _cells(configuration: Configuration) -> list[str]:
     row, values = _row(configuration), configuration.values
     several = len(values) > 1
     interval = row["interval"]
-    name = configuration.runs[0].folder.name if is_search else ""
     return [
-        f"{name}: {configuration.name}" if is_search else configuration.name,
+        configuration.name,
         str(row["seeds"]),
         spread(values) if values else "",
         f"{row['min']:.3f}" if several else "",

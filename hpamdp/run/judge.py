@@ -18,7 +18,7 @@ from hpamdp.config.outside_jobs import composed
 from hpamdp.config.schema import Config
 from hpamdp.data.row_checks import PERSON
 from hpamdp.env.decisions import decision_tracker
-from hpamdp.messages import say
+from hpamdp.messages import aligned, say
 from hpamdp.run.assemble import make_data, option_length
 from hpamdp.run.players import (
     LoadedAgent,
@@ -182,6 +182,6 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
         ]
         for row in rows
     ]
-    widths = [max(map(len, column)) for column in zip(header, *cells, strict=True)]
-    lines = ["   ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in [header, *cells]]
-    return "\n".join([*lines, *(f"{row['agent']}: {doubt}" for row in rows for doubt in row["doubts"])])
+    return "\n".join(
+        [*aligned([header, *cells]), *(f"{row['agent']}: {doubt}" for row in rows for doubt in row["doubts"])]
+    )

@@ -13,7 +13,7 @@ from hpamdp.config.components import Component
 from hpamdp.config.schema import Config
 from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.figure_style import REFERENCES
-from hpamdp.messages import duration
+from hpamdp.messages import aligned, duration
 from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 
 WITHOUT_UPDATE = "without_update"  # names of the levels that made no update
@@ -94,11 +94,7 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     for metric in rows:
         values = [measured.get(metric.name) for measured in columns.values()]
         cells.append([metric.title, *(_WRITE[metric.kind](value) if _is_known(value) else "" for value in values)])
-    widths = [max(len(cell) for cell in column) for column in zip(*cells, strict=True)]
-    lines = []
-    for first, *others in cells:
-        aligned = [first.ljust(widths[0]), *map(str.rjust, others, widths[1:])]
-        lines.append("   ".join(aligned).rstrip())
+    lines = aligned(cells)
     if any("" in row[1:] for row in cells[1:]):
         lines.append("empty cells: no figure is stored for that reference with these settings")
     lines += summary.get(REMARKS, [])
