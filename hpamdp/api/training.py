@@ -110,6 +110,9 @@ def train(
         if is_interrupted:
             say(f"Stopped at {trainer.frames:,}{trainer.unit}")
     parts = trainer.parts
+    without = parts.agent.without_update()
+    if without and not progress:  # the table says so
+        warn(f"no update was made: {', '.join(without)}")
     return Agent(config, parts.agent, parts.problem, trainer.progress(), trainer.recorder.metrics.rows())
 
 

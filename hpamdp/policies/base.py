@@ -440,14 +440,6 @@ class Selector(Level, TensorDictModuleBase):
         goes_on = ~after.get(keys.DONE).squeeze(-1)
         return self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1).float() * goes_on
 
-    def decisions_to_update(self) -> dict[str, int]:
-        """Return the least number of decisions before the first update, by the name of each setting that requires one.
-
-        A selector that learns within options counts steps. A run that is too short is refused. The message names the
-        setting with the largest number. Override it if one decision is not enough.
-        """
-        return {}
-
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write `out_keys`: a fresh choice if `is_decision` is true, else what `td` already holds.
 
@@ -678,14 +670,6 @@ class Learner(Level, nn.Module):
         fresh = {name: value for name, value in own.items() if name.rpartition(".")[2] in self.progress}
         later = {name: own[name] for name in added_later(self) - state.keys()}
         self.load_state_dict({**state, **later, **fresh})
-
-    def steps_to_update(self) -> dict[str, int]:
-        """Return the least number of own steps before the first update, by the name of each setting that requires one.
-
-        A run that is too short is refused, and the message names the setting with the largest number. Override it if
-        one step is not enough.
-        """
-        return {}
 
     def num_updates(self, steps: int) -> int:
         """Return about how many gradient steps the learner takes in this many steps of its own.

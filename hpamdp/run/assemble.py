@@ -29,7 +29,7 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner, Selector
 from hpamdp.policies.option_lengths import DEFAULT_LENGTHS
 from hpamdp.policies.practice import CurvePractice, Practice
-from hpamdp.run import capacity, checkpoint, compatibility
+from hpamdp.run import checkpoint, compatibility
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.specs import PAMDPSpecs
 
@@ -101,7 +101,6 @@ def _assemble(config: Config, env: PAMDPEnv, device: torch.device) -> AssembledR
     data = make_data(config, env, _gamma(agent)) if is_new or holds_out else None
     if is_new and run.low.checkpoint is not None:
         checkpoint.load_learners(checkpoint.find(run.low.checkpoint, "low.checkpoint"), agent, device)
-    capacity.check_length(config, agent, with_learners(config, agent))
     tracked, policy = env_and_policy(env, agent, config)
     return AssembledRun(tracked, policy, agent, make_evaluation(config, env), data, device)
 

@@ -92,10 +92,6 @@ class Actor(OnPolicy, RemembersDecisions):
         logits = masked_logits(self.logits(self.seen(td)), td.get(keys.OPTION_MASK, None))
         return logits.log_softmax(-1)
 
-    def decisions_to_update(self) -> dict[str, int]:
-        """Return the size of a minibatch."""
-        return {"minibatch_size": self.options.minibatch_size}
-
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Gather decisions; as soon as there is a minibatch of them, make `epochs` passes over them."""
         return self._learn(self.rows(decisions))

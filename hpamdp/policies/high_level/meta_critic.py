@@ -34,7 +34,7 @@ from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.gradients import descend
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.perception import Perception
-from hpamdp.policies.shared.replay import first_multiple, packed_states, replay_buffer, unpacked_states
+from hpamdp.policies.shared.replay import packed_states, replay_buffer, unpacked_states
 from hpamdp.policies.shared.selector_memory import RemembersDecisions
 from hpamdp.policies.shared.sequences import HistoryLinks, sample_with_past, states_of_past
 from hpamdp.specs import PAMDPSpecs
@@ -109,11 +109,6 @@ class MetaCritic(RemembersDecisions):
             return is_worse
         random_probability = 1.0 - (1.0 - self.epsilon) * (1.0 - float(self.practice.sum()))
         return is_worse | (torch.rand(is_worse.shape, device=is_worse.device, dtype=torch.float32) < random_probability)
-
-    def decisions_to_update(self) -> dict[str, int]:
-        """Return the length of the warm-up and the number of decisions for one update."""
-        first_update = first_multiple(self.options.updates_per_decision)
-        return {"warmup_decisions": self.options.warmup_decisions, "updates_per_decision": first_update}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Store finished decisions `[N]` and, after the warm-up, make the updates that are due."""

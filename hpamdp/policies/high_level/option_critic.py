@@ -39,7 +39,7 @@ from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.policies.shared.exploration import schedule
 from hpamdp.policies.shared.gradients import descend
 from hpamdp.policies.shared.networks import mlp, polyak_update
-from hpamdp.policies.shared.replay import first_multiple, replay_buffer
+from hpamdp.policies.shared.replay import replay_buffer
 from hpamdp.policies.shared.selector_memory import RemembersDecisions
 from hpamdp.specs import PAMDPSpecs
 
@@ -106,13 +106,6 @@ class OptionCritic(RemembersDecisions):
         random_probability = 0.0 if is_greedy() else 1.0 - (1.0 - self.epsilon) * (1.0 - float(self.practice.sum()))
         beta = self.beta(self.seen(td), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None), random_probability)
         return beta > 0.5 if is_greedy() else torch.rand_like(beta) < beta
-
-    def decisions_to_update(self) -> dict[str, int]:
-        """Return the length of the warm-up and the number of steps for one update."""
-        return {
-            "warmup_steps": self.options.warmup_steps,
-            "updates_per_step": first_multiple(self.options.updates_per_step),
-        }
 
     def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
         """Store the steps `[*B, T]` and, after the warm-up, make the updates that are due."""

@@ -351,10 +351,6 @@ class HPPO(OnPolicy, Learner):
         """Return the passes over this many steps, in minibatches."""
         return self.options.epochs * steps // self.options.minibatch_size
 
-    def steps_to_update(self) -> dict[str, int]:
-        """Return the size of a minibatch."""
-        return {"minibatch_size": self.options.minibatch_size}
-
 
 def kl_estimate(log_ratio: Tensor) -> Tensor:
     """Estimate the divergence of the new policy from the old one as the mean of r - 1 - log(r), never negative.

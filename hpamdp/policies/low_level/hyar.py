@@ -488,13 +488,6 @@ class HyAR(ReplayLearner):
             self._update_codec(self._codec_sample())
         self.fit_latent_range()
 
-    def steps_to_update(self) -> dict[str, int]:
-        """Return the length of the warm-up, with a batch after it if the critics learn from no earlier steps."""
-        needed = super().steps_to_update()
-        if self.options.critic_window is not None:
-            needed["warmup_steps"] += self.options.batch_size
-        return needed
-
     def on_progress(self, steps: int) -> None:
         """Lower the probability of random actions, the noise and the learning rates."""
         options = self.options

@@ -353,10 +353,6 @@ class QPAMDP(Learner):
         self.updates: Tensor = nn.Buffer(torch.zeros((), dtype=torch.long))  # of the parameters
         self.to(checked_device(self, device))
 
-    def steps_to_update(self) -> dict[str, int]:
-        """Return the length of the warm-up and one step after it."""
-        return {"warmup_steps": max(0, self.options.warmup_steps - int(self.frames)) + 1}
-
     def has_updated(self) -> bool:
         """Return whether Sarsa has made an update, which leaves traces."""
         return self.sarsa.traces.numel() > 0

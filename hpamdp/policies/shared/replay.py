@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -209,14 +208,6 @@ class ReplayLearner(Learner):
     def is_untrained(self) -> bool:
         """Return whether no update was made."""
         return int(self.updates) == 0
-
-    def steps_to_update(self) -> dict[str, int]:
-        """Return the length of the warm-up and the number of steps for one update."""
-        options = self.options
-        return {
-            "warmup_steps": options.warmup_steps,
-            "updates_per_step": first_multiple(options.updates_per_step),
-        }
 
     def num_updates(self, steps: int) -> int:
         """Return the number of updates within this many steps, the first of which are the warm-up."""
@@ -434,8 +425,3 @@ def unpacked_states(rows: TensorDictBase, specs: PAMDPSpecs) -> TensorDictBase:
 
 def _packs(specs: PAMDPSpecs) -> bool:
     return specs.has_pictures and specs.observation_dtype == torch.float32
-
-
-def first_multiple(updates_per_step: float) -> int:
-    """Return the number of steps, or of decisions, at which the first update is due."""
-    return math.ceil(1.0 / updates_per_step - 1e-9)
