@@ -19,7 +19,9 @@ from hpamdp.run.recorder import Recorder
 from hpamdp.run.stopping import STOP_SIGNALS
 from hpamdp.run.train import run
 
-SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=416", "eval.layouts=2", "eval.every=224", "log_every=64"]
+SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=416", "eval.layouts=2", "eval.every=0", "log_every=64"]
+# Before the stop and after it; evaluations take longer than the training. What resumes in one way alone goes without.
+EVALUATED = "eval.every=224"
 STOPPED_AFTER = 9  # batches, in the middle of a log interval
 SELECTORS = ("ucb", "linucb", "meta_critic", "actor", "exp3")
 
@@ -100,7 +102,7 @@ def words_of(high: str, low: str) -> list[str]:
 # `test_every_pair_resumes_to_the_last_bit` has the others.
 @pytest.mark.parametrize(("high", "low"), [("meta_critic", "random"), ("ucb", "hppo")])
 def test_a_resumed_run_is_the_run_that_was_never_stopped(high, low, tmp_path, monkeypatch):
-    stop_and_resume(words_of(high, low), tmp_path, monkeypatch, signal.SIGINT)
+    stop_and_resume([*words_of(high, low), EVALUATED], tmp_path, monkeypatch, signal.SIGINT)
 
 
 def test_a_run_of_the_selector_alone_resumes_to_the_last_bit(tmp_path, monkeypatch):
@@ -109,14 +111,14 @@ def test_a_run_of_the_selector_alone_resumes_to_the_last_bit(tmp_path, monkeypat
 
 @pytest.mark.slow
 def test_every_signal_that_stops_a_run_saves_it(tmp_path, monkeypatch):
-    stop_and_resume(words_of("ucb", "random"), tmp_path, monkeypatch, *STOP_SIGNALS)
+    stop_and_resume([*words_of("ucb", "random"), EVALUATED], tmp_path, monkeypatch, *STOP_SIGNALS)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("high", "low"), list(itertools.product(SELECTORS, TRAINED)))
 def test_every_pair_resumes_to_the_last_bit(high, low, tmp_path, monkeypatch):
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-    stop_and_resume(words_of(high, low), tmp_path, monkeypatch, *numbers)
+    stop_and_resume([*words_of(high, low), EVALUATED], tmp_path, monkeypatch, *numbers)
 
 
 @pytest.mark.slow
