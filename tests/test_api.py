@@ -433,9 +433,9 @@ def test_an_agent_is_refused_at_a_problem_of_other_sizes(platform_agent):
 def test_an_agent_plays_its_problem_in_gymnasiums_form_also_in_a_wrapper(agent, env_id):
     # Goal's form has no published initial parameters. Moving's has bounds, by which observations would be scaled.
     loaded, env = hpamdp.load(agent), gymnasium.make(f"hpamdp/{env_id}-v0")
-    played = loaded.evaluate(env, episodes=30, per_episode=True)
+    played = loaded.evaluate(env, episodes=10, per_episode=True)
     doubled = gymnasium.wrappers.TransformReward(env, lambda reward: 2.0 * reward)
-    assert loaded.evaluate(doubled, episodes=30)["return"] == pytest.approx(2.0 * float(played["return"].mean()))
+    assert loaded.evaluate(doubled, episodes=10)["return"] == pytest.approx(2.0 * float(played["return"].mean()))
     own = loaded.evaluate(episodes=100, per_episode=True)["return"]
     assert float(played["return"].mean()) == pytest.approx(float(own.mean()), abs=float(own.std()))
 

@@ -80,8 +80,8 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path):
 
 
 def test_evaluations_move_no_random_generator_of_the_training(tmp_path):
-    start(tmp_path / "often", "low=random", "eval.every=128")
-    start(tmp_path / "seldom", "low=random", "eval.every=512")
+    start(tmp_path / "often", "low=random", "total_frames=512", "eval.every=128")
+    start(tmp_path / "seldom", "low=random", "total_frames=512", "eval.every=512")
     often, seldom = (rows_of(tmp_path / name)[-1] for name in ("often", "seldom"))
     assert often["eval/score"] == seldom["eval/score"]
     states = []
@@ -129,7 +129,7 @@ def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, cap
     played = np.load(tmp_path / "stopped" / "evaluation.npz")["score"].mean()
     assert float(before["eval/score"]) == stopped["score"] == pytest.approx(played)
     assert stopped["evaluated_frames"] == 0 and "of the agent after 0 frames" in printed
-    total = stopped["frames"] + 2048
+    total = stopped["frames"] + 256
     more = [f"resume={tmp_path / 'stopped'}", f"total_frames={total}"]
     assert run(compose_config(more), tmp_path / "resumed", more) == 0
     resumed = json.loads((tmp_path / "resumed" / "summary.json").read_text())
@@ -147,7 +147,7 @@ def test_ctrl_c_ends_an_evaluation_at_once_and_resuming_repeats_it(tmp_path, mon
             pytest.fail("the evaluation went on")
         return step(self, td)
 
-    whole = ["low=random", "high=ucb", "eval.layouts=8", "eval.every=128", "total_frames=1024"]
+    whole = ["low=random", "high=ucb", "eval.layouts=8", "eval.every=128", "total_frames=512"]
     start(tmp_path / "whole", *whole)
     monkeypatch.setattr(BoatDockEnv, "_step", interrupted)
     assert start(tmp_path / "stopped", *whole) == 130
