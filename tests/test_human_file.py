@@ -13,8 +13,9 @@ import torch
 
 from hpamdp.data import DataError
 from hpamdp.data.human import released_file
-from hpamdp.data.human.released_file import Outcome, read
+from hpamdp.data.human.released_file import read
 from hpamdp.env.boatdock import harbour
+from hpamdp.env.boatdock.task import Outcome
 
 OUTCOMES = {1: Outcome.OUT_OF_FUEL, 2: Outcome.SUCCESS, 3: Outcome.TOO_FAST, 4: Outcome.OUT_OF_BOUNDS}
 

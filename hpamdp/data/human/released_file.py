@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-from enum import IntEnum
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +21,7 @@ from hpamdp.data import DataError
 from hpamdp.data.human import schema
 from hpamdp.data.human.options import SHA256
 from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock.task import Outcome
 from hpamdp.files import read_regular
 from hpamdp.messages import reason_of
 
@@ -34,18 +34,16 @@ EPISODES_PER_BLOCK = 60
 _LOG_TOLERANCE = 2.5  # ticks by which the tank and the logged presses may differ in a complete log
 _MAX_BYTES = 64 * 2**20  # larger files are not read; the released one has 4 million
 
-Outcome = IntEnum("Outcome", [name.upper() for name in physics.OUTCOMES], start=0)  # type: ignore[misc]
-"""The outcomes of episodes by their numbers here, such as `Outcome.SUCCESS`."""
-# The numbers here of the file's outcomes 1 to 4.
-_OUTCOMES = np.array([physics.OUT_OF_FUEL, physics.SUCCESS, physics.TOO_FAST, physics.OUT_OF_BOUNDS])
+# The file's outcomes 1 to 4.
+_OUTCOMES = np.array([Outcome.OUT_OF_FUEL, Outcome.SUCCESS, Outcome.TOO_FAST, Outcome.OUT_OF_BOUNDS])
 
 QUIRKS = (
     "A press's next position is where the next logged press began. The boat may still have been gliding.",
     "An episode's final press has no next position (NaN here). If a single press was logged, `obs` is empty.",
     "Presses that overlapped another are not logged. In some episodes the first or the only press is missing.",
     "`gas` (1 - logged seconds / 5) ignores the missing presses. `tank` (ticks left of 360) counts them.",
-    "Outcomes are renumbered, see `Outcome`: 1, 2, 3 and 4 of the file (out of fuel, success, too fast, out of bounds) "
-    "are 4, 1, 2 and 3 here.",
+    "Outcomes are renumbered, see `hpamdp.env.boatdock.task.Outcome`: 1, 2, 3 and 4 of the file (out of fuel, success, "
+    "too fast, out of bounds) are 4, 1, 2 and 3 here.",
     "`complete` marks the episodes whose log agrees with the tank: |tank + 60 x logged seconds - 360| <= 2.5 ticks.",
 )
 

@@ -16,7 +16,7 @@ from scipy.stats import binomtest
 from hpamdp.env.boatdock.harbour import CONGRUENT, INCONGRUENT, NOT_CHOSEN
 from hpamdp.env.boatdock.physics import DOCK_RADIUS, HARBOUR_RADIUS, OUTCOMES, SUCCESS
 from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
-from hpamdp.env.boatdock.task import OUTCOME_TABLE
+from hpamdp.env.boatdock.task import Outcome
 from hpamdp.figure_style import AGENT, FAINT, INK, REFERENCES, label_ends
 
 _WATER, _RIM, _DOCK, _DOCK_EDGE = "#eef4f6", "#9fb9c2", "#f4dfb0", "#c8963e"
@@ -74,7 +74,7 @@ def _trajectories(evaluation: Mapping[str, np.ndarray], names: tuple[str, ...]) 
 
 
 def _colour(outcome: str) -> str:
-    return OUTCOME_TABLE[outcome].colour
+    return Outcome[outcome.upper()].colour
 
 
 def _words(name: str) -> str:

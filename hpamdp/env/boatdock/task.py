@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 if TYPE_CHECKING:
@@ -26,28 +27,36 @@ MAX_PRESSES = 25
 SUCCESS_REWARD, FAILURE_REWARD = 5.0, -1.0
 
 
-class Outcome(NamedTuple):
-    """How the game in the browser tells of an outcome, and its colour in figures."""
+class Outcome(IntEnum):
+    """How an episode ended: the number in every table and tensordict, its words in the browser, its colour in figures.
+
+    In this order: going on, success, the failures, the time limit. Numbers, rewards, tables, figures, files and the
+    page follow from it. When an outcome occurs is written where presses are: for columns in `physics.press`, for one
+    row in `kernel.press`, and in `play/page/physics.js`. `planner` knows only docking at rest: if a rule forbids some
+    of its plans, it would give a wrong ceiling without an error. tests/test_rule_copies.py compares names and
+    constants, tests/test_planner.py plays the plans.
+    """
 
     words: str
     colour: str
 
+    def __new__(cls, number: int, words: str, colour: str) -> Outcome:
+        """Return a member with its words and colour."""
+        member = int.__new__(cls, number)
+        member._value_, member.words, member.colour = number, words, colour
+        return member
 
-# The outcomes by their names, in this order: going on, success, the failures, the time limit. Numbers, rewards, tables,
-# figures, files and the page follow from it. When an outcome occurs is written where presses are: for columns in
-# `physics.press`, for one row in `kernel.press`, and in `play/page/physics.js`. `planner` knows only docking at rest:
-# if a rule forbids some of its plans, it would give a wrong ceiling without an error.
-# tests/test_rule_copies.py compares names and constants, tests/test_planner.py plays the plans.
-OUTCOME_TABLE = {
-    "sailing": Outcome("Sailing", "#8c8c8c"),
-    "success": Outcome("Docked", "#009E73"),
-    "too_fast": Outcome("Too fast", "#D55E00"),
-    "out_of_bounds": Outcome("Out of the harbour", "#AA4499"),
-    "out_of_fuel": Outcome("Out of fuel", "#332288"),
-    "time_limit": Outcome(f"{MAX_PRESSES} presses and no dock", "#7FC8F2"),
-}
-OUTCOMES = tuple(OUTCOME_TABLE)
-SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL, TIME_LIMIT = range(len(OUTCOMES))
+    SAILING = 0, "Sailing", "#8c8c8c"
+    SUCCESS = 1, "Docked", "#009E73"
+    TOO_FAST = 2, "Too fast", "#D55E00"
+    OUT_OF_BOUNDS = 3, "Out of the harbour", "#AA4499"
+    OUT_OF_FUEL = 4, "Out of fuel", "#332288"
+    TIME_LIMIT = 5, f"{MAX_PRESSES} presses and no dock", "#7FC8F2"
+
+
+OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome)
+# Plain numbers, which kernels and tensors take.
+SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL, TIME_LIMIT = map(int, Outcome)
 
 # With no more fuel than this (seconds) the tank counts as empty. The remainder is a rounding error of float32.
 DRY = 1e-6

@@ -18,7 +18,7 @@ from hpamdp.env.boatdock.reference import (
     HUMAN_SUCCESS_BY_BLOCK,
     OFFSET_EDGES,
 )
-from hpamdp.env.boatdock.task import MAX_PRESSES, OUTCOME_TABLE, Boats, Rules
+from hpamdp.env.boatdock.task import MAX_PRESSES, Boats, Outcome, Rules
 from hpamdp.env.play_page import EpisodeError
 
 BLOCK, NUM_BLOCKS = 60, 6  # as in the recording of people
@@ -43,7 +43,7 @@ def shared_data(has_server: bool, **rules: float) -> dict[str, Any]:
         "tank": physics.TANK,
         "max_duration": physics.MAX_DURATION,
         "max_presses": MAX_PRESSES,
-        "outcomes": {name: outcome.words for name, outcome in OUTCOME_TABLE.items()},
+        "outcomes": {outcome.name.lower(): outcome.words for outcome in Outcome},
     }
     rules_of_page = {**shared, **rules}
     return {"format": episodes.FORMAT, "software": __version__, "has_server": has_server, "rules": rules_of_page}
