@@ -1,4 +1,4 @@
-"""The command line for the recording: `python -m hpamdp.data.human download | check | summary | export`."""
+"""The command line for the recording: `python -m hpamdp.data.human download | check | summary | models | export`."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from hpamdp.data import DataError, export
-from hpamdp.data.human import minari, played_file, statistics, validation
+from hpamdp.data.human import minari, models, played_file, statistics, validation
 from hpamdp.data.human.download import download
 from hpamdp.data.human.episodes import scores_by_person, select
 from hpamdp.data.human.options import SHA256
+from hpamdp.data.human.press_model import UPDATES
 from hpamdp.data.human.released_file import (
     EPISODES_PER_BLOCK,
     FILE_NAME,
@@ -70,7 +71,7 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="python -m hpamdp.data.human",
-        description="Fetch, check, summarise and export the recording of 40 people at the boat-docking task.",
+        description="Fetch, check, summarise, model and export the recording of 40 people at the boat-docking task.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
 
@@ -100,6 +101,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     summary_parser.add_argument("--json", action="store_true", help="print json, by person, block and controller")
     summary_parser.set_defaults(run=_summary)
+
+    models_parser = commands.add_parser(
+        "models",
+        parents=[file_arguments],
+        help="fit models of people's choices and presses, test them on other people, and simulate people",
+    )
+    models_parser.add_argument("--folds", type=int, default=5, metavar="K", help="folds of people (default 5)")
+    models_parser.add_argument("--updates", type=int, default=UPDATES, help=f"of a press model (default {UPDATES})")
+    models_parser.add_argument("--seed", type=int, default=0, help="of folds, models and simulated people (default 0)")
+    models_parser.add_argument(
+        "--recorded", action="store_true", help="model the presses as they were recorded; simulate nobody"
+    )
+    models_parser.add_argument("--json", action="store_true", help="print json, by person, block and controller")
+    models_parser.set_defaults(run=_models)
 
     export_parser = commands.add_parser(
         "export", parents=[file_arguments], help="write the tables or the transitions for other programs"
@@ -186,35 +201,89 @@ def _print_counts(name: str, values: Tensor) -> None:
     )
 
 
+def _figures(data: HumanData) -> dict[str, Any]:
+    """Return figures of all episodes and by controller, block and person, and the curve of choices."""
+    by = {column: statistics.figures_by(data, column) for column in ("controller", "block", "person")}
+    return {"all": statistics.figures(data), **by, "congruent_by_offset": statistics.choice_curve(data).tolist()}
+
+
 def _summary(options: argparse.Namespace) -> None:
     data = _read(options)
-    overall = statistics.figures(data)
-    by_controller = statistics.figures_by(data, "controller")
-    by_block = statistics.figures_by(data, "block")
-    by_person = statistics.figures_by(data, "person")
-    curve = statistics.choice_curve(data).tolist()
+    figures = _figures(data)
     if options.json:
-        summary = {
-            "all": overall,
-            "controller": by_controller,
-            "block": by_block,
-            "person": by_person,
-            "congruent_by_offset": curve,
-        }
-        say(json.dumps(_without_nan(summary), indent=1, allow_nan=False))
+        say(json.dumps(_without_nan(figures), indent=1, allow_nan=False))
         return
-    say(f"{'':24}{'episodes':>8}  {'score':>7}  {'success':>7}  {'too fast':>8}  {'out':>6}  {'no fuel':>7}  presses")
-    _print_row("all", overall)
-    for option, figures in by_controller.items():
-        _print_row(harbour.CONTROLLERS[option], figures)
-    for block, figures in by_block.items():
-        first = EPISODES_PER_BLOCK * block + 1
-        _print_row(f"episodes {first} to {first + EPISODES_PER_BLOCK - 1}", figures)
+    _print_head()
+    _print_row("all", figures["all"])
+    for option, of_option in figures["controller"].items():
+        _print_row(harbour.CONTROLLERS[option], of_option)
+    _print_blocks(figures["block"])
     best = int(scores_by_person(data).nan_to_num(nan=-torch.inf).argmax())
-    _print_row(f"best person ({best})", by_person[best])
+    _print_row(f"best person ({best})", figures["person"][best])
     say("congruent controller chosen, by degrees between the bearing and its nearest direction:")
+    _print_curve("", figures["congruent_by_offset"])
+
+
+def _models(options: argparse.Namespace) -> None:
+    data = _read(options, one_frame=True)
+    if not len(data.presses):
+        raise DataError(NO_PRESS)
+    if options.updates < 1:
+        raise DataError(f"--updates {options.updates}, but must be at least 1")
+    settings = {"updates": options.updates, "seed": options.seed}
+    folds = {
+        "at random": models.folds_at_random(data, options.folds, options.seed),
+        "by number": models.halves_by_number(data),
+    }
+    losses = {
+        name: models.held_out_losses(data, each, rest_to_rest=not options.recorded, **settings)
+        for name, each in folds.items()
+    }
+    found: dict[str, Any] = {"held_out": {name: each.summary(data) for name, each in losses.items()}}
+    if not options.recorded:
+        found |= {"people": _figures(data), "simulated": _figures(models.simulate(data, **settings))}
+    if options.json:
+        say(json.dumps(_without_nan(found), indent=1, allow_nan=False))
+        return
+    say(f"{'nats on people held out':36}{'choice':>7}  {'six bins':>8}  {'key':>6}  {'duration':>8}")
+    at_random, by_number = (found["held_out"][name] for name in folds)
+    _print_losses(f"{options.folds} folds of people at random", at_random["all"])
+    for block, of_block in at_random["block"].items():
+        _print_losses(_episodes_of(block), of_block)
+    _print_losses("halves by number", by_number["all"])
+    for half in folds["by number"]:
+        mask = torch.isin(data.episodes["person"], half)
+        _print_losses(f"people {half[0]} to {half[-1]}", losses["by number"].means(mask))
+    for name in ("people", "simulated"):
+        if name in found:
+            say("")
+            _print_head()
+            _print_row(name, found[name]["all"])
+            _print_blocks(found[name]["block"])
+            _print_curve("congruent by degrees off its direction: ", found[name]["congruent_by_offset"])
+
+
+def _print_losses(name: str, losses: Figures) -> None:
+    say(f"{name:36}{losses['choice']:7.3f}  {losses['bins']:8.3f}  {losses['key']:6.3f}  {losses['duration']:8.3f}")
+
+
+def _print_head() -> None:
+    say(f"{'':24}{'episodes':>8}  {'score':>7}  {'success':>7}  {'too fast':>8}  {'out':>6}  {'no fuel':>7}  presses")
+
+
+def _print_blocks(by_block: dict[int, Figures]) -> None:
+    for block, figures in by_block.items():
+        _print_row(_episodes_of(block), figures)
+
+
+def _episodes_of(block: int) -> str:
+    first = EPISODES_PER_BLOCK * block + 1
+    return f"episodes {first} to {first + EPISODES_PER_BLOCK - 1}"
+
+
+def _print_curve(name: str, curve: Sequence[float]) -> None:
     bins = zip(OFFSET_EDGES[:-1], OFFSET_EDGES[1:], curve, strict=True)
-    say(", ".join(f"{low}-{high}: {probability:.3f}" for low, high, probability in bins))
+    say(name + ", ".join(f"{low}-{high}: {probability:.3f}" for low, high, probability in bins))
 
 
 def _without_nan(value: Any) -> Any:
