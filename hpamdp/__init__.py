@@ -17,13 +17,22 @@ Importing this package registers the Gymnasium ids of its problems. It loads nei
 names is used.
 """
 
+from typing import Any
+
 import lazy_loader
 
+from hpamdp.imports import collector_paused
 from hpamdp.search_path import is_command_line, put_working_directory_last
 
 __version__ = "0.3.0"
 # `__init__.pyi` lists the names with their modules, which are imported when a name is used.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_imported, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    with collector_paused():
+        return _imported(name)
+
 
 if is_command_line():
     # `python -m` puts the working directory first, and the next import needs other packages.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import importlib
 import os
 import sys
@@ -27,6 +28,7 @@ from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.hydra_errors import explained, not_understood
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.env.errors import EnvironmentFaultError
+from hpamdp.imports import collector_paused
 from hpamdp.messages import (
     FAILED,
     INTERRUPTED,
@@ -39,7 +41,7 @@ from hpamdp.messages import (
 )
 from hpamdp.run import compatibility, sweep
 from hpamdp.run.folder import is_about_folder, locked
-from hpamdp.search_path import protect_children, put_working_directory_last, unprotect_children
+from hpamdp.search_path import is_command_line, protect_children, put_working_directory_last, unprotect_children
 from hpamdp.shell import program
 
 # Further commands, and the modules whose `main` gets the words that follow and a parser.
@@ -98,7 +100,8 @@ def _main() -> None:
 
 def _run_command(name: str, words: list[str]) -> int:
     """Run a command that has options of its own, and return its exit code."""
-    command = importlib.import_module(_COMMANDS[name])
+    with collector_paused():
+        command = importlib.import_module(_COMMANDS[name])
     parser = _Parser(prog=f"{program()} {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
     with problems_explained():
         return command.main(words, parser)
@@ -168,7 +171,10 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
         with locked(output_dir):
             is_new = cfg.resume is None and cfg.mode != "eval"  # a saved run completes other configs
             config = compatibility.checked(cfg, job_overrides()) if is_new else None  # before torch is imported
-            from hpamdp.run import train  # takes seconds, which a wrong setting need not wait for
+            with collector_paused():
+                from hpamdp.run import train  # takes seconds, which a wrong setting need not wait for
+            if is_command_line():  # whose process is its own
+                gc.freeze()  # the collector then never searches the modules
 
             if cfg.resume == RESUME_AUTO:
                 cfg.resume = None

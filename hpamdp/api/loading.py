@@ -21,6 +21,7 @@ from hpamdp.config.saved import choices_of
 from hpamdp.config.schema import RunConfig
 from hpamdp.env.errors import closed_on_error
 from hpamdp.env.facts import NAMING_SETTINGS
+from hpamdp.imports import collector_paused
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
 from hpamdp.run.players import load_agent
@@ -82,6 +83,7 @@ def load(
     return loaded(file, words, own, problem.objects)
 
 
+@collector_paused()
 def loaded(file: Path, words: Sequence[str], settings: Sequence[tuple[str, Any]], objects: Mapping[str, Any]) -> Agent:
     """Return the agent of a file, and the metrics beside it."""
     with torch_restored(), problems_explained():

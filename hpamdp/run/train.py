@@ -12,6 +12,7 @@ from hpamdp.cards import CallbackCard, outside_card
 from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.saved import needs_trust
 from hpamdp.config.schema import Config, RunConfig
+from hpamdp.imports import collector_paused
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble, choose_selector
@@ -96,6 +97,7 @@ def go_on(
     return None, source is not None, code
 
 
+@collector_paused()
 def begin(
     config: Config,
     source: Path | None = None,
