@@ -7,15 +7,22 @@ from __future__ import annotations
 
 import errno
 import glob
+import io
 import os
 import secrets
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from hashlib import sha256
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _ABANDONED_S = 3600.0  # after which nobody still writes to a file
+_MAX_KEPT_BYTES = 2**26  # of an array in the cache
 
 
 @contextmanager
@@ -96,3 +103,28 @@ def read_regular(path: Path, max_bytes: int, *, follow_links: bool = True) -> by
     if max(size, len(data)) > max_bytes:
         raise OSError(errno.EFBIG, f"has {size} bytes, but may have at most {max_bytes}", str(path))
     return data
+
+
+def kept_in_cache(kind: str, depends_on: bytes, compute: Callable[[], np.ndarray]) -> np.ndarray:
+    """Return an array that takes seconds to compute, and keep it in the user's cache for later runs.
+
+    If the cache cannot be read or written, the array is computed.
+
+    Args:
+        kind: name of the array's folder in the cache.
+        depends_on: all that the array depends on, the source code included.
+        compute: makes the array.
+    """
+    import numpy as np
+    from platformdirs import user_cache_path
+
+    file = user_cache_path("hpamdp") / kind / f"{sha256(depends_on).hexdigest()}.npy"
+    with suppress(OSError, ValueError, EOFError):
+        kept: np.ndarray = np.load(io.BytesIO(read_regular(file, _MAX_KEPT_BYTES)), allow_pickle=False)
+        return kept
+    array = compute()
+    with suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as partial:
+            np.save(partial, array)
+    return array

@@ -5,11 +5,12 @@ import shutil
 import socket
 import stat
 
+import numpy as np
 import pytest
 from conftest import compose_config
 
 import hpamdp
-from hpamdp.files import replacing
+from hpamdp.files import kept_in_cache, replacing
 from hpamdp.run import play
 from hpamdp.run.folder import locked
 from hpamdp.run.train import run
@@ -140,3 +141,23 @@ def test_an_error_inside_the_block_about_the_new_file_names_the_path(tmp_path):
         partial.unlink()
         partial.read_bytes()
     assert error.value.filename == str(tmp_path / "x.safetensors")
+
+
+def test_an_array_in_the_cache_is_computed_once_and_again_if_its_file_is_broken(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    computed = []
+
+    def compute():
+        computed.append(1)
+        return np.arange(3)
+
+    for given in (b"one", b"one", b"two"):
+        assert kept_in_cache("arrays", given, compute).tolist() == [0, 1, 2]
+    assert len(computed) == 2
+    for file in (tmp_path / "hpamdp" / "arrays").iterdir():
+        file.write_bytes(file.read_bytes()[:-1])
+    assert kept_in_cache("arrays", b"one", compute).tolist() == [0, 1, 2]
+    assert len(computed) == 3
+    monkeypatch.setenv("XDG_CACHE_HOME", os.devnull)
+    assert kept_in_cache("arrays", b"one", compute).tolist() == [0, 1, 2]
+    assert len(computed) == 4

@@ -49,6 +49,8 @@ from hpamdp.env.boatdock.physics import (
     total_distance,
 )
 from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Boats, BoatState, Rules
+from hpamdp.env.kernels import sources
+from hpamdp.files import kept_in_cache
 
 MAX_PRESSES = 3
 
@@ -75,6 +77,7 @@ _ZOOM = 0.6  # factor by which they shrink each round
 _CHUNK = 64  # number of boats searched together, which bounds the memory and fits the cache
 _ROUGH_GRID = (3, 5)  # points along the sides of the only grid of a rough search
 _ROUGH_CHUNK = 512
+_KEPT_BOATS = 100  # whose best scores take longer to compute than to read
 
 
 class Plan(NamedTuple):
@@ -374,7 +377,22 @@ def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
     """Return the best score with each controller, from the start with a full tank, `[N, num_controllers]`.
 
     With a `switch_cost`, it is the best score of a plan that begins with that controller.
+
+    The scores of many boats, as in an evaluation, take seconds. The user's cache keeps them.
     """
+    if len(keymap) < _KEPT_BOATS:
+        return _best_scores(rules, layout, keymap)
+    columns = [column.numpy(force=True).tobytes() for column in (*layout, keymap)]
+    given = (*sources(), torch.__version__, torch.get_default_dtype(), repr(rules), len(keymap))
+    scores = kept_in_cache(
+        "ceilings",
+        b"".join([repr(given).encode(), *columns]),
+        lambda: _best_scores(rules, layout, keymap).numpy(force=True),
+    )
+    return torch.from_numpy(scores).to(keymap.device)
+
+
+def _best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
     if rules.are_peoples:
         return best_plans(layout, keymap).score
     fuel = torch.full_like(layout.start_x, TANK)
