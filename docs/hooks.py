@@ -309,18 +309,19 @@ def fields_of(path: str, target: str | None) -> dict[str, tuple[str, object, str
     if target is None or not target.startswith("hpamdp."):
         return {}
     from hpamdp.config.components import SUPPLIED_ARGUMENTS, defaults_of, load_class, settings_model
+    from hpamdp.settings import meanings_of
 
     group = Path(path).parent.name
     model = settings_model(load_class(target), SUPPLIED_ARGUMENTS.get(group, ()))
-    schema = model.model_json_schema()
+    schema, meanings = model.model_json_schema(), meanings_of(model)
     defaults = defaults_of(model)
     return {
         name: (
             allowed_values(schema["properties"][name], schema.get("$defs", {})),
             defaults[name],
-            " ".join((field.description or "").split()),
+            " ".join(meanings.get(name, "").split()),
         )
-        for name, field in model.model_fields.items()
+        for name in model.model_fields
     }
 
 

@@ -20,7 +20,12 @@ yaml file names the class and holds the values that differ from these defaults. 
 
 from __future__ import annotations
 
+import ast
+import inspect
+import textwrap
 from collections.abc import Mapping
+from contextlib import suppress
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -118,7 +123,6 @@ class Settings(BaseModel):
         frozen=True,
         allow_inf_nan=False,
         protected_namespaces=(),
-        use_attribute_docstrings=True,
         defer_build=True,
     )
 
@@ -143,3 +147,20 @@ class Settings(BaseModel):
             return cls(**values)
         except ValidationError as error:
             raise SettingError(complaints(error, cls, values, f"setting of {cls.__name__}", show=as_code)) from error
+
+
+def meanings_of(model: type[BaseModel]) -> dict[str, str]:
+    """Return the docstring below each setting, by the names of settings.
+
+    Only help and pages need them. With pydantic's `use_attribute_docstrings` every start would parse the sources.
+    """
+    found = {}
+    for each in reversed(model.__mro__):
+        if not issubclass(each, Settings):
+            continue
+        with suppress(OSError, TypeError):  # no file has its source
+            tree: Any = ast.parse(textwrap.dedent(inspect.getsource(each)))
+            for statement, below in pairwise(tree.body[0].body):
+                if isinstance(statement, ast.AnnAssign) and isinstance(below, ast.Expr):
+                    found[ast.unparse(statement.target)] = str(ast.literal_eval(below.value))
+    return found

@@ -24,7 +24,7 @@ from hpamdp.config.saved import read_saved
 from hpamdp.policies.high_level.ucb import UCB
 from hpamdp.policies.low_level.random import Random
 from hpamdp.run import compatibility
-from hpamdp.settings import SettingError
+from hpamdp.settings import SettingError, meanings_of
 
 FILES = [(group, name) for group in GROUPS for name in choices(group)]
 
@@ -256,7 +256,7 @@ def test_a_yaml_holds_only_what_differs_from_its_class_and_every_setting_has_its
             model = settings_model(load_class(target), SUPPLIED_ARGUMENTS.get(group, ()))
             defaults = defaults_of(model)
             same = [key for key, value in given.items() if key != "budget" and value == defaults.get(key, value)]
-            nameless = [key for key, field in model.model_fields.items() if not field.description]
+            nameless = sorted(model.model_fields.keys() - meanings_of(model).keys())
             offenders += [f"{group}/{name}: {key}" for key in (*same, *nameless)]
     assert not offenders
 

@@ -18,6 +18,7 @@ from hpamdp.config.compose import listed_callbacks, plain
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed
 from hpamdp.config.schema import RunConfig
+from hpamdp.settings import meanings_of
 from hpamdp.shell import program
 
 _WIDTH = 110  # letters of a line
@@ -99,6 +100,7 @@ def _explained_choice(group: str, name: str, given: Mapping[str, Any], prefix: s
 
 def _explained(model: type[BaseModel], prefix: str, values: dict[str, Any]) -> Iterator[str]:
     """Yield a line with each setting and its value, and its meaning below."""
+    meanings = meanings_of(model)
     for name, field in model.model_fields.items():
         default = values.get(name, field.default)
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
@@ -106,5 +108,5 @@ def _explained(model: type[BaseModel], prefix: str, values: dict[str, Any]) -> I
             continue
         shown = "" if default is PydanticUndefined else json.dumps(default, default=str)
         yield f"  {prefix}{name}={shown}"
-        meaning = " ".join((field.description or "").split())
+        meaning = " ".join(meanings.get(name, "").split())
         yield textwrap.fill(meaning, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)
