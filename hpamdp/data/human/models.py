@@ -88,7 +88,7 @@ def held_out_losses(
     in_bins = one_hot(offset_bins(data), len(OFFSET_EDGES) - 1)
     features, presses = features_of(data), Presses(data, rest_to_rest=rest_to_rest)
     choice, of_bins = torch.zeros(2, len(person), dtype=torch.float64).unbind(0)
-    key, duration = torch.zeros(2, len(presses.key)).unbind(0)
+    key, duration = torch.zeros(2, len(presses.key), dtype=torch.float32).unbind(0)
     for fold in folds:
         held_out = torch.isin(person, fold)
         fitted = ~held_out
@@ -133,12 +133,14 @@ def simulate(data: HumanData, *, updates: int = UPDATES, seed: int = 0) -> Human
             bearing[:, number] = torch.atan2(state.goal_y - state.start_y, state.goal_x - state.start_x)
             index = torch.full((num_people,), number)
             likely = choices.probability(choice_features(index, bearing[:, number], bearing, choice))
-            controller = (torch.rand(num_people) < likely).long()
+            controller = (torch.rand(num_people, dtype=torch.float32) < likely).long()
             choice[:, number] = 2.0 * controller - 1.0
             while not td[keys.DONE].all():
                 before = env.state
                 key, duration = presses.sample(press_features(td[keys.OBSERVATION], controller, past))
-                parameters = torch.zeros(num_people, harbour.NUM_KEYS).scatter(1, key[:, None], duration[:, None])
+                parameters = torch.zeros(num_people, harbour.NUM_KEYS, dtype=torch.float32).scatter(
+                    1, key[:, None], duration[:, None]
+                )
                 action = TensorDict({"discrete": key, "parameters": parameters}, td.batch_size)
                 td = step_mdp(env.step(td.update({keys.OPTION: controller, keys.ACTION: action})))
                 played.append(_presses(before, env.state, key, torch.arange(num_people) * num_episodes + number))

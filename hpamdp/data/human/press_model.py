@@ -157,13 +157,17 @@ class PressModel(nn.Module):
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
             self.hidden = nn.Sequential(
-                nn.Linear(features.shape[-1], _WIDTH), nn.SiLU(), nn.Linear(_WIDTH, _WIDTH), nn.SiLU()
+                nn.Linear(features.shape[-1], _WIDTH, dtype=torch.float32),
+                nn.SiLU(),
+                nn.Linear(_WIDTH, _WIDTH, dtype=torch.float32),
+                nn.SiLU(),
             )
-            self.heads = nn.Linear(_WIDTH, 1 + 3 * _NUM_GAUSSIANS)
+            self.heads = nn.Linear(_WIDTH, 1 + 3 * _NUM_GAUSSIANS, dtype=torch.float32)
             with torch.no_grad():
                 self.heads.weight.mul_(0.1)
-                spread = torch.linspace(0.1, 1.2, _NUM_GAUSSIANS)
-                self.heads.bias.copy_(torch.cat([torch.zeros(1 + _NUM_GAUSSIANS), spread, spread * 0.0 - 1.0]))
+                spread = torch.linspace(0.1, 1.2, _NUM_GAUSSIANS, dtype=torch.float32)
+                logits = torch.zeros(1 + _NUM_GAUSSIANS, dtype=torch.float32)
+                self.heads.bias.copy_(torch.cat([logits, spread, torch.full_like(spread, -1.0)]))
             self._fit(presses, is_fitted.nonzero()[:, 0], updates)
 
     def _fit(self, presses: Presses, rows: Tensor, updates: int) -> None:
