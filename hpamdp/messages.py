@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from io import TextIOWrapper
+from typing import Any, TextIO, cast
 
 # Exit codes of the command line, beside 0.
 FAILED = 1
@@ -40,6 +41,49 @@ def first_line(text: object) -> str:
     return one_line(str(text).strip().partition("\n")[0])
 
 
+class LenientStream:
+    """A text stream on which writing never fails. If the terminal was closed or the disk is full, only text is lost.
+
+    Args:
+        stream: the stream to write to. A letter that it cannot encode is written as its number.
+
+    Attributes:
+        error: the last error of a write; None if all text was written.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self.error: OSError | ValueError | None = None
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write the text if possible."""
+        try:
+            self._stream.write(text)
+        except (OSError, ValueError) as error:
+            self.error = error
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream if possible."""
+        try:
+            self._stream.flush()
+        except (OSError, ValueError) as error:
+            self.error = error
+
+    def finish(self) -> None:
+        """Flush the stream, or drop the rest of its text if that fails, so that the interpreter's last flush works."""
+        self.error = None
+        self.flush()
+        if self.error is not None:
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+
+
 def exit_code(program: Callable[[], int | None]) -> int:
     """Run a program and return its exit code, or 1 if some of its text could not be written to stdout.
 
@@ -49,44 +93,39 @@ def exit_code(program: Callable[[], int | None]) -> int:
     Args:
         program: returns its exit code. None stands for 0.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a letter that it cannot encode is written as its number
-    _lost.clear()
+    out, err = LenientStream(sys.stdout), LenientStream(sys.stderr)
     try:
-        code = program() or 0
-    except SystemExit as stop:
-        if stop.code:
-            raise
-        code = 0  # argparse has printed its help
+        with redirect_stdout(cast(TextIO, out)), redirect_stderr(cast(TextIO, err)):
+            try:
+                code = program() or 0
+            except SystemExit as stop:
+                if stop.code:
+                    raise
+                code = 0  # argparse has printed its help
+            out.flush()
+            if code or out.error is None:
+                return code
+            if not isinstance(out.error, BrokenPipeError):
+                warn(f"stdout: {reason_of(out.error)}")
+            return FAILED
     finally:
-        say("", end="")
-        if _lost:  # the rest of the text is dropped, so that the interpreter's last flush works
-            with suppress(OSError, ValueError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if code or not _lost:
-        return code
-    if not isinstance(_lost[0], BrokenPipeError):
-        warn(f"stdout: {reason_of(_lost[0])}")
-    return FAILED
+        out.finish()
+        err.finish()
 
 
-# The errors of `say`.
-_lost: list[OSError | ValueError] = []
-
-
-def say(text: str, end: str = "\n") -> None:
+def say(text: str) -> None:
     """Print to stdout, if it is still there."""
-    try:
-        print(text, end=end, flush=True)
-    except (OSError, ValueError) as error:
-        _lost.append(error)
+    _print(text, sys.stdout)
 
 
 def warn(message: str) -> None:
     """Write one line to stderr, if it is still there. This works if logging is switched off."""
+    _print(message, sys.stderr)
+
+
+def _print(text: str, stream: TextIO) -> None:
     with suppress(OSError, ValueError):
-        print(message, file=sys.stderr, flush=True)
+        print(text, file=stream, flush=True)
 
 
 def reason_of(error: BaseException | None) -> str:

@@ -122,4 +122,4 @@ def test_a_run_says_what_practised_and_which_selector_holds_one_option(high, is_
     assert run(compose_config(words), tmp_path / "run") == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert sum(summary["practised"].values()) == pytest.approx(1.0)
-    assert any(line.startswith(f"high={high} holds") for line in summary["remarks"]) == is_told
+    assert [line.startswith(f"high={high} holds") for line in summary["one_option"]] == [True] * is_told

@@ -25,7 +25,9 @@ from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.loggers import EarlierRun, LenientLogger, Logger
 from hpamdp.run.summary import (
     EVALUATED_FRAMES,
-    REMARKS,
+    ONE_ACTION,
+    ONE_OPTION,
+    SHORT_SIGHT,
     WITHOUT_UPDATE,
     closing_table,
     short_sight,
@@ -227,8 +229,9 @@ class Recorder:
         summary |= {**self._callback_metrics, **ending}
         if self.config.run.mode != "eval":
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
-            seen = short_sight(self.config.learners, measured["steps"])
-            summary[REMARKS] = [*seen, *self._one_option(), *self.parts.evaluation.one_action]
+            summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])
+            summary[ONE_OPTION] = self._one_option()
+            summary[ONE_ACTION] = self.parts.evaluation.one_action
             summary["practised"] = self.parts.agent.practised()
         self.summary = summary
         if self.output_dir is not None:

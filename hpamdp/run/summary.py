@@ -17,9 +17,11 @@ from hpamdp.messages import aligned, duration
 from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 
 WITHOUT_UPDATE = "without_update"  # names of the levels that made no update
+ONE_OPTION = "one_option"  # lines about a selector that holds one option in all episodes
 KEPT_FRAMES, KEPT_SCORE = "kept_frames", "kept_score"  # of the best agent, if it is kept in place of the last one
+ONE_ACTION = "one_action"  # lines about a greedy policy that takes one discrete action at all steps
 EVALUATED_FRAMES = "evaluated_frames"  # frames before the evaluation of an interrupted run, if it went on afterwards
-REMARKS = "remarks"  # lines for the closing table about what may be wrong with the agent or its settings
+SHORT_SIGHT = "short_sight"  # lines about learners that look far less ahead than episodes last
 _FAR = 4.0  # times the steps that a learner looks ahead; longer episodes count as far longer
 _PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy")
 
@@ -75,9 +77,9 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     """Return a plain aligned table of this agent beside the references.
 
     Args:
-        summary: the agent's metrics by their names, `references`, `mode`, `frames`, `wall_s`, `without_update` and
-            `remarks`; `kept_frames` and `kept_score`, if an earlier agent is kept; `evaluated_frames`, if the figures
-            are those of an earlier agent.
+        summary: the agent's metrics by their names, `references`, `mode`, `frames`, `wall_s`, `without_update`,
+            `short_sight`, `one_option` and `one_action`; `kept_frames` and `kept_score`, if an earlier agent is kept;
+            `evaluated_frames`, if the figures are those of an earlier agent.
         metrics: the rows. Rows without a value for the agent are left out, and so are columns without any value.
     """
     titles = {name: title for name, (title, _, _) in REFERENCES.items()}
@@ -97,7 +99,7 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     lines = aligned(cells)
     if any("" in row[1:] for row in cells[1:]):
         lines.append("empty cells: no figure is stored for that reference with these settings")
-    lines += summary.get(REMARKS, [])
+    lines += [line for name in (SHORT_SIGHT, ONE_OPTION, ONE_ACTION) for line in summary.get(name, [])]
     if EVALUATED_FRAMES in summary:
         lines.append(f"these figures are of the agent after {summary[EVALUATED_FRAMES]:,.0f} frames")
     without = summary.get(WITHOUT_UPDATE, [])

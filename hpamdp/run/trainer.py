@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ from hpamdp import keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.files import replacing
-from hpamdp.messages import first_line, warn
+from hpamdp.messages import LenientStream, first_line, warn
 from hpamdp.policies.base import Learner
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import AssembledRun
@@ -285,6 +286,7 @@ class Trainer:
             unit=self.unit,
             unit_scale=True,
             mininterval=1.0,
+            file=LenientStream(sys.stderr),
             disable=not self.shows_progress,
         )
         for learner in self.parts.agent.learners:
