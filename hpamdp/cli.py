@@ -102,9 +102,14 @@ def _run_command(name: str, words: list[str]) -> int:
     """Run a command that has options of its own, and return its exit code."""
     with collector_paused():
         command = importlib.import_module(_COMMANDS[name])
+    from hpamdp.run.stopping import ProgramExitError, exits_explained
+
     parser = _Parser(prog=f"{program()} {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
-    with problems_explained():
-        return command.main(words, parser)
+    try:
+        with exits_explained(), problems_explained():
+            return command.main(words, parser)
+    except ProgramExitError as error:
+        _exit_with(str(error), FAILED)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -12,7 +12,6 @@ from gymnasium_players import step
 from toy_environments import Toy
 
 from hpamdp.config.errors import ConfigError
-from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.gymnasium.time_limit import limit_of
 from hpamdp.env.registration import register
@@ -111,8 +110,10 @@ def test_without_a_limit_the_line_asks_for_one(limit):
 
 
 def test_an_environment_that_ends_the_program_while_it_is_built_is_reported_in_one_line(tmp_path):
-    with pytest.raises(EnvironmentFaultError, match=r"^.*: its constructor raised SystemExit: 0 \(.*\.py, line \d+\)$"):
-        run(compose_config(WORDS), tmp_path / "run")
+    told: list[str] = []
+    assert run(compose_config(WORDS), tmp_path / "run", tell=told.append) == 1
+    (line,) = told
+    assert line.endswith("called sys.exit(0), which stopped the run") and ".py, line " in line and "\n" not in line
 
 
 def test_a_reward_of_an_evaluation_that_is_not_finite_is_reported_in_one_line(tmp_path, monkeypatch):

@@ -25,6 +25,7 @@ from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.continuation import Rest, refuse_another, rest_of
 from hpamdp.run.folder import locked
 from hpamdp.run.resume import resolve, saved_words
+from hpamdp.run.stopping import exits_explained
 from hpamdp.run.train import begin, check_callbacks
 
 # Values of the run that are of use only if the run writes files.
@@ -68,9 +69,9 @@ def train(
         ConfigError: a value is wrong or given twice, values do not go together, or the folder holds another run. Then
             nothing is written.
         DivergedError: a reward, a loss or a weight is not finite.
-        EnvironmentFaultError: the environment's own code raised an error, which is the cause, or called `sys.exit`.
+        EnvironmentFaultError: the environment's own code raised an error, which is the cause.
         SystemExit: a worker process imports a script that calls this function outside `if __name__ == "__main__":`.
-        RuntimeError: a worker process died.
+        RuntimeError: a worker process died, or somebody's code called `sys.exit`.
 
     Example:
         >>> import hpamdp
@@ -86,7 +87,7 @@ def train(
     goes_on = settings.get("resume") == RESUME_AUTO
     if goes_on:
         settings = {**settings, "resume": None}
-    with _warned_if_concurrent(), torch_restored(), problems_explained(), ExitStack() as stack:
+    with _warned_if_concurrent(), torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
         with own_hydra(), composed(*_given(problem, settings, config_dirs)) as cfg:
             words = job_overrides()
             check_no_sweep(cfg, words)

@@ -18,7 +18,7 @@ _NOT_THEIRS = ("hpamdp", "gymnasium", "numpy", "torch", "torchrl", "tensordict",
 
 
 class EnvironmentFaultError(RuntimeError):
-    """A third-party environment raised an error, or called `sys.exit`. One line says where; the error is the cause.
+    """A third-party environment or callback raised an error. One line says where; the error is the cause.
 
     Args:
         line: the message.
@@ -56,7 +56,7 @@ def closed_on_error(environment: Closable) -> Iterator[None]:
         raise
 
 
-def fault_of(error: BaseException, what: str) -> EnvironmentFaultError | None:
+def fault_of(error: Exception, what: str) -> EnvironmentFaultError | None:
     """Return the fault that an error is, or None if no third-party code was running.
 
     Args:

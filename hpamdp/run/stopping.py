@@ -1,14 +1,17 @@
-"""Stop a run by signals, which take effect between two batches."""
+"""Stop a run by signals, which take effect between two batches, and explain `sys.exit` in third-party code."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import ClassVar
+
+from hpamdp.messages import one_line
 
 # Ctrl-C, a cluster's stop, the warning of SLURM and others before the time limit, and a closed terminal.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGXCPU)
@@ -93,3 +96,32 @@ def pass_on_signal() -> None:
 def _changeable_signals() -> tuple[signal.Signals, ...]:
     """Return the signals that this thread can handle, which are none outside the main thread."""
     return STOP_SIGNALS if threading.current_thread() is threading.main_thread() else ()
+
+
+class ProgramExitError(RuntimeError):
+    """Raised for a call of `sys.exit` in third-party code; the message is one line."""
+
+
+@contextmanager
+def exits_explained() -> Iterator[None]:
+    """Turn a call of `sys.exit` inside the block into an error that names its place.
+
+    Calls by argparse pass, and so do calls by submitit, which ends a job this way to requeue it.
+
+    Raises:
+        ProgramExitError: `sys.exit` was called.
+    """
+    try:
+        yield
+    except SystemExit as error:
+        # wandb puts a function of its own before `sys.exit`.
+        frames = [each for each in traceback.walk_tb(error.__traceback__) if _module(each[0]) != "wandb"]
+        frame, line = frames[-1]
+        if _module(frame) in ("argparse", "submitit"):
+            raise
+        where = f"{frame.f_code.co_filename}, line {line}"
+        raise ProgramExitError(one_line(f"{where}: called sys.exit({error.code!r}), which stopped the run")) from error
+
+
+def _module(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__")).partition(".")[0]

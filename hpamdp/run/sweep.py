@@ -27,7 +27,7 @@ from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.files import replacing
 from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, MISTAKE, one_line, reason_of, say, warn
 from hpamdp.run.folder import has_foreign_error, is_about_folder, locked, write_error
-from hpamdp.run.stopping import pass_on_signal
+from hpamdp.run.stopping import exits_explained, pass_on_signal
 from hpamdp.run_files import ERROR_NAME, saved_summary
 from hpamdp.shell import path_setting
 
@@ -133,7 +133,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     records.write(job)
     say(f"Job {job.number}: {job.overrides}")
     try:
-        with locked(folder, _LOCK_PATIENCE_S):
+        with locked(folder, _LOCK_PATIENCE_S), exits_explained():
             job.state, job.score, job.reason = _run_rest(cfg, overrides, folder)
     except ConfigError as error:
         job.state, job.reason = _REFUSED, one_line(str(error))

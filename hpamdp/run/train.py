@@ -23,6 +23,7 @@ from hpamdp.run.compatibility import need_of_evaluations, settings_without_effec
 from hpamdp.run.continuation import rest_of
 from hpamdp.run.folder import check_no_training, check_unused, remove_error
 from hpamdp.run.resume import check_saved_options, resolve
+from hpamdp.run.stopping import ProgramExitError, exits_explained
 from hpamdp.run.trainer import DivergedError, Trainer
 from hpamdp.shell import path_setting, program
 
@@ -42,8 +43,8 @@ def run(
     - 0: the run reached its end.
     - 130: a signal stopped the run, and it was saved.
     - 3: a reward, a loss or a weight was not finite. The last good checkpoint is kept.
-    - 1: a worker process died or could not start, or a callback returned a value that cannot be recorded. The agent was
-      saved.
+    - 1: a worker process died or could not start, third-party code called `sys.exit`, or a callback returned a value
+      that cannot be recorded. The agent was saved.
 
     Args:
         cfg: the composed config.
@@ -57,15 +58,19 @@ def run(
     Raises:
         ConfigError: a value or a path is wrong, or values do not go together.
     """
-    with problems_explained():
-        source = stopped_at
-        if config is None:
-            config, given = resolve(cfg, overrides)
-            source = stopped_at or given
-        config = choose_selector(config, overrides)
-        with memory_errors_explained(config):
-            trainer = begin(config, source, output_dir, overrides, may_overwrite=may_overwrite)
-            return _run_to_the_end(trainer, output_dir, tell)
+    try:
+        with exits_explained(), problems_explained():
+            source = stopped_at
+            if config is None:
+                config, given = resolve(cfg, overrides)
+                source = stopped_at or given
+            config = choose_selector(config, overrides)
+            with memory_errors_explained(config):
+                trainer = begin(config, source, output_dir, overrides, may_overwrite=may_overwrite)
+                return _run_to_the_end(trainer, output_dir, tell)
+    except ProgramExitError as error:
+        tell(str(error))
+        return FAILED
 
 
 def go_on(

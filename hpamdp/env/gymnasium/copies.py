@@ -214,7 +214,7 @@ class Copies:
                 self._num_steps[self._row] = 0
             if rows:
                 self._settle(rows, rows, seen)
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             self._explain("reset", error)
         self._after[rows] = 0.0
 
@@ -261,7 +261,7 @@ class Copies:
                     flags[row] = (terminated, truncated, bool(success), success is not None)
             if rows:
                 self._settle(index, rows, seen)
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             self._explain("step", error)
         self.results.flags[:, index] = 0.0
         self.results.reward[index] = rewards
@@ -317,7 +317,7 @@ class Copies:
                 if not (isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.shape[2:] == (3,)):
                     raise ProblemError(f"render returned {_kind(picture)}, not a picture, uint8 [height, width, 3]")
                 pictures.append(picture)
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             self._explain("render", error)
         return pictures
 
@@ -333,11 +333,11 @@ class Copies:
             for row, env in enumerate(self.envs):
                 self._row = row
                 values.append(getattr(env.unwrapped, method)(*arguments))
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             self._explain(method, error)
         return values
 
-    def _explain(self, method: str, error: BaseException) -> NoReturn:
+    def _explain(self, method: str, error: Exception) -> NoReturn:
         """Raise the error of a method, and say which copy broke its contract or raised it."""
         if isinstance(error, EnvironmentFaultError):
             raise error

@@ -73,7 +73,7 @@ class Maker:
             raise SettingError(f"{self.name}: {error}") from error
         except (ProblemError, MemoryError):
             raise
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             self._refuse_arguments(error, kwargs)
             fault = fault_of(error, f"{self.name}: its constructor")
             if fault is None:
@@ -116,7 +116,7 @@ class Maker:
             raise SettingError(f"there is no class or function {name} in {module_name}")
         return entry
 
-    def _refuse_arguments(self, error: BaseException, kwargs: dict[str, Any]) -> None:
+    def _refuse_arguments(self, error: Exception, kwargs: dict[str, Any]) -> None:
         """Raise a refusal if an error is about the arguments of the constructor."""
         cause = error.__cause__ or error  # Gymnasium raises a constructor's error again, from the original one
         # A constructor may pass unknown arguments on to another one, which then raises the error.
