@@ -158,9 +158,11 @@ def meanings_of(model: type[BaseModel]) -> dict[str, str]:
     for each in reversed(model.__mro__):
         if not issubclass(each, Settings):
             continue
-        with suppress(OSError, TypeError):  # no file has its source
+        found |= {name: field.description for name, field in each.model_fields.items() if field.description}
+        with suppress(OSError, TypeError, SyntaxError):  # no file has its source, or not as it stands
             tree: Any = ast.parse(textwrap.dedent(inspect.getsource(each)))
             for statement, below in pairwise(tree.body[0].body):
-                if isinstance(statement, ast.AnnAssign) and isinstance(below, ast.Expr):
-                    found[ast.unparse(statement.target)] = str(ast.literal_eval(below.value))
+                match statement, below:
+                    case ast.AnnAssign(target=setting), ast.Expr(value=ast.Constant(value=str(meaning))):
+                        found[ast.unparse(setting)] = meaning
     return found

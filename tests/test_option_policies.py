@@ -78,6 +78,14 @@ def test_meta_critic_does_not_learn_from_returns_that_are_out_of_date():
     assert greedy_regret(critic) < 0.2
 
 
+def test_meta_critic_goes_on_without_the_buffer_that_a_checkpoint_left_out():
+    before, after = make(MetaCritic), make(MetaCritic)
+    play(before, by_sign, 3000, 30)
+    after.load_state_dict(before.state_dict())
+    play(after, by_sign, 3000, 30, noise=0.5)
+    assert greedy_regret(after) < 0.2
+
+
 def test_the_targets_of_the_meta_critic_are_those_of_semi_mdp_q_learning():
     critic = make(MetaCritic, gamma=0.9, num_members=1)
     with torch.no_grad():

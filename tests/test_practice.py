@@ -58,6 +58,15 @@ def test_options_practise_for_equally_many_steps_though_the_decisions_of_one_are
     assert practised([50.0, 50.0], [3.3, 3.3], chosen=0, lengths=(1, 5))[1] == pytest.approx(0.27, abs=0.04)
 
 
+def test_lengths_of_decisions_are_known_though_a_batch_is_longer_than_the_bins_they_are_taken_from():
+    practice = CurvePractice(3, TOTAL)  # the third option may never be chosen
+    for _ in range(3):
+        of_step = torch.tensor([0, 1]).repeat_interleave(400)
+        practice.add(of_step, of_step[::10], torch.randn(80))
+    equal = practice.probabilities(TOTAL // 2).tolist()
+    assert equal == pytest.approx([0.05 / 3.0] * 3)
+
+
 def test_an_option_that_nobody_may_choose_does_not_keep_the_selector_waiting():
     practice = CurvePractice(2, TOTAL)
     for _ in range(TOTAL // 20):

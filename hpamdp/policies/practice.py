@@ -172,11 +172,18 @@ class CurvePractice(Practice):
         return (self.own_steps / self.width).long().clamp(max=NUM_BINS - 1)
 
     def _decision_steps(self) -> Tensor:
-        """Return the mean length `[num_options]` of each option's recent decisions in steps, at least 1."""
+        """Return the mean length `[num_options]` of each option's recent decisions in steps, at least 1.
+
+        An option without any has the mean of all its decisions, or else the mean of all options.
+        """
+        total = self.counts.sum(-1)
+        of_all = self.own_steps.sum() / total.sum().clamp(min=1.0)
+        of_option = torch.where(total > 0.0, self.own_steps / total.clamp(min=1.0), of_all)
         first = (self._bin() - RECENT_BINS).clamp(min=0)
         is_recent = torch.arange(NUM_BINS, device=first.device) >= first.unsqueeze(-1)
         decisions = (self.counts * is_recent).sum(-1)
-        return ((self.own_steps - first * self.width) / decisions.clamp(min=1.0)).clamp(min=1.0)
+        recent = (self.own_steps - first * self.width) / decisions.clamp(min=1.0)
+        return torch.where(decisions > 0.0, recent, of_option).clamp(min=1.0)
 
     def _noise(self) -> Tensor:
         """Return the variance of the returns within a bin, a scalar; at least a thousandth of that of all returns."""

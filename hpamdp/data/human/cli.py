@@ -109,7 +109,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     models_parser.add_argument("--folds", type=int, default=5, metavar="K", help="folds of people (default 5)")
     models_parser.add_argument("--updates", type=int, default=UPDATES, help=f"of a press model (default {UPDATES})")
-    models_parser.add_argument("--seed", type=int, default=0, help="of folds, models and simulated people (default 0)")
+    models_parser.add_argument(
+        "--seed", type=_seed, default=0, help="seed of folds, models and simulated people (default 0)"
+    )
     models_parser.add_argument(
         "--recorded", action="store_true", help="model the presses as they were recorded; simulate nobody"
     )
@@ -138,6 +140,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     export_parser.set_defaults(run=_export)
     return parser
+
+
+def _seed(text: str) -> int:
+    seed = int(text)
+    if not 0 <= seed < 2**63:
+        raise argparse.ArgumentTypeError("must be from 0 to 2**63 - 1")
+    return seed
 
 
 def _read(options: argparse.Namespace, one_frame: bool = False) -> HumanData:

@@ -10,6 +10,7 @@ Differs from the sources:
 - Q is an ensemble of networks, learned from a replay buffer of decisions, with target networks;
 - values do not bootstrap past the end of an episode, also if a time limit ended it;
 - while exploring, options are also interrupted at random, with the probability of a random option;
+- updates draw from the later half of the decisions, except with a recurrent memory: learners were weaker before;
 - which decisions a member of the ensemble learns from is drawn again at every update, not once for each decision;
 - all members share one target, the mean of the target members;
 - with `memory` the critics also see the observations at earlier decisions of the episode.
@@ -152,9 +153,13 @@ class MetaCritic(RemembersDecisions):
         return unpacked_states(sample_with_past(self.buffer, size, num_past), self.specs)
 
     def _later_half(self, num: int) -> Tensor:
-        """Return the places `[num]` of random decisions, but none of the first half: their returns are out of date."""
+        """Return the places `[num]` of random decisions, but none of the oldest: their returns are out of date.
+
+        As many are left out as half of the own decisions. Those of a data set are the oldest.
+        """
         num_written = self.buffer.write_count
-        age = torch.randint(min(len(self.buffer), num_written - int(self.num_decisions) // 2), (num,))
+        num_own = min(int(self.num_decisions), num_written)  # a resumed run may lack the buffer
+        age = torch.randint(min(len(self.buffer), num_written - num_own // 2), (num,))
         return (num_written - 1 - age) % self.options.buffer_size
 
     def rows(self, decisions: TensorDictBase) -> TensorDict:

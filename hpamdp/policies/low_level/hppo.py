@@ -341,7 +341,10 @@ class HPPO(OnPolicy, Learner):
         self.descent.lower_precision()
 
     def exported(self) -> dict[str, Any] | None:
-        """Return the actor, unless it samples or sees features: see `hpamdp.policies.shared.exported_policy`."""
+        """Return the actor, unless it samples, sees features or acts by clipped means.
+
+        See `hpamdp.policies.shared.exported_policy`.
+        """
         is_mean = self.options.greedy_parameters == "mean"
         if self.policy.samples_when_greedy or not is_mean or not self.perception.is_plain:
             return None
