@@ -154,7 +154,7 @@ def meanings_of(model: type[BaseModel]) -> dict[str, str]:
 
     Only help and pages need them. With pydantic's `use_attribute_docstrings` every start would parse the sources.
     """
-    found = {}
+    found: dict[str, str] = {}
     for each in reversed(model.__mro__):
         if not issubclass(each, Settings):
             continue
