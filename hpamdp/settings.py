@@ -150,7 +150,7 @@ class Settings(BaseModel):
 
 
 def meanings_of(model: type[BaseModel]) -> dict[str, str]:
-    """Return the docstring below each setting, by the names of settings.
+    """Return the docstring below each setting, or else its description, by the names of settings.
 
     Only help and pages need them. With pydantic's `use_attribute_docstrings` every start would parse the sources.
     """
