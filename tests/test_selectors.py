@@ -1,5 +1,6 @@
 """What all selectors have in common, the selectors that learn nothing, and the random agent."""
 
+import inspect
 import textwrap
 
 import pytest
@@ -148,7 +149,8 @@ def test_pending_decisions_are_those_whose_end_the_selector_has_not_seen(freeze)
 
 
 def test_the_example_in_the_documentation_of_selectors_learns_the_better_option():
-    source = textwrap.dedent(Selector.__doc__.partition("::\n")[2].partition("\n    Constructor")[0])
+    docstring = inspect.cleandoc(Selector.__doc__)  # Python 3.13 keeps it without its indentation
+    source = textwrap.dedent(docstring.partition("::\n")[2].partition("\nConstructor")[0])
     names = {**vars(policies_base), "Fraction": Fraction}
     exec(source, names)
     torch.manual_seed(0)
