@@ -31,7 +31,9 @@ _imported, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 def __getattr__(name: str) -> Any:
     with collector_paused():
-        return _imported(name)
+        value = _imported(name)
+    globals()[name] = value  # so that it is looked up once
+    return value
 
 
 if is_command_line():
