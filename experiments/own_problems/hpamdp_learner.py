@@ -7,36 +7,35 @@ python experiments/own_problems/hpamdp_learner.py PROBLEM LEARNER SEED FILE CPU_
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 import yaml
-from problems import EPISODE_SEEDS, PROBLEMS
-from protocol import Clock
 from tensordict import TensorDict
 
 import hpamdp
+from experiments.own_problems.problems import EPISODE_SEEDS, PROBLEMS
+from experiments.own_problems.protocol import Clock
 from hpamdp.env.decisions import with_decisions
-from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.run.evaluate import Evaluation
 
 
 class Scorer(hpamdp.Callback):
-    """Score the agent while it learns, and end training when its time is over."""
+    """Score the agent in episodes with these seeds while it learns, and end training when its time is over."""
 
-    def __init__(self, name: dict, file: Path, limit: float) -> None:
+    def __init__(self, seeds: Sequence[int], name: dict, file: Path, limit: float) -> None:
+        self.seeds = seeds
         self.given = (name, file, limit)
 
     def on_start(self, trainer) -> None:
         """Make the fixed episodes."""
-        name, file, limit = self.given
-        env = GymnasiumEnv(len(EPISODE_SEEDS), options=trainer.parts.problem.options)
-        env.set_scaling_from(trainer.parts.problem)
+        problem, policy = trainer.parts.problem, trainer.parts.agent.policy
+        env = type(problem)(len(self.seeds), options=problem.options)
+        env.set_scaling_from(problem)
         evaluation = Evaluation(with_decisions(env), seed=0)
-        evaluation.episodes = TensorDict({"seed": torch.tensor(EPISODE_SEEDS)}, batch_size=[len(EPISODE_SEEDS)])
-        self.clock = Clock(
-            lambda: float(evaluation.run(trainer.parts.agent.policy)["return"].mean()), name, file, limit
-        )
+        evaluation.episodes = TensorDict({"seed": torch.tensor(self.seeds)}, batch_size=[len(self.seeds)])
+        self.clock = Clock(lambda: float(evaluation.run(policy)["return"].mean()), *self.given)
 
     def on_batch(self, trainer) -> None:
         """Score the agent if it is due."""
@@ -59,7 +58,7 @@ def main(problem: str, learner: str, seed: int, file: Path, limit: float, settin
         low=learner,
         seed=seed,
         progress=False,
-        callbacks=[Scorer(name, file, limit)],
+        callbacks=[Scorer(EPISODE_SEEDS, name, file, limit)],
         **{"env.max_steps": PROBLEMS[problem].steps, **values},
     )
 

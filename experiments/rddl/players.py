@@ -62,32 +62,11 @@ def mean_return(envs: Sequence[gymnasium.Env], act: Callable[[list[np.ndarray]],
 
 def train_hppo(domain: str, name: dict, seed: int, file: Path, limit: float) -> None:
     """Train H-PPO with its defaults."""
-    import torch
-    from tensordict import TensorDict
-
-    from hpamdp.env.decisions import with_decisions
-    from hpamdp.run.evaluate import Evaluation
-
-    class Scorer(hpamdp.Callback):
-        def on_start(self, trainer) -> None:
-            problem = trainer.parts.problem
-            env = type(problem)(len(EPISODE_SEEDS), options=problem.options)
-            env.set_scaling_from(problem)
-            evaluation = Evaluation(with_decisions(env), seed=0)
-            evaluation.episodes = TensorDict({"seed": torch.tensor(EPISODE_SEEDS)}, batch_size=[len(EPISODE_SEEDS)])
-            policy = trainer.parts.agent.policy
-            self.clock = Clock(lambda: float(evaluation.run(policy)["return"].mean()), name, file, limit)
-
-        def on_batch(self, trainer) -> None:
-            if self.clock.after(trainer.frames):
-                trainer.stop("the time is over")
-
-        def on_end(self, trainer) -> None:
-            self.clock.after(trainer.frames, is_over=True)
-            self.clock.write()
+    from experiments.own_problems.hpamdp_learner import Scorer  # with torch, which PPO's time does not pay for
 
     problem = {"name": "rddl", "domain": domain, **SETTINGS.get(domain, {})}
-    hpamdp.train(problem, low="hppo", seed=seed, progress=False, callbacks=[Scorer()], total_frames=10**8)
+    scorer = Scorer(EPISODE_SEEDS, name, file, limit)
+    hpamdp.train(problem, low="hppo", seed=seed, progress=False, callbacks=[scorer], total_frames=10**8)
 
 
 def train_ppo(domain: str, name: dict, seed: int, file: Path, limit: float) -> None:
