@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import synthetic_human
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
@@ -295,6 +296,12 @@ def people() -> HumanData:
     if not os.environ.get(released_file.PATH_VARIABLE):
         pytest.skip(f"{released_file.PATH_VARIABLE} is not set")
     return released_file.read()
+
+
+@pytest.fixture(scope="session")
+def people_file(tmp_path_factory) -> Path:
+    """A file of the released form with a few made-up people."""
+    return synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat")
 
 
 @pytest.fixture(scope="session")

@@ -27,11 +27,6 @@ from hpamdp.data.human.transitions import transitions
 from hpamdp.env.boatdock.environment import BoatDockEnv
 
 
-@pytest.fixture(scope="module")
-def path(tmp_path_factory) -> Path:
-    return synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat")
-
-
 def printed(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     """Run the command line, which must succeed, and return its stdout."""
     assert cli.main([str(a) for a in arguments]) == 0
@@ -51,12 +46,12 @@ def error_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return output.err
 
 
-def test_check_and_summary_print_what_a_file_holds(capsys, path):
-    output = printed(capsys, "check", path, "--any-file")
+def test_check_and_summary_print_what_a_file_holds(capsys, people_file):
+    output = printed(capsys, "check", people_file, "--any-file")
     assert "3 people, 210 episodes" in output and "The boat may still have been gliding" in output
-    output = printed(capsys, "summary", path, "--any-file")
+    output = printed(capsys, "summary", people_file, "--any-file")
     assert re.search(r"^all +210 ", output, re.MULTILINE)
-    figures = json.loads(printed(capsys, "summary", path, "--any-file", "--json"))
+    figures = json.loads(printed(capsys, "summary", people_file, "--any-file", "--json"))
     assert figures["all"]["episodes"] == 210 and len(figures["person"]) == 3
 
 
@@ -111,9 +106,9 @@ def test_a_recording_without_a_press_is_checked_and_summarised_and_gives_no_tran
         ("memmap", ["--one-frame"], "--one-frame: no effect on transitions, which always have one frame"),
     ],
 )
-def test_options_that_an_export_would_ignore_are_refused(capsys, path, tmp_path, form, given, said):
+def test_options_that_an_export_would_ignore_are_refused(capsys, people_file, tmp_path, form, given, said):
     to = tmp_path / "out"
-    assert said in error_of(capsys, "export", path, "--any-file", "--format", form, "--to", to, *given)
+    assert said in error_of(capsys, "export", people_file, "--any-file", "--format", form, "--to", to, *given)
     assert not to.exists()
 
 
@@ -128,14 +123,14 @@ def test_usage_errors_are_one_line(capsys, arguments, message):
     assert message in error_of(capsys, *arguments)
 
 
-def test_an_altered_file_is_refused_in_one_line(capsys, path):
-    assert "truncated, altered or another file" in error_of(capsys, "summary", path)
+def test_an_altered_file_is_refused_in_one_line(capsys, people_file):
+    assert "truncated, altered or another file" in error_of(capsys, "summary", people_file)
 
 
-def test_csv_and_npz_hold_both_tables(capsys, path, tmp_path):
-    data = read(path, checksum=None)
-    printed(capsys, "export", path, "--any-file", "--format", "csv", "--to", tmp_path / "tables")
-    printed(capsys, "export", path, "--any-file", "--format", "npz", "--to", tmp_path / "tables.npz")
+def test_csv_and_npz_hold_both_tables(capsys, people_file, tmp_path):
+    data = read(people_file, checksum=None)
+    printed(capsys, "export", people_file, "--any-file", "--format", "csv", "--to", tmp_path / "tables")
+    printed(capsys, "export", people_file, "--any-file", "--format", "npz", "--to", tmp_path / "tables.npz")
     arrays = np.load(tmp_path / "tables.npz")
     for name, table in data._asdict().items():
         rows = list(csv.DictReader((tmp_path / "tables" / f"{name}.csv").open()))
@@ -146,10 +141,10 @@ def test_csv_and_npz_hold_both_tables(capsys, path, tmp_path):
             assert np.array_equal(written.reshape(values.shape), values.numpy().astype(np.float32), equal_nan=True)
 
 
-def test_memmap_holds_the_selected_transitions(capsys, path, tmp_path):
+def test_memmap_holds_the_selected_transitions(capsys, people_file, tmp_path):
     wanted = ("--complete", "--reward", "sparse", "--observation", "pixels")
-    printed(capsys, "export", path, "--any-file", "--format", "memmap", "--to", tmp_path / "batch", *wanted)
-    data = read(path, checksum=None, one_frame=True)
+    printed(capsys, "export", people_file, "--any-file", "--format", "memmap", "--to", tmp_path / "batch", *wanted)
+    data = read(people_file, checksum=None, one_frame=True)
     kept = data.episodes["complete"][data.presses["episode"]]
     batch = transitions(data, reward="sparse", observation="pixels")[kept]
     written = TensorDict.load_memmap(tmp_path / "batch")
@@ -158,10 +153,10 @@ def test_memmap_holds_the_selected_transitions(capsys, path, tmp_path):
     )
 
 
-def test_exports_overwrite_nothing_and_leave_nothing_behind(capsys, path, tmp_path, monkeypatch):
+def test_exports_overwrite_nothing_and_leave_nothing_behind(capsys, people_file, tmp_path, monkeypatch):
     target = tmp_path / "tables.npz"
     target.write_text("mine")
-    assert "exists" in error_of(capsys, "export", path, "--any-file", "--format", "npz", "--to", target)
+    assert "exists" in error_of(capsys, "export", people_file, "--any-file", "--format", "npz", "--to", target)
     assert target.read_text() == "mine"
     (tmp_path / "full").mkdir()
 
@@ -170,10 +165,10 @@ def test_exports_overwrite_nothing_and_leave_nothing_behind(capsys, path, tmp_pa
 
     monkeypatch.setattr(np, "savez_compressed", fail)
     to = tmp_path / "full" / "tables.npz"
-    assert "No space left" in error_of(capsys, "export", path, "--any-file", "--format", "npz", "--to", to)
+    assert "No space left" in error_of(capsys, "export", people_file, "--any-file", "--format", "npz", "--to", to)
     assert not list((tmp_path / "full").iterdir())
     assert "best_people=4" in error_of(
-        capsys, "export", path, "--any-file", "--format", "npz", "--to", to, "--best-people", 4
+        capsys, "export", people_file, "--any-file", "--format", "npz", "--to", to, "--best-people", 4
     )
 
 

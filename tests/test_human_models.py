@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
-import synthetic_human
 import torch
 
 from hpamdp import keys
@@ -22,13 +20,8 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory) -> Path:
-    return synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat")
-
-
-@pytest.fixture(scope="module")
-def data(path) -> HumanData:
-    return read(path, checksum=None, one_frame=True)
+def data(people_file) -> HumanData:
+    return read(people_file, checksum=None, one_frame=True)
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +113,8 @@ def test_simulated_people_are_a_recording_of_the_real_environment(data, simulate
     assert torch.equal(again.presses["duration"], presses["duration"])
 
 
-def test_the_command_prints_losses_and_simulated_people(capsys, path, tmp_path):
-    words = ["models", str(path), "--any-file", "--folds", "3", "--updates", "5"]
+def test_the_command_prints_losses_and_simulated_people(capsys, people_file, tmp_path):
+    words = ["models", str(people_file), "--any-file", "--folds", "3", "--updates", "5"]
     assert cli.main([*words, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["held_out"]["at random"]["person"].keys() == {"0", "1", "2"}
@@ -130,7 +123,7 @@ def test_the_command_prints_losses_and_simulated_people(capsys, path, tmp_path):
     output = capsys.readouterr().out
     assert "people 1 to 2" in output and "simulated" not in output
     for wrong, said in ((["--folds", "7"], "7 folds of 3 people"), (["--updates", "0"], "--updates 0, but must")):
-        assert cli.main(["models", str(path), "--any-file", *wrong]) == 2
+        assert cli.main(["models", str(people_file), "--any-file", *wrong]) == 2
         assert capsys.readouterr().err.startswith(said)
 
 

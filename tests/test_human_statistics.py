@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import synthetic_human
 import torch
 from scripts import load_script
 
@@ -20,8 +19,8 @@ STUDY = Path(__file__).parents[1] / "experiments/human/study.py"
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory) -> HumanData:
-    return read(synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat"), checksum=None)
+def data(people_file) -> HumanData:
+    return read(people_file, checksum=None)
 
 
 def test_scores_are_five_times_the_tank_left_or_minus_one(data):

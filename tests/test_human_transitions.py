@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
-import synthetic_human
 import torch
 from tensordict import TensorDict
 
@@ -25,13 +23,8 @@ from hpamdp.env.decisions import with_decisions
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory) -> Path:
-    return synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat")
-
-
-@pytest.fixture(scope="module")
-def data(path) -> HumanData:
-    return read(path, checksum=None, one_frame=True)
+def data(people_file) -> HumanData:
+    return read(people_file, checksum=None, one_frame=True)
 
 
 def replayed(data: HumanData, **arguments) -> list[TensorDict]:
@@ -142,9 +135,9 @@ def test_fuel_is_a_tank_less_the_logged_presses_and_at_the_end_the_recorded_tank
         assert rows["next", FUEL][-1, 0] == pytest.approx(data.episodes["tank"][number].item() / 360)
 
 
-def test_two_frames_are_refused(path):
+def test_two_frames_are_refused(people_file):
     with pytest.raises(DataError, match="one_frame=True"):
-        transitions(read(path, checksum=None))
+        transitions(read(people_file, checksum=None))
 
 
 def test_first_observations_are_the_environments_and_second_ones_are_near_it(people_in_one_frame):
@@ -193,12 +186,12 @@ def test_selected_episodes_meet_every_condition_and_keep_their_presses(data):
         assert own.sum() <= 30 < own.sum() + every[len(own)] and torch.equal(own, every[: len(own)])
 
 
-def test_replay_buffer_is_complete(path, data):
-    buffer = HumanExperienceReplay(32, reward="sparse", path=path, checksum=None)
+def test_replay_buffer_is_complete(people_file, data):
+    buffer = HumanExperienceReplay(32, reward="sparse", path=people_file, checksum=None)
     assert len(buffer) == len(data.presses) and buffer.sample().shape == (32,)
     assert buffer[:].exclude("index")[keys.OBSERVATION].equal(transitions(data)[keys.OBSERVATION])
     with pytest.raises(DataError, match="truncated, altered or another file"):
-        HumanExperienceReplay(4, path=path)
+        HumanExperienceReplay(4, path=people_file)
 
 
 @pytest.mark.parametrize(
@@ -209,13 +202,13 @@ def test_replay_buffer_is_complete(path, data):
         (dict(reward="dense"), "reward='dense', but must be one of paper, sparse"),
     ],
 )
-def test_a_wrong_argument_of_the_replay_buffer_is_refused_in_one_line(path, given, said):
+def test_a_wrong_argument_of_the_replay_buffer_is_refused_in_one_line(people_file, given, said):
     with pytest.raises(DataError, match=f"^{re.escape(said)}$"):
-        HumanExperienceReplay(4, path=path, checksum=None, **given)
+        HumanExperienceReplay(4, path=people_file, checksum=None, **given)
 
 
-def test_replay_buffer_samples_whole_episodes_and_slices(path, data):
-    arguments = dict(path=path, checksum=None)
+def test_replay_buffer_samples_whole_episodes_and_slices(people_file, data):
+    arguments = dict(path=people_file, checksum=None)
     episodes = HumanExperienceReplay(200, sampler=whole_episodes(), **arguments).sample()
     starts, ends = episodes[keys.IS_DECISION].squeeze(-1), episodes["next", keys.DONE].squeeze(-1)
     assert starts.sum() == ends.sum() == 8 and starts[0] and torch.equal(starts.roll(-1), ends)

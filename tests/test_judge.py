@@ -1,7 +1,6 @@
 """Judging agents by recorded transitions: the model, its order of agents, and what it says that it cannot tell."""
 
 import pytest
-import synthetic_human
 import torch
 from conftest import compose_config, make_config
 
@@ -19,8 +18,8 @@ WORDS = ["data=human", "data.checksum=null", "offline.updates=400", "low.batch_s
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory) -> str:
-    return str(synthetic_human.write(tmp_path_factory.mktemp("human") / "human.mat"))
+def path(people_file) -> str:
+    return str(people_file)
 
 
 @pytest.fixture(scope="module")

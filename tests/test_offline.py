@@ -3,7 +3,6 @@
 import json
 
 import pytest
-import synthetic_human
 import torch
 from conftest import compose_config, make_config
 from tensordict import TensorDict
@@ -33,8 +32,8 @@ SMALL += ["eval.layouts=10", "low.batch_size=16"]
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory) -> str:
-    return str(synthetic_human.write(tmp_path_factory.mktemp("human") / "human.mat"))
+def path(people_file) -> str:
+    return str(people_file)
 
 
 def human_batch(path: str, rest_to_rest: bool = False, **env):
