@@ -16,15 +16,20 @@ import numpy as np
 import torch
 import yaml
 from torch import Tensor
+from torchrl.data import Binary, TensorSpec
 
 import hpamdp
 from experiments.options import train_rooms
+from hpamdp import keys
 from hpamdp.env.batched_env import Action
 from hpamdp.env.boatdock import episode, harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.task import CONGRUENT, NOT_CHOSEN, BoatState
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.office import kernel, rules
+from hpamdp.env.office.environment import OfficeEnv
+from hpamdp.env.office.options import GOALS, OfficeOptions
 from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.env.rooms.options import RoomsOptions
 from hpamdp.env.rooms.rules import RoomsState
@@ -67,10 +72,43 @@ class SlippersRoomsEnv(RoomsEnv):
         return super().act(state, action._replace(parameters=action.parameters * walks), rng, is_idle)
 
 
+_NAP = len(GOALS)
+
+
+def advance_with_nap(state: Any, option: Any, *others: Any) -> int:
+    """Move offices as their kernel does. Who naps goes for what is out of reach, and so takes nothing."""
+    x, y = state[0][:2]
+    far_goal = np.where((abs(x - rules.PLACES[1][0]) < 0.2) & (abs(y - rules.PLACES[1][1]) < 0.2), 0, 1)
+    return kernel.advance(state, np.where(option == _NAP, far_goal, option), *others)
+
+
+class _NapOptions(OfficeOptions):
+    def facts(self, title: str) -> ProblemFacts:
+        return ProblemFacts(title=title, option_names=(*GOALS, "nap"), has_choice=True)
+
+
+class NapOfficeEnv(OfficeEnv):
+    """Office with a fourth goal, a nap, at which there is nothing to take. It is open while the agent holds nothing."""
+
+    Options = _NapOptions
+    row_kernel = staticmethod(advance_with_nap)
+
+    def _knowledge_specs(self) -> dict[str, TensorSpec]:
+        shape = (self.num_envs, _NAP + 1)
+        return {keys.OPTION_MASK: Binary(_NAP + 1, shape=shape, dtype=torch.bool, device=self.device)}
+
+    def masks(self) -> dict[str, Tensor]:
+        """Return which goals are open, `[N, 4]`."""
+        holds_nothing = ((self._state.coffee == 0) & (self._state.mail == 0)).unsqueeze(-1)
+        return {keys.OPTION_MASK: torch.cat([rules.open_goals(self._state), holds_nothing], -1)}
+
+
 BOATS = {"high": "meta_critic", "low": "hyar", "recipe": "boatdock_hyar"}
 ROOMS_WORDS = [*train_rooms.COMMON[1:], *train_rooms.SELECTORS["meta_critic"], *train_rooms.LEARNERS["hppo"]]
 ROOMS = {name: yaml.safe_load(value) for name, _, value in (word.partition("=") for word in ROOMS_WORDS)}
 ROOMS |= {"high": "meta_critic", "low": "hppo"}
+OFFICE = {"high": "meta_critic", "low": "hppo", "recipe": "office_hppo", "env.tiles": 20, "env.chooses_goal": True}
+OFFICE |= {"exploration": "counts", "exploration.resolution": 1, "exploration.weight": 25, "eval.layouts": 100}
 CRIPPLED = {"env.boats": ["incongruent1", "congruent", "crippled"], "+env.controllers": {"crippled": [0.0, 5.0, 10.0]}}
 CASES: dict[str, dict[str, Any]] = {
     "boats": {"env": BoatDockEnv, **BOATS},
@@ -79,6 +117,8 @@ CASES: dict[str, dict[str, Any]] = {
     "crippled": {"env": BoatDockEnv, **BOATS, **CRIPPLED},
     "rooms": {"env": RoomsEnv, **ROOMS},
     "rooms, curves": {"env": RoomsEnv, **ROOMS, "agent.practice": "curves"},
+    "office": {"env": OfficeEnv, **OFFICE},
+    "nap": {"env": NapOfficeEnv, **OFFICE},
     "slippers": {"env": SlippersRoomsEnv, **ROOMS},
     "slippers, curves": {"env": SlippersRoomsEnv, **ROOMS, "agent.practice": "curves"},
 }
