@@ -158,13 +158,24 @@ def test_steps_of_the_batched_environment_are_those_of_the_gymnasium_form():
 
 
 @needs_simulator
-def test_the_initial_parameters_are_the_default_values_within_the_bounds():
-    env = RDDLEnv(1, domain="SupplyChain_or", **SHIPS)
-    weight, bias = env.initial_parameters()
-    assert weight.shape == (4, len(env.observation_names)) and not weight.any()
-    assert bias.tolist() == [-1.0] * 4  # all defaults are 0, and the least shipment to w1 is 5
-    assert RDDLEnv(1, domain="Sudoku_arcade").initial_parameters() is None
-    assert RDDLEnv(1, domain="Elevators").initial_parameters() is None
+@pytest.mark.parametrize(
+    ("domain", "settings", "expected"),
+    [
+        ("Reservoir_ippc2023", {}, -1.0),  # the defaults are 0, and so are the least releases
+        ("SupplyChain_or", SHIPS, 0.0),  # random shipments earn more than the defaults
+        ("Sudoku_arcade", {}, None),
+        ("Elevators", {}, None),
+    ],
+)
+def test_numbers_begin_at_their_defaults_or_in_mid_range_if_random_play_is_better_there(domain, settings, expected):
+    env = RDDLEnv(1, domain=domain, **settings)
+    initial = env.initial_parameters()
+    if expected is None:
+        assert initial is None
+    else:
+        weight, bias = initial
+        assert weight.shape == (env.full_action_spec_unbatched[keys.PARAMETERS].shape[-1], len(env.observation_names))
+        assert not weight.any() and bias.tolist() == [expected] * len(bias)
 
 
 @needs_simulator

@@ -5,7 +5,6 @@ from __future__ import annotations
 import zlib
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,12 +32,12 @@ class RDDLEnv(SimulatorEnv):
         self.observation_names = self._copies.call("observation_names")[0]
 
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
-        """Return the default values of numbers that are always set, or the nearest within their bounds."""
-        low, high = self._copies.actions.own_low, self._copies.actions.own_high
-        defaults = self._copies.call("default_numbers")[0]
-        if not defaults:
+        """Return where numbers that are always set begin: `RDDLProblem.initial_numbers`."""
+        rules = {name: getattr(self.options, name) for name in RDDLRules.model_fields}
+        numbers = RDDLProblem(**rules).initial_numbers()
+        if not len(numbers):
             return None
-        numbers = np.array(defaults).clip(low, high)
+        low, high = self._copies.actions.own_low, self._copies.actions.own_high
         unit = torch.tensor(2.0 * (numbers - low) / (high - low) - 1.0, dtype=torch.float32)
         return torch.zeros(len(unit), self.observation_spec[keys.OBSERVATION].shape[-1], dtype=torch.float32), unit
 

@@ -20,6 +20,9 @@ from hpamdp.env.rddl.options import RDDLRules
 from hpamdp.messages import one_line, warn
 from hpamdp.settings import SettingError
 
+NUM_TRIALS = 4
+"""Episodes that tell whether numbers begin at their default values or in mid-range."""
+
 _NONE = spaces.Box(0.0, 1.0, (0,), np.float32)
 _warn_once = cache(warn)
 
@@ -158,10 +161,35 @@ class RDDLProblem(gymnasium.Env):
         names = [_name(fluent, value) for fluent in fluents for value in range(len(fluent.values))]
         return (*names, *(["numbers"] if any(not fluent.values for fluent in fluents) else []))
 
-    def default_numbers(self) -> list[float]:
-        """Return the default values of the numbers that are always set, in the order of the parameters."""
-        fluents = () if self._num_choices else self._by_name.values()
-        return [float(fluent.default) for fluent in fluents if not fluent.values]
+    def initial_numbers(self) -> np.ndarray:
+        """Return where learners begin with the numbers that are always set, float64 `[P]`; `P` is 0 if there are none.
+
+        They begin at their default values, or in mid-range if random play around it has a higher mean return, by more
+        than two standard errors. The episodes that tell begin here, so the last one must be over.
+        """
+        fluents = [] if self._num_choices else [fluent for fluent in self._by_name.values() if not fluent.values]
+        if not fluents:
+            return np.zeros(0)
+        low, high = np.array([_bounds_of(fluent.space) for fluent in fluents]).T
+        starts = [np.array([fluent.default for fluent in fluents], np.float64).clip(low, high), 0.5 * (low + high)]
+        returns = np.array([[self._trial(start, low, high, seed) for seed in range(NUM_TRIALS)] for start in starts])
+        error = np.sqrt(returns.var(-1, ddof=1).sum() / NUM_TRIALS)
+        return starts[int(returns[1].mean() - returns[0].mean() > 2.0 * error)]
+
+    def _trial(self, start: np.ndarray, low: np.ndarray, high: np.ndarray, seed: int) -> float:
+        """Return the return of an episode of random choices, and of numbers around these, clipped to their bounds."""
+        rng, total, is_over = np.random.default_rng(seed), 0.0, False
+        self.action_space.seed(seed)
+        self.reset(seed=seed)
+        while not is_over:
+            action = self.action_space.sample()
+            own = action["numbers"][1][0]
+            values = (start + 0.25 * (high - low) * rng.standard_normal(len(start))).clip(low, high)
+            for name, value in zip(own, values, strict=True):
+                own[name] = value if isinstance(self._by_name[name].space, spaces.Box) else round(value)
+            _, reward, terminated, truncated, _ = self.step(action)
+            total, is_over = total + reward, terminated or truncated
+        return total
 
     def observation_names(self) -> tuple[str, ...]:
         """Return the names of the entries of the observation."""
@@ -253,6 +281,12 @@ def _space_of_number(low: float, high: float, *, is_whole: bool) -> spaces.Space
     if is_whole:
         return spaces.Discrete(int(high - low) + 1, start=int(low))
     return spaces.Box(low, high, (), np.float64)
+
+
+def _bounds_of(space: spaces.Discrete | spaces.Box) -> tuple[float, float]:
+    if isinstance(space, spaces.Box):
+        return float(space.low), float(space.high)
+    return float(space.start), float(space.start + space.n - 1)
 
 
 def _space_of_all(fluents: list[Fluent]) -> spaces.Dict:
