@@ -33,7 +33,7 @@ from experiments.study_tables import (
     with_enough_seeds,
 )
 from hpamdp.analysis.statistics import spread
-from hpamdp.env.boatdock.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
+from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 from hpamdp.figure_style import draw_spread
 from hpamdp.messages import exit_code
 
@@ -147,7 +147,7 @@ def _below_ceiling(runs: Rows) -> list[float]:
     return [run["ceiling"] - run["score"] for run in runs]
 
 
-def of_the_map(rows: Rows) -> Rows:
+def of_the_figures(rows: Rows) -> Rows:
     """Return the runs without uniform options, of the length that most selectors have over the learner."""
     plain = [row for row in rows if row["uniform_option_steps"] == 0]
     length = {}
@@ -157,25 +157,6 @@ def of_the_map(rows: Rows) -> Rows:
         }
         length[low] = max(selectors, key=lambda total: selectors[total])
     return [row for row in plain if row["total"] == length[row["low"]]]
-
-
-def draw_map(results: Rows, path: Path) -> None:
-    """Draw the mean scores as a map, a row for each selector and a column for each learner."""
-    lows = list(dict.fromkeys(row["low"] for row in results))
-    highs = [high for high in SELECTORS if any(row["high"] == high for row in results)]
-    scores = np.full((len(highs), len(lows)), np.nan)
-    for (low, high), rows in groups(results, "low", "high").items():
-        scores[highs.index(high), lows.index(low)] = np.mean([row["score"] for row in rows])
-    figure = Figure(figsize=(1.6 + 1.5 * len(lows), 0.6 + 0.36 * len(highs)), layout="constrained")
-    axes = figure.subplots()
-    image = axes.imshow(scores, cmap="viridis", aspect="auto", vmin=HUMAN["chosen"]["score"], vmax=3.68)
-    for (i, j), score in np.ndenumerate(scores):
-        if np.isfinite(score):
-            axes.text(j, i, f"{score:.2f}", ha="center", va="center", color="white" if score < 3.1 else "black")
-    axes.set_xticks(range(len(lows)), lows)
-    axes.set_yticks(range(len(highs)), highs)
-    figure.colorbar(image, label="score: people's mean to the ceiling")
-    figure.savefig(path, dpi=140)
 
 
 def draw_curves(curves: Rows, column: str, label: str, path: Path) -> None:
@@ -230,9 +211,8 @@ def main(folders: Sequence[str]) -> None:
         add_to_tables(HERE, new, (*CELL, "seed"))
     stored = (standing_rows(HERE / f"{name}.csv") for name in TABLES)
     results, curves, choices = (with_enough_seeds(rows, *CELL) for rows in stored)
-    curves, choices = of_the_map(curves), of_the_map(choices)
+    curves, choices = of_the_figures(curves), of_the_figures(choices)
     print(table(results))
-    draw_map(of_the_map(results), HERE / "map.png")
     draw_curves(curves, "regret", "regret of the greedy choice", HERE / "regret.png")
     draw_curves(curves, "score", "score, greedy, 1,000 layouts", HERE / "curves.png")
     draw_choices(choices, HERE / "choices.png")
