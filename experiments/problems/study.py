@@ -89,13 +89,9 @@ BARS = {
 
 # What conf/experiment/primitives.yaml and the defaults set on primitives; other values make another problem.
 PRIMITIVES = {"reach": 0.4, "negative_distances": False, "decisions": 5}
-# The smallest standard deviation of H-PPO on circuits in the recipe's earlier form.
-EARLIER_NOISE = 0.003
-# The learning rate of H-PPO on primitives in its recipe's earlier form.
-EARLIER_LR = 0.001
 # The weight of H-PPO's entropy bonus on Pinball's hard map in the earlier form of conf/experiment/pinball_hard.yaml.
 EARLIER_ENTROPY = 0.01
-# The weight of counted visits for H-PPO on Office. P-DQN has another one, and so had an earlier recipe of H-PPO.
+# The weight of counted visits for H-PPO on Office; P-DQN has another one.
 OFFICE_WEIGHT = 25
 
 
@@ -139,15 +135,9 @@ def learner_of(run: Run) -> str:
     """Return the learner of a run and the selector above it; the selector alone over random play in the options."""
     env, high, low = (run.summary[name] for name in ("env", "high", "low"))
     settings = run.config["low"]
-    if env == "circuit" and settings.get("min_scale_final") == EARLIER_NOISE:
-        low = f"{low}, noise to {EARLIER_NOISE}"
     is_hard_map = env == "pinball" and run.config["env"]["map"] == "hard"
     if is_hard_map and settings.get("discrete_entropy") == EARLIER_ENTROPY:
         low = f"{low}, discrete_entropy={EARLIER_ENTROPY}"
-    # Position steps never had another rate.
-    takes_primitives = env == "primitives" and run.config["env"]["actions"] == "primitives"
-    if takes_primitives and low == "hppo" and settings["lr"] == EARLIER_LR:
-        low = f"{low}, lr={EARLIER_LR}"
     if high == "none":
         return low
     return high if low == "random" else f"{high} over {low}"
@@ -264,9 +254,7 @@ def draw(curves: Rows, path: Path) -> None:
             for (learner, exploration), runs in groups(rows, *RUN[1:-1]).items():
                 label = learner if exploration == "none" else f"{learner}, {exploration}"
                 drawn = curve(runs, "frames", "score")
-                name, _, earlier = learner.partition(", ")
-                line = "--" if earlier else "-"
-                draw_spread(axes, *drawn, line, marker=".", label=label, color=LEARNER_COLOURS.get(name))
+                draw_spread(axes, *drawn, marker=".", label=label, color=LEARNER_COLOURS.get(learner))
             axes.set(title=task, xlabel="primitives", ylabel="success, greedy", ylim=(-0.02, 1.02))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.legend(frameon=False, fontsize=7)
