@@ -109,6 +109,7 @@ ROOMS = {name: yaml.safe_load(value) for name, _, value in (word.partition("=") 
 ROOMS |= {"high": "meta_critic", "low": "hppo"}
 OFFICE = {"high": "meta_critic", "low": "hppo", "recipe": "office_hppo", "env.tiles": 20, "env.chooses_goal": True}
 OFFICE |= {"exploration": "counts", "exploration.resolution": 1, "exploration.weight": 25, "eval.layouts": 100}
+COUNTS = {"exploration": "counts", "exploration.resolution": 1, "exploration.weight": 0.1}
 CRIPPLED = {"env.boats": ["incongruent1", "congruent", "crippled"], "+env.controllers": {"crippled": [0.0, 5.0, 10.0]}}
 CASES: dict[str, dict[str, Any]] = {
     "boats": {"env": BoatDockEnv, **BOATS},
@@ -121,6 +122,8 @@ CASES: dict[str, dict[str, Any]] = {
     "nap": {"env": NapOfficeEnv, **OFFICE},
     "slippers": {"env": SlippersRoomsEnv, **ROOMS},
     "slippers, curves": {"env": SlippersRoomsEnv, **ROOMS, "agent.practice": "curves"},
+    "slippers, counts": {"env": SlippersRoomsEnv, **ROOMS, **COUNTS},
+    "slippers, counts, curves": {"env": SlippersRoomsEnv, **ROOMS, **COUNTS, "agent.practice": "curves"},
 }
 
 
