@@ -1,4 +1,4 @@
-"""The published rules of the field's domains as environments without kernels, to compare the kernels with."""
+"""The rules of boats and of the field's domains as environments without kernels, to compare the kernels with."""
 
 import importlib
 from pathlib import Path
@@ -10,11 +10,13 @@ from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 
-load_script(Path(__file__).resolve().parent.parent / "experiments" / "domains" / "replay.py")  # which finds them
+_EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
+load_script(_EXPERIMENTS / "domains" / "replay.py")  # which finds them
 catch_point, goal, gym_hybrid, hard_move, points = (
     importlib.import_module(f"published_rules.{name}")
     for name in ("catch_point", "goal", "gym_hybrid", "hard_move", "points")
 )
+boat_rules = load_script(_EXPERIMENTS / "whole_map" / "boat_rules.py")
 
 
 def with_tensor_rules(env: BatchedEnv, seed: int) -> BatchedEnv:

@@ -16,6 +16,7 @@ import torch
 from batched_players import action, is_unchanged, play, random_player, restart, snapshot
 from conftest import global_generators_unmoved
 from gymnasium.utils.env_checker import check_env
+from tensor_rules import boat_rules
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
@@ -323,9 +324,8 @@ def test_a_seed_fixes_the_episodes(problem):
 
 
 def test_evaluation_draws_starts_and_noise_from_streams_of_its_own_until_the_next_seed():
-    env = PROBLEMS["boats"](4)
-    # The tensor functions; what the kernel draws is compared with them in test_boat_kernel.
-    env.leave_kernel()
+    # What the kernel draws is compared with the tensor functions in test_boat_kernel.
+    env = boat_rules.TensorBoats(4, controller="random", keymap="random", **NOISE)
     streams = []
 
     drawn = counter_rng.rng_key

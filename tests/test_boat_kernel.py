@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
+from tensor_rules import boat_rules
 
 from hpamdp import keys
 from hpamdp.env import counter_rng, kernels
@@ -84,8 +85,7 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
     if is_evaluation:
         env.seed_evaluation(seed)
     td = env.reset()
-    by_tensors = BoatDockEnv(num_envs, seed=seed, first_env=7, **rules)
-    by_tensors.leave_kernel()
+    by_tensors = boat_rules.TensorBoats(num_envs, seed=seed, first_env=7, **rules)
     if is_evaluation:
         by_tensors.seed_evaluation(seed)
     generator = torch.Generator().manual_seed(seed)
@@ -183,15 +183,6 @@ def test_a_state_that_was_read_does_not_change_with_the_boats():
     state, saved = env.state, env.env_state()
     env.step(env.rand_action(td))
     assert (state.presses == 0).all() and (saved["presses"] == 0).all() and (env.state.presses == 1).all()
-
-
-def test_durations_that_require_gradients_get_them():
-    env = BoatDockEnv(4, controller="congruent")
-    td = env.reset()
-    td[keys.DISCRETE] = torch.zeros(4, dtype=torch.long)
-    td[keys.PARAMETERS] = torch.full((4, 3), 0.3, requires_grad=True)
-    env.step(td)["next", "observation"].sum().backward()
-    assert td[keys.PARAMETERS].grad[:, 0].abs().min() > 0.0
 
 
 def test_a_boat_for_gymnasium_needs_no_torch():

@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 import torch
 from conftest import compose_config
+from tensor_rules import boat_rules
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
 from hpamdp.config.compose import read
 from hpamdp.env import counter_rng
-from hpamdp.env.boatdock import episode, harbour, physics, planner
+from hpamdp.env.boatdock import harbour, physics, planner
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.gymnasium_adapter import BoatDock, BoatDockVector
 from hpamdp.env.boatdock.options import BoatDockOptions
-from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Rules
+from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, BoatState, Rules
 from hpamdp.env.state_columns import where
 from hpamdp.run.assemble import assemble
 
@@ -187,17 +188,17 @@ def test_an_evolutionary_search_over_presses_and_boats_never_beats_the_planner(r
         shape = durations.shape[:-1]
         place = [column.reshape(num, *[1] * (len(shape) - 1)).expand(shape) for column in layout]
         zeros = torch.zeros(shape, dtype=torch.int32)
-        state = episode.BoatState(
+        state = BoatState(
             *place, place[0], place[1], zeros.float(), zeros.float(), zeros + physics.TANK, zeros + NOT_CHOSEN,
             zeros + 1, zeros, zeros, zeros
         )  # fmt: skip
-        flat = episode.BoatState(*(column.reshape(-1) for column in state))
+        flat = BoatState(*(column.reshape(-1) for column in state))
         row = torch.zeros(flat.x.shape, dtype=torch.int32)
         rng = counter_rng.rng_key(counter_rng.seed_tensor(0), counter_rng.NOISE, row, row)
         for number in range(num_presses):
             duration = durations[..., number].reshape(-1)
             option, key = boats[..., number].reshape(-1), pressed[..., number].reshape(-1)
-            after, _ = episode.act(flat, option, key, duration, rng, rules)
+            after, _ = boat_rules.act(flat, option, key, duration, rng, rules)
             flat = where(flat.outcome == physics.SAILING, after, flat)
         return harbour.score(flat.outcome, flat.fuel / physics.TANK).reshape(shape)
 

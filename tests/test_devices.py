@@ -22,8 +22,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_steps import SPECS, sample
 
 from hpamdp import keys
-from hpamdp.env import counter_rng
-from hpamdp.env.boatdock import episode
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.policies.low_level.hyar import LATENT
 from hpamdp.policies.low_level.paddpg import SCORES
@@ -108,13 +106,3 @@ def test_losses_and_their_gradients_stay_on_their_device(name):
         with Answers():
             _, gradients = gradients_of(loss_of, list(getattr(learner, part).parameters()), *inputs)
         assert {gradient.device for gradient in gradients if gradient is not None} == {META}
-
-
-def test_the_boats_rules_stay_on_their_device():
-    rules = BoatDockEnv(4).rules
-    number = torch.zeros(4, dtype=torch.int32, device=META)
-    rng = counter_rng.rng_key(counter_rng.seed_tensor(0, META), counter_rng.TRAINING, number, number)
-    state = episode.start(number, rng, rules)
-    after, reward = episode.act(state, number, number.long(), torch.zeros(4, device=META), rng, rules)
-    observation = episode.observe(after, rng, rules)
-    assert {column.device for column in (*after, reward, observation)} == {META}

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from tensor_rules import boat_rules
 from tensordict import TensorDict
 from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -9,9 +10,9 @@ from toy_steps import SPECS, one_step_rows
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.boatdock import episode, physics, task
+from hpamdp.env.boatdock import physics, task
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.task import Rules
+from hpamdp.env.boatdock.task import BoatState, Rules
 from hpamdp.env.state_columns import where
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
@@ -37,12 +38,12 @@ def make(specs: PAMDPSpecs = SPECS, **changes) -> DLPA:
     return DLPA(specs, device=torch.device("cpu"), **{**OPTIONS, **changes})
 
 
-def boats(seen: torch.Tensor) -> episode.BoatState:
+def boats(seen: torch.Tensor) -> BoatState:
     """Return the boats' state from scaled observations `[N, 16]`."""
     lengths = seen[:, [0, 1, 2, 3, 8, 9]] * physics.HARBOUR_RADIUS
     zeros = torch.zeros(len(seen), dtype=torch.int32)
     still = torch.zeros(len(seen))
-    return episode.BoatState(
+    return BoatState(
         *lengths.unbind(-1), still, still, seen[:, 12] * physics.TANK, seen[:, 7].int(), zeros + 1, zeros, zeros, zeros
     )
 
@@ -53,11 +54,11 @@ def true_model(state: torch.Tensor, discrete: torch.Tensor, unit: torch.Tensor) 
     rng = counter_rng.rng_key(counter_rng.seed_tensor(0), counter_rng.NOISE, row, torch.zeros_like(row))
     before = boats(state)
     duration = (unit + 1.0).clamp(0.0, physics.MAX_DURATION).gather(1, discrete.unsqueeze(1)).squeeze(1)
-    after, reward = episode.act(before, None, discrete, duration, rng, rules)
+    after, reward = boat_rules.act(before, None, discrete, duration, rng, rules)
     is_over = before.outcome != physics.SAILING
     after, reward = where(is_over, before, after), torch.where(is_over, 0.0, reward)
     logit = torch.where((after.outcome != physics.SAILING) & (after.presses < task.MAX_PRESSES), 50.0, -50.0)
-    return Prediction(episode.observe(after, None, rules), reward[None], reward[None], logit[None])
+    return Prediction(boat_rules.observe(after, None, rules), reward[None], reward[None], logit[None])
 
 
 def test_planning_in_the_true_model_comes_close_to_the_ceiling():

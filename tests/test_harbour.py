@@ -8,11 +8,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from hpamdp.env import counter_rng
-from hpamdp.env.boatdock import episode, harbour, physics
+from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.harbour import CONGRUENT, INCONGRUENT, Layout
-from hpamdp.env.state_columns import where
+from hpamdp.env.boatdock.task import BoatState
 
 NUM = 200_000
 
@@ -79,29 +81,22 @@ def test_direction_follows_the_table(key, keymap):
 
 
 def test_the_layouts_of_an_environment_depend_neither_on_the_batch_nor_on_other_resets():
-    seed = counter_rng.seed_tensor(5)
-    rules = episode.Rules(controller="random", keymap="random")
+    def after_resets(num: int, *resets: list[int]) -> BoatState:
+        env = BoatDockEnv(num, seed=5, controller="random", keymap="random")
+        env.reset()
+        for rows in resets:
+            mask = torch.zeros(num, 1, dtype=torch.bool)
+            mask[rows] = True
+            env.reset(TensorDict({"_reset": mask}, [num]))
+        return env.state
 
-    def blank(num: int) -> episode.BoatState:
-        return episode.BoatState(
-            *[torch.zeros(num)] * 9, *[counter(num)] * 4, episode=torch.full_like(counter(num), -1)
-        )
-
-    def reset(state: episode.BoatState, *rows: int) -> episode.BoatState:
-        mask = torch.zeros(len(state.x), dtype=torch.bool)
-        mask[list(rows)] = True
-        rng = counter_rng.rng_key(seed, counter_rng.TRAINING, counter(len(state.x)), state.episode + 1)
-        return where(mask, episode.start(state.episode + 1, rng, rules), state)
-
-    small = reset(reset(reset(blank(3), 0, 1, 2), 1), 1)
-    large = reset(reset(reset(reset(blank(10), *range(10)), 0, 1, 7), 0, 2), 1, 9)
+    small, large = after_resets(3, [1], [1]), after_resets(10, [0, 1, 7], [0, 2], [1, 9])
     assert small.episode.tolist() == [0, 2, 0]
     assert large.episode[1] == 2
     for one, other in zip(small, large, strict=True):
-        torch.testing.assert_close(one[1], other[1])
-    again = reset(blank(1), 0)
-    for one, other in zip(again, small, strict=True):
-        torch.testing.assert_close(one[0], other[0])
+        assert one[1] == other[1]
+    for one, other in zip(after_resets(1), small, strict=True):
+        assert one[0] == other[0]
 
 
 def test_bearing_offset_is_0_along_a_congruent_direction_and_60_along_an_incongruent_one():
@@ -157,10 +152,9 @@ def test_the_steps_of_two_streams_meet_at_most_once_in_two_to_the_thirty():
 
 
 def test_random_controllers_and_key_maps_are_uniform_and_independent_of_the_layout():
-    rules = episode.Rules(controller="random", keymap="random")
-    num = 100_000
-    rng = counter_rng.rng_key(counter_rng.seed_tensor(0), counter_rng.TRAINING, counter(num), counter(num) * 0)
-    state = episode.start(counter(num) * 0, rng, rules)
+    env = BoatDockEnv(100_000, controller="random", keymap="random")
+    env.reset()
+    state = env.state
     columns = torch.stack(
         [state.controller, state.keymap - 1, state.start_x, state.start_y, state.goal_x, state.goal_y]
     )

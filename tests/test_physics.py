@@ -11,8 +11,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from hpamdp.env import counter_rng
-from hpamdp.env.boatdock import episode, harbour, physics
+from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.physics import OUT_OF_BOUNDS, OUT_OF_FUEL, SAILING, SUCCESS, TOO_FAST
 
 NUM_STEPS = 20_000
@@ -236,38 +235,3 @@ def test_a_press_of_no_duration_changes_nothing():
     after = press([Case(10.0, -20.0, 60.0, 30.0, 1.0, 0.0, 4.0)])
     assert torch.stack([after.x, after.y, after.fuel, after.speed]).flatten().tolist() == [10.0, -20.0, 4.0, 0.0]
     assert after.outcome.item() == SAILING
-
-
-def press_and_step(columns: tuple[torch.Tensor, ...], arguments: tuple) -> tuple:
-    return physics.press(*columns), episode.act(*arguments)
-
-
-@pytest.fixture(scope="module")
-def compiled():
-    """Compile both functions without graph breaks, together because each call costs a run of the C++ compiler."""
-    return torch.compile(press_and_step, fullgraph=True, dynamic=False)
-
-
-@pytest.mark.slow
-def test_compiled_and_eager_agree(compiled):
-    num = 4096
-    rows = torch.arange(num, dtype=torch.int32)
-    seed = torch.tensor(7, dtype=torch.int32)
-    rules = episode.Rules()
-    rng = counter_rng.rng_key(seed, counter_rng.TRAINING, rows, torch.zeros_like(rows))
-    state = episode.start(torch.zeros_like(rows), rng, rules)
-    generator = torch.Generator().manual_seed(0)
-    durations = 1.5 * torch.rand(num, 3, generator=generator)
-    options, keys = (torch.randint(n, (num,), generator=generator) for n in (2, 3))
-    direction = harbour.direction(options, state.keymap, keys)
-    columns = (state.x, state.y, state.fuel, state.goal_x, state.goal_y, *direction, durations[:, 0])
-    arguments = (state, options, keys, durations[:, 0], rng, rules)
-    eager = flat(press_and_step(columns, arguments))
-    fast = flat(compiled(columns, arguments))
-    # Rounding may change the outcome of a boat that nearly touches a circle; the others must agree.
-    same = torch.stack([(a.float() - b.float()).abs() < 1e-4 for a, b in zip(eager, fast, strict=True)])
-    assert same.all(0).float().mean() > 0.999
-
-
-def flat(value: tuple | torch.Tensor) -> list[torch.Tensor]:
-    return [value] if isinstance(value, torch.Tensor) else [tensor for part in value for tensor in flat(part)]

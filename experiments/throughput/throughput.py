@@ -26,6 +26,7 @@ import torch
 
 import hpamdp  # also registers the Gymnasium ids
 from experiments.study_tables import Rows, write_tables
+from experiments.whole_map.boat_rules import TensorBoats
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
@@ -78,16 +79,6 @@ def env_stepper(env: PAMDPEnv) -> Callable[[], object]:
     return step
 
 
-def by_tensor_functions(num_envs: int) -> BoatDockEnv:
-    """Return boats that the uncompiled tensor functions move, since their durations require gradients."""
-    env = BoatDockEnv(num_envs)
-    td = env.rand_action(env.reset())
-    td[keys.PARAMETERS] = td[keys.PARAMETERS].requires_grad_()
-    env.step(td)
-    env.state = env.state._replace(**{name: column.detach() for name, column in env.state._asdict().items()})
-    return env
-
-
 def one_stepper(env_id: str) -> Callable[[], object]:
     """Return a function that makes 64 steps of one Gymnasium environment, with resets."""
     env = gymnasium.make(env_id)
@@ -119,7 +110,7 @@ def boats(num_envs: int) -> dict[str, Callable[[], Callable[[], object]]]:
         "CartPole-v1, Gymnasium vector": lambda: vector_stepper("CartPole-v1", num_envs),
         "boats, Gymnasium vector": lambda: vector_stepper("hpamdp/BoatDock-v0", num_envs),
         "boats, TorchRL": lambda: env_stepper(BoatDockEnv(num_envs)),
-        "boats, TorchRL, tensor functions": lambda: env_stepper(by_tensor_functions(num_envs)),
+        "boats, TorchRL, tensor functions": lambda: env_stepper(TensorBoats(num_envs)),
     }
 
 

@@ -20,9 +20,10 @@ from torchrl.data import Binary, TensorSpec
 
 import hpamdp
 from experiments.options import train_rooms
+from experiments.whole_map import boat_rules
 from hpamdp import keys
 from hpamdp.env.batched_env import Action
-from hpamdp.env.boatdock import episode, harbour, physics
+from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.task import CONGRUENT, NOT_CHOSEN, BoatState
 from hpamdp.env.counter_rng import RngKey
@@ -37,7 +38,7 @@ from hpamdp.messages import exit_code
 from hpamdp.run.trainer import Trainer
 
 
-class WeakBoatEnv(BoatDockEnv):
+class WeakBoatEnv(boat_rules.TensorBoats):
     """Boats of which the congruent one has a third of the push.
 
     Its speed, and so the way of a press, is a third of that of the other boat; a press takes as much fuel. The planner
@@ -48,12 +49,12 @@ class WeakBoatEnv(BoatDockEnv):
         """Return the states after one press, and the rewards `[N]`."""
         option, key = action.option.int(), action.discrete.int()
         held = torch.where(state.controller == NOT_CHOSEN, option, state.controller)
-        dir_x, dir_y = harbour.direction_of(self.rules, held, state.keymap, key)
+        dir_x, dir_y = boat_rules.direction_of(self.rules, held, state.keymap, key)
         strength = torch.where(held == CONGRUENT, 1.0 / 3.0, 1.0)
         position = (state.x, state.y, state.fuel, state.goal_x, state.goal_y)
         pressed = physics.press(*position, dir_x, dir_y, action.parameters.squeeze(-1), strength=strength)
-        after = episode.after_press(state, pressed, dir_x, dir_y, held)
-        return after, episode.reward_of(state, after, self.rules)
+        after = boat_rules.after_press(state, pressed, dir_x, dir_y, held)
+        return after, boat_rules.reward_of(state, after, self.rules)
 
 
 class _SlippersOptions(RoomsOptions):

@@ -88,7 +88,7 @@ class BatchedEnvVectorAdapter(GymnasiumVectorAdapter):
 
 
 class TensorRows:
-    """The methods of `KernelRows`, for a `BatchedEnv` that its tensor functions move: on a GPU, or compiled."""
+    """The methods of `KernelRows`, for a `BatchedEnv` that its tensor functions move."""
 
     def __init__(self, env: BatchedEnv) -> None:
         self._env = env

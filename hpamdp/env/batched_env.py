@@ -3,8 +3,9 @@
 The state is a tuple of columns, with one row for each environment. Random numbers are counter-based: each depends only
 on the seed, the number of the environment, the episode, and the place of the draw in it. See `counter_rng`.
 
-A subclass hands over three pure functions: how an episode starts, what an action does, and what is observed. The rest
-is the same for all of them: specs, checks of actions, masked steps and resets, the time limit, seeds and checkpoints.
+A subclass hands over three pure functions: how an episode starts, what an action does, and what is observed. Or it is a
+`KernelEnv`, and hands over a kernel. The rest is the same for all of them: specs, checks of actions, masked steps and
+resets, the time limit, seeds and checkpoints.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from hpamdp.settings import SettingError, Settings
 
 # If a tensordict has only these keys and the problem's extra ones, there is nothing else to carry into its next root.
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
+_RULES = ("start", "act", "observe")
 _PLAN = "plan_"  # before the names of an oracle's columns in an `env_state`
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
@@ -111,17 +113,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     """`num_envs` copies of a problem in one batch dimension.
 
     A subclass sets the attributes below, in its class or in `_prepare`, and defines `start`, `act` and `observe`. This
-    class implements the settings `max_steps` and `compile_rules`. The parameters of the chosen action are clipped to
-    their bounds; NaN and infinite ones are refused, and so are unknown actions. The parameters of the other actions are
-    never read.
-
-    On the CPU the problem's `row_kernel`, if it has one, does the work of the three functions. The tensor functions run
-    instead:
-    - on other devices, and with `compile_rules`;
-    - if a subclass overrides one of the three;
-    - after the first action whose parameters require gradients.
-
-    `KernelEnv` is for problems whose rules are a kernel alone.
+    class implements the setting `max_steps`. The parameters of the chosen action are clipped to their bounds; NaN and
+    infinite ones are refused, and so are unknown actions. The parameters of the other actions are never read.
 
     The scripted action of `oracle` is always a tensor function. It is one plan, or one for each option that the agent
     chooses (P plans).
@@ -152,7 +145,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     # Bounds of the parameters of all discrete actions, side by side.
     parameter_low: Sequence[float]
     parameter_high: Sequence[float]
-    row_kernel: ClassVar[Advance | None] = None  # stands for `start`, `act` and `observe` on the CPU
+    row_kernel: ClassVar[Advance | None] = None  # in place of `start`, `act` and `observe`
     result_keys: tuple[str, ...] = (keys.OUTCOME,)
     reset_returns_all_rows = True
     num_envs: int
@@ -186,10 +179,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         self.option_names = facts.option_names
         self.can_change_option = facts.can_change_option
         self.plans_change_options = facts.plans_change_options
-        # Not every problem has these two settings.
         if hasattr(self.options, "max_steps"):
             self.max_steps = self.options.max_steps
-        self._is_compiled = getattr(self.options, "compile_rules", False)
         self._prepare()
         self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
         low, high = (
@@ -198,11 +189,9 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         )
         self._make_specs(low, high)
         self._place_parameters(low, high)
-        self._pure_step, self._pure_reset, self._pure_observe = self.advance, self.restart, self.observe
-        if self._is_compiled:
-            self._compile()
         self._set_seed(seed)
-        self._use_kernel()
+        if self.row_kernel is not None:
+            self._use_kernel(self.row_kernel)
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
@@ -211,13 +200,6 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _prepare(self) -> None:
         """Set what follows from the settings, such as the bounds of the parameters, before the specs are made."""
-
-    def _compile(self) -> None:
-        """Compile the tensor functions."""
-        arguments: Any = counter_rng.COMPILE_ARGUMENTS
-        self._pure_step = torch.compile(self.advance, **arguments)
-        self._pure_reset = torch.compile(self.restart, **arguments)
-        self._pure_observe = torch.compile(self.observe, **arguments)
 
     @property
     def training_begins_elsewhere(self) -> bool:
@@ -228,15 +210,20 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         """Return the problem's own numbers for its kernel."""
         return ()
 
-    def _use_kernel(self) -> None:
-        """Let the kernel move the environments, if it may."""
-        if self.row_kernel is None or not self._may_use_kernel():
-            return
+    def _use_kernel(self, advance: Advance) -> None:
+        """Let a kernel move the environments."""
+        owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
+        replaced = [name for name in _RULES if getattr(type(self), name) is not getattr(owner, name)]
+        if replaced:
+            name = type(self).__name__
+            raise TypeError(
+                f"{name}: overrides {', '.join(replaced)}, but only the kernel of {owner.__name__} has rules"
+            )
         bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
         state = self._columns
         num_integers = sum(not column.is_floating_point() for column in state)
         self.rows = KernelRows(
-            self.row_kernel,
+            advance,
             self.num_envs,
             num_columns=(len(state._fields) - num_integers, num_integers),
             reading_dims=(len(self.observation_names), len(self.extra_names)),
@@ -247,23 +234,6 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         )
         self.rows.set_seed(int(self._seed), self._streams)
         self._state = state
-
-    def _may_use_kernel(self) -> bool:
-        """Return whether the tensors are on the CPU, and rules neither compiled nor replaced by a subclass."""
-        return self._is_on_cpu and not self._is_compiled and not self._replaced_rules()
-
-    def _class_of_kernel(self) -> type:
-        """Return the class whose rules the kernel states."""
-        return next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
-
-    def _replaced_rules(self) -> list[str]:
-        """Return the names of the rules that a subclass of the kernel's class overrides."""
-        owner, rules = self._class_of_kernel(), ("start", "act", "observe")
-        return [name for name in rules if getattr(type(self), name) is not getattr(owner, name)]
-
-    def leave_kernel(self) -> None:
-        """Let the tensor functions move the environments from here on."""
-        self._columns, self.rows = self.state, None
 
     @property
     def _state(self) -> EpisodeState:
@@ -587,7 +557,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         if self.rows is not None:
             results = self.rows.restart(mask.numpy(force=True))
         else:
-            self._state = self._pure_reset(self._state, mask)
+            self._state = self.restart(self._state, mask)
         if given:
             state = self._state
             self._state = where(mask, replaced(state, **given), state)
@@ -619,7 +589,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         is_idle = before.outcome != GOING_ON
         if mask is not None:
             is_idle = is_idle | ~mask
-        after, reward, is_valid = self._pure_step(before, *leaves, is_idle)
+        after, reward, is_valid = self.advance(before, *leaves, is_idle)
         if not is_valid.all():
             raise self.invalid_action(int((~is_valid).nonzero()[0]), *leaves)
         self._state = after
@@ -629,10 +599,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         is_plain = self.rows is not None and not self._has_knowledge and tensordict.device == self.device
         if not is_plain or not self._plain_keys.issuperset(tensordict.keys()):
             return super()._step_and_maybe_reset(tensordict)
-        leaves = self.action_leaves(tensordict)
-        if self.rows is None:  # the parameters require gradients
-            return super()._step_and_maybe_reset(tensordict)
-        results = self._act(leaves, None, restarts=True)
+        results = self._act(self.action_leaves(tensordict), None, restarts=True)
         # The same in one pass, because TorchRL's work between step and reset takes longer than the kernel. As in
         # TorchRL, the root keeps the action. It is in a tensordict of its own, since updates of the root change it.
         action = TensorDict._new_unsafe(
@@ -647,8 +614,6 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     def action_leaves(self, tensordict: TensorDictBase) -> tuple[Tensor | None, Tensor, Tensor]:
         """Return option, discrete actions and parameters, whose values are still to be checked.
 
-        Parameters that require gradients end the use of the kernel.
-
         Raises:
             RuntimeError: no episode has begun since the last seed.
         """
@@ -656,10 +621,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             raise RuntimeError(f"{self.title}: no episode has begun; call reset before step")
         self.check_action(tensordict)
         action = tensordict.get(keys.ACTION)
-        discrete, parameters = action.get("discrete").long(), action.get("parameters").float()
-        if self.rows is not None and parameters.requires_grad and torch.is_grad_enabled():
-            self.leave_kernel()
-        return tensordict.get(keys.OPTION).long() if self._chooses else None, discrete, parameters
+        option = tensordict.get(keys.OPTION).long() if self._chooses else None
+        return option, action.get("discrete").long(), action.get("parameters").float()
 
     def _act(
         self, leaves: tuple[Tensor | None, Tensor, Tensor], mask: Tensor | None, *, restarts: bool = False
@@ -699,7 +662,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         done = (outcome != GOING_ON).unsqueeze(-1)
         truncated = (outcome == len(self.outcomes) - 1).unsqueeze(-1)
         leaves = {
-            keys.OBSERVATION: self.shown(self._pure_observe(state)),
+            keys.OBSERVATION: self.shown(self.observe(state)),
             keys.OUTCOME: outcome,
             **{name: extra.unsqueeze(-1) for name, extra in zip(self.extra_names, self.extras(state), strict=True)},
             **self._flags(done, done & ~truncated, truncated),
@@ -760,16 +723,6 @@ class KernelEnv(BatchedEnv[EpisodeState]):
     def observe(self, state: EpisodeState) -> Tensor:
         """Refuse: the kernel observes."""
         raise NotImplementedError
-
-    def _may_use_kernel(self) -> bool:
-        replaced = self._replaced_rules()
-        if replaced:
-            name, owner = type(self).__name__, self._class_of_kernel().__name__
-            raise TypeError(f"{name}: overrides {', '.join(replaced)}, but only the kernel of {owner} has rules")
-        return True
-
-    def leave_kernel(self) -> None:
-        """Do nothing: the kernel has the rules."""
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -10,22 +10,12 @@ on the batch, and the global generators are not used.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from hpamdp.env.rng_streams import EVALUATION, EVALUATION_NOISE, NOISE, STEPS, TRAINING, folded
-
-# Arguments for compiling functions that draw random numbers. Each operation of the hash reads its input twice. By
-# default the compiler inlines these operations into one another, which takes two minutes.
-# Measured with 16,384 environments: with these thresholds compiling takes 4 s, and step and reset run at 50 million
-# steps/s. With thresholds (8, 2) and (20, 4) they run at 21 million steps/s.
-COMPILE_ARGUMENTS: dict[str, Any] = {
-    "fullgraph": True,
-    "dynamic": False,
-    "options": {"realize_opcount_threshold": 16, "realize_reads_threshold": 4},
-}
 
 
 class RngKey(NamedTuple):

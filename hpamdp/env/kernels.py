@@ -3,8 +3,7 @@
 Each tensor operation reads and writes whole columns, and takes microseconds even for one row. A kernel states the rules
 for one row, and takes each row through a whole step. So it is fast with one environment and with a million.
 
-Most problems have their kernels alone (`KernelEnv`). Some also have tensor functions, which run on CPU and CUDA,
-compile and differentiate. A test compares the two.
+The problems have their kernels alone (`KernelEnv`). Tests compare them with tensor functions under experiments/.
 
 Random numbers equal those of `counter_rng` bit for bit. Numba caches the machine code on disk, so only the first run on
 a machine compiles.

@@ -23,8 +23,10 @@ from hpamdp import keys
 from hpamdp.data import DataError
 from hpamdp.data.human.released_file import TICKS_PER_SECOND, HumanData
 from hpamdp.data.row_checks import TRAJECTORY
-from hpamdp.env.boatdock import episode, harbour, physics
-from hpamdp.env.boatdock.task import FUEL, BoatState, ObservationForm, RewardForm, Rules
+from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.options import BoatDockOptions
+from hpamdp.env.boatdock.task import FAILURE_REWARD, SUCCESS_REWARD, BoatState, ObservationForm, RewardForm
 
 NO_PRESS = "the episodes have no logged press"
 _REWARDS = ("paper", "sparse")
@@ -58,12 +60,11 @@ def transitions(
     _check(data, reward, observation)
     if not len(data.presses):
         raise DataError(NO_PRESS)
-    rules = Rules(controller="choose" if has_choice else "random", reward=reward, observation=observation)
     presses = data.presses
     episodes = data.episodes[presses["episode"]]  # the episode of each press
     before, after = _states(presses, episodes, has_choice)
 
-    rows = _read(before, rules)
+    rows = _read(before, observation)
     key = presses["key"].unsqueeze(1)
     rows[keys.DISCRETE] = presses["key"].clone()
     rows[keys.PARAMETERS] = torch.zeros(len(key), harbour.NUM_KEYS, dtype=torch.float32).scatter(
@@ -73,8 +74,8 @@ def transitions(
         rows[keys.OPTION] = episodes["controller"]
     rows[keys.IS_DECISION] = (presses["press"] == 0).unsqueeze(-1)
     rows[TRAJECTORY] = presses["episode"].clone()
-    following = _read(after, rules)
-    following[keys.REWARD] = episode.reward_of(before, after, rules).unsqueeze(-1)
+    following = _read(after, observation)
+    following[keys.REWARD] = _reward(before, after, reward).unsqueeze(-1)
     following[keys.IS_DECISION] = following[keys.DONE].clone()
     rows["next"] = following
     return rows
@@ -99,7 +100,6 @@ def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: Obs
         DataError: the reward or the observation is unknown, or the harbours have different centres.
     """
     _check(data, reward, observation)
-    rules = Rules(reward=reward, observation=observation)
     episodes = data.episodes
     start, goal = episodes["start"] - _CENTRE, episodes["goal"] - _CENTRE
     # Find the end of the last logged press. Without a press, let the boat head for its goal from the start.
@@ -125,10 +125,10 @@ def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: Obs
         presses=steps.to(torch.int32),
         outcome=episodes["outcome"].int(),
     )
-    ended = _read(after, rules)
-    ended[keys.DECISION_OBSERVATION] = _read(before, rules)[keys.OBSERVATION]
+    ended = _read(after, observation)
+    ended[keys.DECISION_OBSERVATION] = _read(before, observation)[keys.OBSERVATION]
     # The progress rewards of an episode's presses sum to that of one step from its start to its end.
-    ended[keys.OPTION_RETURN] = episode.reward_of(before, after, rules).unsqueeze(-1)
+    ended[keys.OPTION_RETURN] = _reward(before, after, reward).unsqueeze(-1)
     ended[keys.OPTION_STEPS] = steps.unsqueeze(-1)
     ended[keys.IS_DECISION] = ended[keys.DONE].clone()
     return TensorDict({keys.OPTION: episodes["controller"].clone(), "next": ended}, batch_size=[len(start)])
@@ -230,16 +230,24 @@ def _final_position(
     return torch.where(reached_dock.unsqueeze(1), on_circle, torch.stack([sailed.x, sailed.y], 1))
 
 
-def _read(state: BoatState, rules: Rules) -> TensorDict:
+def _reward(before: BoatState, after: BoatState, form: RewardForm) -> Tensor:
+    """Return the rewards of presses between two states, `[N]`."""
+    final = torch.where(after.outcome == physics.SUCCESS, SUCCESS_REWARD * after.fuel / physics.TANK, 0.0)
+    if form == "sparse":
+        return final
+    failed = (after.outcome > physics.SUCCESS) & (after.outcome < physics.TIME_LIMIT)
+    progress = (_to_goal(before.x, before.y, before) - _to_goal(after.x, after.y, after)) / _to_goal(
+        before.start_x, before.start_y, before
+    )
+    return progress + torch.where(failed, FAILURE_REWARD, final)
+
+
+def _to_goal(x: Tensor, y: Tensor, state: BoatState) -> Tensor:
+    return ((state.goal_x - x).square() + (state.goal_y - y).square()).sqrt()
+
+
+def _read(state: BoatState, observation: ObservationForm) -> TensorDict:
     """Return the environment's entries for these boats, without noise."""
-    done = (state.outcome != physics.SAILING).unsqueeze(-1)
-    truncated = (state.outcome == physics.TIME_LIMIT).unsqueeze(-1)
-    reading = {
-        keys.OBSERVATION: episode.observe(state, None, rules),
-        keys.OUTCOME: state.outcome.long(),
-        FUEL: (state.fuel / physics.TANK).unsqueeze(-1),
-        keys.DONE: done,
-        keys.TERMINATED: done & ~truncated,
-        keys.TRUNCATED: truncated,
-    }
-    return TensorDict(reading, batch_size=state.x.shape)
+    boats = BoatDockEnv(len(state.x), options=BoatDockOptions(observation=observation))
+    boats.state = state
+    return boats.read()

@@ -20,8 +20,7 @@ from torchrl.data import TensorSpec
 
 from hpamdp import keys
 from hpamdp.env.base import Metric
-from hpamdp.env.batched_env import Action, BatchedEnv
-from hpamdp.env.boatdock import episode as episode_rules
+from hpamdp.env.batched_env import KernelEnv
 from hpamdp.env.boatdock import harbour, kernel, planner, task
 from hpamdp.env.boatdock.form import BoatForm
 from hpamdp.env.boatdock.human_choices import choice_probabilities, human_spec
@@ -31,7 +30,6 @@ from hpamdp.env.boatdock.oracle import BoatDockOracle
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.boatdock.task import BoatState
-from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.play_page import EpisodeError
 from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
@@ -47,7 +45,7 @@ _MOST_SWAPPED = 4  # controllers; if there are more, symmetries swap none
 _CONTROLLER_ENTRY = task.OBSERVATION_NAMES.index("controller")
 
 
-class BoatDockEnv(BatchedEnv[BoatState]):
+class BoatDockEnv(KernelEnv[BoatState]):
     """Dock boats in `num_envs` harbours at once.
 
     Action leaves:
@@ -89,6 +87,8 @@ class BoatDockEnv(BatchedEnv[BoatState]):
     start_keys = frozenset({"start", "goal", "controller", "keymap"})
     action_names = ("key", "durations")
     row_kernel = staticmethod(kernel.advance)
+    state_type = BoatState
+    num_columns = (9, 5)
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score"),
         Metric("human_normalised", "human-normalised score"),
@@ -139,24 +139,6 @@ class BoatDockEnv(BatchedEnv[BoatState]):
     def kernel_settings(self) -> Sequence[float]:
         """Return the rules in numbers."""
         return kernel.settings_of(self.rules)
-
-    def start(self, episode: Tensor, rng: RngKey) -> BoatState:
-        """Return the states of environments with new layouts."""
-        return episode_rules.start(episode, rng, self.rules)
-
-    def act(self, state: BoatState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[BoatState, Tensor]:
-        """Return the states after one press, and the rewards `[N]`."""
-        duration = action.parameters.squeeze(-1)
-        return episode_rules.act(state, action.option, action.discrete, duration, rng, self.rules)
-
-    def observe(self, state: BoatState) -> Tensor:
-        """Return the observations, `[N, 16]`, or `[N, 14]` in pixels."""
-        rng = self._noise_rng(state) if self.rules.sensor_noise > 0.0 else None
-        return episode_rules.observe(state, rng, self.rules)
-
-    def extras(self, state: BoatState) -> Sequence[Tensor]:
-        """Return the fraction of fuel that is left."""
-        return (state.fuel / task.TANK,)
 
     def start_columns(self, given: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """Check a layout and return the columns of the state that it sets."""

@@ -10,7 +10,6 @@ Options of `reset`: `start` and `goal` `[2]` in screen px and, with these, `cont
 from __future__ import annotations
 
 import itertools
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -79,7 +78,6 @@ class BoatDockVector(GymnasiumVectorAdapter):
         autoreset_mode: when finished environments start again. With `NextStep` they do in the next step, which ignores
             their actions. With `SameStep` they do in the same step; the last observations and infos are
             `infos["final_obs"]` and `infos["final_info"]`. With `Disabled` they do only by `reset`.
-        device: as in BoatDockEnv.
         settings: single settings by name, in place of those in `options`.
 
     `reset` takes one integer seed for all environments. The layouts of environment i depend only on the seed and i,
@@ -97,19 +95,7 @@ class BoatDockVector(GymnasiumVectorAdapter):
         options: BoatDockOptions | None = None,
         action_format: ActionFormat = "dict",
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        device: Any = "cpu",
         **settings: Any,
     ) -> None:
-        options = BoatDockOptions.of(options, settings)
-        make_rows = None
-        if options.compile_rules or str(device) != "cpu":
-            make_rows = partial(_tensor_rows, num_envs, options, device)
-        super().__init__(NumpyBoats(options.rules, (num_envs,), action_format, make_rows), num_envs, autoreset_mode)
-
-
-def _tensor_rows(num_envs: int, options: BoatDockOptions, device: Any) -> Any:
-    """Return boats that the tensor functions move."""
-    from hpamdp.env.batched_adapter import TensorRows
-    from hpamdp.env.boatdock.environment import BoatDockEnv  # it brings torch along
-
-    return TensorRows(BoatDockEnv(num_envs, options=options, device=device))
+        rules = BoatDockOptions.of(options, settings).rules
+        super().__init__(NumpyBoats(rules, (num_envs,), action_format), num_envs, autoreset_mode)

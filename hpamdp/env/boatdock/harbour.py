@@ -53,22 +53,6 @@ def direction(controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, 
     return sign * _COS30 * (column - 1).to(torch.float32), sign * torch.where(column == 1, -1.0, 0.5).float()
 
 
-def direction_of(rules: Rules, controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the unit direction (x, y) of a key with the boats of these rules, each `[*B]` float32.
-
-    The other arguments are those of `direction`.
-    """
-    if rules.boats is None:
-        return direction(controller, keymap, key)
-    row = controller * NUM_KEYS + key
-    every = [each for keys in rules.boats.directions for each in keys]
-    x, y = (torch.full(row.shape, each, device=row.device, dtype=torch.float32) for each in every[0])
-    # As in `direction`, there is no gather.
-    for number, (key_x, key_y) in enumerate(every[1:], start=1):
-        x, y = torch.where(row == number, key_x, x), torch.where(row == number, key_y, y)
-    return x, y
-
-
 class Layout(NamedTuple):
     """Start and goal of an episode, px from the harbour's centre, every field `[*B]`."""
 

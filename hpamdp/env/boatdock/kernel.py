@@ -1,7 +1,7 @@
 """The boats' rules for one row, and the loops over all rows that Numba compiles: a step, a reset, a reading.
 
-These are the rules of `physics`, `harbour` and `episode`, for the CPU alone and without gradients. The tests compare
-the two.
+Closed forms of the motion, which planners, films and replays need, are in `physics`, for columns. The tests compare
+this module with tensor functions in experiments/whole_map/boat_rules.py.
 
 Rows pass through a step in blocks that stay in the processor's cache. The loops over a block have no branches, so the
 compiler turns them into vector instructions. That is why conditions are values, and why the columns lie in one flat
@@ -295,7 +295,7 @@ def _aim(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
 
 @part
 def _disturb(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
-    """Apply slips of keys and motor noise, as `episode.act` does."""
+    """Apply slips of keys and motor noise."""
     base = stream_hash(settings[SEED], int32(settings[NOISE_STREAM]))
     step = stream_step(int32(settings[NOISE_STREAM]))
     slip = _F(settings[SLIP_CHANCE])
@@ -315,7 +315,7 @@ def _disturb(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
 
 @part
 def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any, rewards: Any) -> None:
-    """Press a key in every row that moves, as `episode.act` does."""
+    """Press a key in every row that moves."""
     is_sparse = settings[IS_SPARSE] != 0.0
     for j in range(count):
         x, y, fuel = scratch[X * _BLOCK + j], scratch[Y * _BLOCK + j], scratch[FUEL * _BLOCK + j]
@@ -354,7 +354,7 @@ def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: A
 
 @part
 def _restart(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
-    """Start new episodes in the marked rows of a block, as `episode.start` and `harbour.sample_layout` do."""
+    """Start new episodes in the marked rows of a block, with layouts as of `harbour.sample_layout`."""
     base = stream_hash(settings[SEED], int32(settings[EPISODE_STREAM]))
     step = stream_step(int32(settings[EPISODE_STREAM]))
     first_env = int32(settings[FIRST_ENV]) + int32(first)
@@ -431,7 +431,7 @@ def _add_sensor_noise(first: Any, count: Any, scratch: Any, numbers: Any, settin
 
 @part
 def _observe(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any, observation: Any) -> None:
-    """Write the observations of a block, as `episode.observe` does."""
+    """Write the observations of a block."""
     # The six coordinates are read from the first columns of the state or, if the sensors are noisy, of the observation.
     seen = 0
     if settings[SENSOR_NOISE] > 0.0:

@@ -14,7 +14,7 @@ episode's first press. With a `switch_cost` it is read at every press.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -95,24 +95,17 @@ class NumpyBoats(NumpyRows):
         rules: rules of the environment.
         batch: `()` for one boat, `(N,)` for N boats.
         action_format: `dict` or `tuple`.
-        make_rows: function that returns the rows of boats. If None, `boat_rows`.
     """
 
     final_infos = ("score",)
 
-    def __init__(
-        self,
-        rules: Rules,
-        batch: tuple[int, ...],
-        action_format: ActionFormat,
-        make_rows: Callable[[], Any] | None = None,
-    ) -> None:
+    def __init__(self, rules: Rules, batch: tuple[int, ...], action_format: ActionFormat) -> None:
         if action_format not in ("dict", "tuple"):
             raise ValueError(f"BoatDock: action_format={action_format!r}, but must be dict or tuple")
         num_boats = batch[0] if batch else 1
         if num_boats < 1:
             raise ValueError(f"BoatDock: num_envs={num_boats}, but must be at least 1")
-        super().__init__(boat_rows(num_boats, rules) if make_rows is None else make_rows(), batch)
+        super().__init__(boat_rows(num_boats, rules), batch)
         self._rules = rules
         self.has_choice = rules.controller == "choose"
         self.action_space = action_space(rules, action_format)

@@ -61,8 +61,6 @@ class BoatDockOptions(ProblemOptions):
     """
     recording: str | None = None
     """A file of `hpamdp play`, whose figures replace people's in tables and curves. If null, people's."""
-    compile_rules: bool = False
-    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
     @property
     def names(self) -> tuple[str, ...]:
