@@ -360,8 +360,8 @@ class Vehicle(OwnProblem):
         return np.array([position, speed, max(800.0 - position, 0.0)], np.float32)
 
 
-TUNED: dict[str, type[OwnProblem]] = {"battery": Battery, "inventory": Inventory, "heating": Heating}
-HELD: dict[str, type[OwnProblem]] = {"queue": Queue, "irrigation": Irrigation, "vehicle": Vehicle}
+TUNED: dict[str, type[OwnProblem]] = {"battery": Battery, "inventory": Inventory, "heating": Heating, "irrigation": Irrigation}
+HELD: dict[str, type[OwnProblem]] = {"queue": Queue, "vehicle": Vehicle}
 PROBLEMS = TUNED | HELD
 EPISODES = 64
 EPISODE_SEEDS = tuple(range(900_000, 900_000 + EPISODES))  # of the fixed episodes on which all players are scored

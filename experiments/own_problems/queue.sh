@@ -22,7 +22,7 @@ for seed in "$@"; do
         for learner in ${LEARNERS:-hppo pdqn hsac}; do
             run "${problem}_${learner}_$seed" "$hpamdp" hpamdp_learner.py "$problem" "$learner" "$seed"
         done
-        for form in ${FORMS:-raw normalised}; do
+        for form in ${FORMS:-raw normalised informed}; do
             run "${problem}_sb3_${form}_$seed" "$sb3" sb3_ppo.py "$problem" "$form" "$seed"
         done
     done

@@ -1,10 +1,11 @@
-"""Train Stable-Baselines3's PPO, with its defaults, on the flattened Box.
+"""Train Stable-Baselines3's PPO on the flattened Box.
 
-python experiments/own_problems/sb3_ppo.py PROBLEM raw|normalised SEED FILE CPU_SECONDS
+python experiments/own_problems/sb3_ppo.py PROBLEM raw|normalised|informed SEED FILE CPU_SECONDS
     writes the curve to a csv file.
 
-The action is one Box: a score for each choice beside all numbers; the largest score chooses. `normalised` wraps the
-environment in VecNormalize, which scales observations and rewards.
+The action is one Box: a score for each choice beside all numbers; the largest score chooses. `raw` has the defaults.
+`normalised` wraps the environment in VecNormalize, which scales observations and rewards. `informed` also has what
+hpamdp's defaults know of such problems: the time limit ends the episode, a discount of 0.997, and several copies.
 """
 
 from __future__ import annotations
@@ -21,6 +22,18 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+
+GAMMA = 0.997
+NUM_COPIES, STEPS = 8, 256  # as many steps in a batch as the defaults have
+
+
+class EndsAtLimit(gymnasium.Wrapper):
+    """Ends episodes at the time limit, so that nothing is expected after it."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated or truncated, False, info
 
 
 class Flat(gymnasium.Wrapper):
@@ -77,7 +90,9 @@ class Scorer(BaseCallback):
 
     def _on_step(self) -> bool:
         # Between two updates, as the learners of hpamdp are scored.
-        is_between = self.num_timesteps % self.model.n_steps == 1 and self.num_timesteps > 1
+        num_copies = self.training_env.num_envs
+        is_first = self.num_timesteps % (num_copies * self.model.n_steps) == num_copies
+        is_between = is_first and self.num_timesteps > num_copies
         return not (is_between and self.clock.after(self.num_timesteps))
 
     def end(self) -> None:
@@ -88,12 +103,16 @@ class Scorer(BaseCallback):
 
 def main(problem: str, form: str, seed: int, file: Path, limit: float) -> None:
     """Train and score."""
-    env = DummyVecEnv([lambda: Monitor(Flat(PROBLEMS[problem]()))])
-    if form == "normalised":
-        env = VecNormalize(env)
+    settings = {}
+    if form == "informed":
+        copies = DummyVecEnv([lambda: Monitor(EndsAtLimit(Flat(PROBLEMS[problem]())))] * NUM_COPIES)
+        env, settings = VecNormalize(copies, gamma=GAMMA), {"gamma": GAMMA, "n_steps": STEPS}
+    else:
+        env = DummyVecEnv([lambda: Monitor(Flat(PROBLEMS[problem]()))])
+        env = VecNormalize(env) if form == "normalised" else env
     name = {"problem": problem, "library": "sb3", "player": f"ppo {form}", "seed": seed, "limit_s": limit}
     scorer = Scorer(name, file, limit)
-    PPO("MlpPolicy", env, seed=seed, device="cpu").learn(10**9, callback=scorer)
+    PPO("MlpPolicy", env, seed=seed, device="cpu", **settings).learn(10**9, callback=scorer)
     scorer.end()
 
 

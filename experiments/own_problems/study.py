@@ -30,9 +30,10 @@ from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 NAME = ("problem", "library", "player", "seed")
+LATENESS = 3.0  # CPU seconds by which a score may follow the time that it stands for
 LEVEL = 0.8  # of the way from random play to the best policy
 TIMES = (15.0, 30.0, 60.0, 120.0)  # columns of the table, CPU seconds
-COLOURS = {"ppo raw": FAINT, "ppo normalised": INK}
+COLOURS = {"ppo raw": FAINT, "ppo normalised": INK, "ppo informed": "#D55E00"}
 
 
 def gather(folder: Path, order: Sequence[str]) -> Rows:
@@ -47,8 +48,8 @@ def gather(folder: Path, order: Sequence[str]) -> Rows:
 
 
 def way_at(run: Rows, cpu_s: float) -> float:
-    """Return the way at a mark. Before its first mark a run has made none; one that has ended keeps its last agent."""
-    return next((row["way"] for row in reversed(run) if row["mark"] <= cpu_s), 0.0)
+    """Return the way by then. Before its first score a run has made none; one that has ended keeps its last agent."""
+    return next((row["way"] for row in reversed(run) if row["cpu_s"] <= cpu_s + LATENESS), 0.0)
 
 
 def seconds_to(run: Rows, level: float) -> float:
