@@ -360,7 +360,12 @@ class Vehicle(OwnProblem):
         return np.array([position, speed, max(800.0 - position, 0.0)], np.float32)
 
 
-TUNED: dict[str, type[OwnProblem]] = {"battery": Battery, "inventory": Inventory, "heating": Heating, "irrigation": Irrigation}
+TUNED: dict[str, type[OwnProblem]] = {
+    "battery": Battery,
+    "inventory": Inventory,
+    "heating": Heating,
+    "irrigation": Irrigation,
+}
 HELD: dict[str, type[OwnProblem]] = {"queue": Queue, "vehicle": Vehicle}
 PROBLEMS = TUNED | HELD
 EPISODES = 64

@@ -23,7 +23,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-
 GAMMA = 0.997
 NUM_COPIES, STEPS = 8, 256  # as many steps in a batch as the defaults have
 
