@@ -244,8 +244,7 @@ def test_a_mask_of_a_choice_may_leave_out_parts(space, mask, flat):
 def test_a_pair_mask_says_what_goes_together(place):
     pairs = np.ones((5, 5))
     pairs[0, 3] = 0
-    settings = {"pair_mask": "info"} if place == "info" else {}
-    env = saying("two discretes", {"pair_mask": pairs}, place, **settings)
+    env = saying("two discretes", {"pair_mask": pairs}, place)
     assert PAMDPSpecs.from_env(env).has_pair_mask
     assert env.reset()[keys.PAIR_MASK].shape == (1, 5, 5) and not env.reset()[keys.PAIR_MASK][0, 0, 3]
     check_env_specs(env)
@@ -254,7 +253,6 @@ def test_a_pair_mask_says_what_goes_together(place):
 @pytest.mark.parametrize(
     ("tree", "said", "settings", "line"),
     [
-        ("two discretes", {"pair_mask": np.ones((5, 5))}, {}, r"env\.pair_mask=info; env\.pair_mask=ignore ignores"),
         ("two discretes", {}, {"pair_mask": "info"}, "gave None as pair_mask, which must be 5 rows of 5 numbers"),
         ("nested", {}, {"pair_mask": "info"}, "pair_mask=info: the action has one component, so there are no pairs"),
     ],
@@ -324,12 +322,15 @@ def test_bounds_that_are_wrong_are_told_in_one_line(said, line):
         saying("counts", {"parameter_low": [2.5, 3.0]}, parameter_bounds="info").reset()
 
 
-def test_bounds_that_are_not_read_are_told_in_one_line():
+def test_bounds_are_read_where_a_first_reset_gives_them_and_reported_if_they_come_later():
+    for settings, is_read in ({}, True), ({"parameter_bounds": "ignore"}, False):
+        env = saying("discretes and a box", BOUNDS, **settings)
+        assert PAMDPSpecs.from_env(env).has_parameter_bounds == is_read
+    env = saying("discretes and a box", {})
+    env.envs[0].unwrapped.said = BOUNDS
     line = r"gave info\['parameter_low'\], which is not read; .*bounds=info; env\.parameter_bounds=ignore ignores them$"
     with pytest.raises(ProblemError, match=line):
-        saying("discretes and a box", BOUNDS).reset()
-    env = saying("discretes and a box", BOUNDS, parameter_bounds="ignore")
-    assert not PAMDPSpecs.from_env(env).has_parameter_bounds
+        env.reset()
     saying("discrete", BOUNDS).reset()  # without parameters, the names mean something else
 
 

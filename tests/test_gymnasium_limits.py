@@ -7,11 +7,13 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from conftest import compose_config
 from gymnasium_players import step
 from toy_environments import Toy
 
 from hpamdp.config.errors import ConfigError
+from hpamdp.env.gymnasium import copies
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.gymnasium.time_limit import limit_of
 from hpamdp.env.registration import register
@@ -44,7 +46,7 @@ def test_each_problem_with_an_id_has_a_time_limit_as_a_gymnasium_environment(env
     except SettingError as error:
         pytest.skip(str(error))
     limit = limit_of(env, None)
-    assert limit > 4 and limit_of(env, 4) == 4
+    assert limit is not None and limit > 4 and limit_of(env, 4) == 4
 
 
 @pytest.mark.parametrize(
@@ -107,6 +109,31 @@ def test_a_limit_above_the_environments_own_is_refused(monkeypatch):
 def test_without_a_limit_the_line_asks_for_one(limit):
     with pytest.raises(ValueError, match=r"has no time limit of its own; set env\.max_steps"):
         GymnasiumEnv(entry_point=f"{__name__}:Limited", kwargs={"limit": limit})
+
+
+class Forbidding(Toy):
+    """Ends its episodes after 8 steps without naming a limit, and forbids all discrete actions but one."""
+
+    def __init__(self):
+        super().__init__(length=8)
+
+    def reset(self, **arguments):
+        return super().reset(**arguments)[0], {"action_mask": [0, 1, 0]}
+
+    def step(self, action):
+        assert action[0] == 1
+        return *super().step(action)[:4], {"action_mask": [0, 1, 0]}
+
+
+def test_an_environment_that_ends_by_itself_needs_no_limit(monkeypatch, capsys):
+    env = GymnasiumEnv(4, make=Forbidding, observation_scaling="none", staggered=True)
+    env.reset()
+    first = [step(env, torch.ones(4, dtype=torch.int64))["done"].squeeze(-1) for _ in range(8)]
+    assert torch.stack(first).int().argmax(0).tolist() == [7, 4, 1, 6]  # apart by parts of eight steps
+    monkeypatch.setattr(copies, "_MOST_STEPS", 3)
+    assert episode_length(GymnasiumEnv(make=lambda: Toy(length=8), observation_scaling="none")) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("an episode without a time limit was truncated after 3 steps; set env.max_steps")
 
 
 def test_an_environment_that_ends_the_program_while_it_is_built_is_reported_in_one_line(tmp_path):

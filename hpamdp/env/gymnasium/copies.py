@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 import gymnasium
 import numpy as np
 
+from hpamdp import keys
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError, closed_on_error, fault_of
 from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
 from hpamdp.env.gymnasium.contract import ContractCheck, checked_step, refuse_running_statistics, refuse_step
@@ -20,6 +21,7 @@ from hpamdp.env.gymnasium.options import GymnasiumOptions
 from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds
 from hpamdp.env.gymnasium.time_limit import limit_of
 from hpamdp.env.gymnasium.values import flag
+from hpamdp.messages import warn
 from hpamdp.settings import SettingError
 
 # If an info has both entries, the first one counts.
@@ -29,6 +31,9 @@ _NUM_AFTER = len(("reward", "terminated", "truncated", "success", "has_success")
 _ALL = slice(None)  # rows
 _SPACES = ("action_space", "observation_space")
 _PICTURES_PER_SECOND = 4.0
+# An environment that names no time limit must end an episode of random actions within the first number of steps.
+# Episodes are truncated after the second number.
+_TRIED_STEPS, _MOST_STEPS = 1_000, 10_000
 
 
 @dataclass(frozen=True)
@@ -99,9 +104,11 @@ class Copies:
         envs: the copies.
         example: one of them, to read its spaces.
         max_steps: of the longest episode.
+        usual_length: `max_steps`, or the steps of a random episode if the environment names no time limit.
         has_pictures: whether `pictures` returns some: the `render_mode` is `rgb_array`.
         pictures_per_second: `render_fps` of the environment's metadata, or 4.
         option_names: what the environment calls its options, unchecked.
+        first_info: of a reset; which masks and bounds are in it tells which ones to read.
         results: what the copies have last returned.
         pixels: the pictures that the copies have last returned, uint8 `[N, num_pixels]`.
 
@@ -124,6 +131,7 @@ class Copies:
     def _read(self, num: int, settings: GymnasiumOptions, flattens_pictures: bool) -> None:
         """Read the spaces, and set up what each step needs."""
         self._check_spaces()
+        self.first_info = self._first_info()
         try:
             self.example = self.envs[0]
             if getattr(self.example.unwrapped, "training_begins_elsewhere", False):  # of this package's problems
@@ -132,14 +140,15 @@ class Copies:
                     "environment does not know which of the two it is in; use the problem itself, such as env=pinball"
                 )
             refuse_running_statistics(self.example)
-            self._limits = [limit_of(env, settings.max_steps) for env in self.envs]
+            limits = [limit_of(env, settings.max_steps) for env in self.envs]
+            self._limits = [_MOST_STEPS if limit is None else limit for limit in limits]
             self.max_steps = max(self._limits)
             space = self.envs[0].observation_space
             self.options = OptionSpace(self.envs[0].action_space, settings.option_key)
             self.actions = ActionSpace(self.options.rest, settings.parameter_dims, settings.action_form)
             sources = settings.action_mask, settings.pair_mask
-            self._masks = Masks(self.envs[0], num, self.actions, self.options.num_options, *sources)
-            self._bounds = ParameterBounds(self.envs[0], num, self.actions, settings.parameter_bounds)
+            self._masks = Masks(self.envs[0], num, self.actions, self.options.num_options, self.first_info, *sources)
+            self._bounds = ParameterBounds(self.envs[0], num, self.actions, self.first_info, settings.parameter_bounds)
             entries: Sequence[int | str] | None = settings.observation_keys
             apart = {*self._masks.in_observation, *(self._bounds.names if self._bounds.in_observation else ())}
             if apart and entries is None:
@@ -166,6 +175,41 @@ class Copies:
         self._after = self.table[:, self.layout.dim : self.layout.dim + _NUM_AFTER]
         self._has_masks = bool(mask_sizes)
         self._has_bounds = num_bounded > 0
+        self._names_no_limit = None in limits
+        self.usual_length = self._length_of_an_episode() if self._names_no_limit else self.max_steps
+
+    def _length_of_an_episode(self) -> int:
+        """Return the steps of an episode of random actions with the first copy.
+
+        Raises:
+            SettingError: it goes on.
+        """
+        rng, actions, num = np.random.default_rng(0), self.actions, len(self.envs)
+        self.reset({0: 0})
+        for step in range(1, _TRIED_STEPS + 1):
+            allowed = {name: rows[0] != 0.0 for name, rows in self.results.masks.items()}
+            mask = allowed.get(keys.ACTION_MASK, np.ones(len(actions.parameter_dims), bool))
+            parts = np.split(mask, np.cumsum(actions.component_sizes)[:-1]) if actions.component_sizes else [mask]
+            chosen = np.array([rng.choice(np.flatnonzero(part)) for part in parts])
+            options = allowed.get(keys.OPTION_MASK, np.ones(max(1, self.options.num_options), bool))
+            option = np.full(num, rng.choice(np.flatnonzero(options))) if self.options.num_options else None
+            discrete = np.tile(chosen if actions.component_sizes else chosen[0], (num, 1) if len(parts) > 1 else num)
+            parameters = np.tile(rng.uniform(actions.low, actions.high).astype(np.float32), (num, 1))
+            self.step([0], option, discrete, parameters)
+            if self.results.flags[:2, 0].any():
+                return step
+        raise SettingError(
+            f"{self._name}: has no time limit of its own; set env.max_steps (an episode of random actions goes on "
+            f"after {_TRIED_STEPS:,} steps)"
+        )
+
+    def _first_info(self) -> Mapping[str, Any]:
+        """Return the info of a reset, which may hold masks and bounds."""
+        self._row = 0
+        try:
+            return self.envs[0].reset(seed=0)[1]
+        except Exception as error:
+            self._explain("reset", error)
 
     def _check_spaces(self) -> None:
         if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
@@ -257,6 +301,7 @@ class Copies:
                     success = _success_in(info)
                 if terminated or truncated or num_steps[row] == 1:
                     self._check_unchanged(row)
+                    self._tell_if_cut(num_steps[row])
                 if terminated or truncated or success is not None:
                     flags[row] = (terminated, truncated, bool(success), success is not None)
             if rows:
@@ -267,6 +312,13 @@ class Copies:
         self.results.reward[index] = rewards
         for row, of_row in flags.items():
             self.results.flags[:, row] = of_row
+
+    def _tell_if_cut(self, num_steps: int) -> None:
+        """Warn once if an episode has been truncated for want of a time limit."""
+        if self._names_no_limit and num_steps >= _MOST_STEPS:
+            self._names_no_limit = False
+            cut = f"an episode without a time limit was truncated after {num_steps:,} steps"
+            warn(f"{self._name}: {cut}; set env.max_steps")
 
     def _natives(
         self, index: Any, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray

@@ -420,7 +420,7 @@ class GymnasiumEnv(PAMDPEnv):
         self._first_ends[is_reset] = 0
         if self._is_staggered and mask is None and given is None:
             numbers = np.arange(self.first_env, self.first_env + self.num_envs)
-            self._first_ends[:] = np.ceil(numbers * _GOLDEN % 1.0 * self.max_steps)
+            self._first_ends[:] = np.ceil(numbers * _GOLDEN % 1.0 * self._copies.usual_length)
         self._scale(is_reset, is_all=len(rows) == self.num_envs)
         if self._reward_scaling is not None:
             self._reward_scaling.begin(is_reset)

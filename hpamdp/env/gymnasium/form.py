@@ -37,7 +37,7 @@ class NativeForm(GymnasiumForm):
         self._env = copies.example
         self.observation_space, self.action_space = self._env.observation_space, self._env.action_space
         self._observations, self._actions, self._options = copies.observations, copies.actions, copies.options
-        self._scaling, self._settings = scaling, settings
+        self._scaling, self._settings, self._first_info = scaling, settings, copies.first_info
 
     def read(self, observation: Any, info: Mapping[str, Any] | None = None) -> tuple[TensorDict, bool]:
         """Return the rows of `GymnasiumForm.read`."""
@@ -49,8 +49,8 @@ class NativeForm(GymnasiumForm):
         observed = self._scaling.rescaled(vectors)
         settings, actions = self._settings, self._actions
         sources = settings.action_mask, settings.pair_mask
-        masks = Masks(self._env, len(singles), actions, self._options.num_options, *sources)
-        bounds = ParameterBounds(self._env, len(singles), actions, settings.parameter_bounds)
+        masks = Masks(self._env, len(singles), actions, self._options.num_options, self._first_info, *sources)
+        bounds = ParameterBounds(self._env, len(singles), actions, self._first_info, settings.parameter_bounds)
         in_info = [*masks.needs_info, *(() if bounds.in_observation else bounds.names)]
         if in_info and info is None:
             raise ValueError(f"give the info of the step, which holds {' and '.join(in_info)}")

@@ -34,8 +34,9 @@ class Masks:
         num_envs: number of copies.
         actions: their action space, without the option.
         num_options: number of options; 0 without options.
+        first_info: of a reset.
         source: where `action_mask` and `option_mask` are. `info`: they come with the info of every reset and step;
-            `ignore`: they are ignored. If None, they are entries of the observation, a `Dict`, if it has them.
+            `ignore`: they are ignored. If None, they are entries of the observation, a `Dict`, or of the first info.
         pair_source: the same for `pair_mask`.
 
     Attributes:
@@ -53,6 +54,7 @@ class Masks:
         num_envs: int,
         actions: ActionSpace,
         num_options: int,
+        first_info: Mapping[str, Any],
         source: MaskSource | None = None,
         pair_source: MaskSource | None = None,
     ) -> None:
@@ -68,6 +70,9 @@ class Masks:
         sizes = {keys.ACTION_MASK: num, keys.OPTION_MASK: num_options, keys.PAIR_MASK: num * num}
         has_pairs = actions.num_components > 1
         sources = {keys.ACTION_MASK: source, keys.OPTION_MASK: source, keys.PAIR_MASK: pair_source}
+        for name, given in sources.items():
+            if given is None and name not in entries and first_info.get(name) is not None:
+                sources[name] = "info"
         sizes = {name: size for name, size in sizes.items() if size > 0 and sources[name] != "ignore"}
         self.rows = {
             name: np.ones((num_envs, size), bool)

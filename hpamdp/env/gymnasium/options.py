@@ -27,7 +27,10 @@ class GymnasiumOptions(Settings):
     kwargs: dict[str, Any] | None = None
     """Arguments of the environment's constructor, as in `env.kwargs={size:5}`."""
     max_steps: PositiveInt | None = None
-    """Steps after which an episode is truncated. If null, the limit of the `TimeLimit` wrapper or of the spec."""
+    """Steps after which an episode is truncated. If null, the limit of the `TimeLimit` wrapper or of the spec.
+
+    An environment without either must end a random episode within 1,000 steps; then the limit is 10,000.
+    """
     action_form: ActionForm = "auto"
     """How the action space is read. `auto`: a `Discrete` and boxes beside it can be one choice with its parameters.
 
@@ -41,18 +44,20 @@ class GymnasiumOptions(Settings):
     action_mask: MaskSource | None = None
     """Where the environment says which actions it forbids. `info`: `action_mask` and `option_mask` in each info.
 
-    `ignore`: masks are ignored. If null, the entries `action_mask` and `option_mask` of a `Dict` of observations, if it
-    has them. A mask in an info, or a method `action_masks()`, is then refused.
+    `ignore`: masks are ignored. If null, the entries `action_mask` and `option_mask` of a `Dict` of observations, or
+    else of the infos if a first reset gives them. A method `action_masks()` is then refused.
     """
     pair_mask: MaskSource | None = None
     """Where the environment says which discrete actions of different components go together, `pair_mask`.
 
-    `info`: in each info; `ignore`: it is ignored. If null, the entry of a `Dict` of observations, if it has one.
+    `info`: in each info; `ignore`: it is ignored. If null, the entry of a `Dict` of observations, or else of the infos
+    if a first reset gives it.
     """
     parameter_bounds: MaskSource | None = None
     """Where the environment gives bounds of the current state, `parameter_low` and `parameter_high`.
 
-    `info`: in each info; `ignore`: they are ignored. If null, entries of a `Dict` of observations, if it has them.
+    `info`: in each info; `ignore`: they are ignored. If null, entries of a `Dict` of observations, or else of the infos
+    if a first reset gives them.
     """
     observation_keys: list[int | str] | None = None
     """Entries of a `Tuple` or `Dict` to observe, as in [0] or [position, speed]. If null, all but masks and bounds."""

@@ -28,8 +28,9 @@ class ParameterBounds:
         env: one of the copies.
         num_envs: number of copies.
         actions: their action space, without the option.
+        first_info: of a reset.
         source: `info`: the bounds come with the info of every reset and step; `ignore`: they are not read. If None,
-            they are entries of the observation, a `Dict`, if it has them.
+            they are entries of the observation, a `Dict`, or of the first info, if these have them.
 
     Attributes:
         names: those of `parameter_low` and `parameter_high` that are read; empty if the environment gives neither.
@@ -40,13 +41,22 @@ class ParameterBounds:
         ValueError: there are no parameters.
     """
 
-    def __init__(self, env: gymnasium.Env, num_envs: int, actions: ActionSpace, source: MaskSource | None) -> None:
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        num_envs: int,
+        actions: ActionSpace,
+        first_info: Mapping[str, Any],
+        source: MaskSource | None,
+    ) -> None:
         space = env.observation_space
         entries = space.spaces if isinstance(space, spaces.Dict) and source is None else {}
         self.names = tuple(name for name in _NAMES if source == "info" or name in entries)
         if self.names and not sum(actions.parameter_dims):
             raise SettingError(f"{' and '.join(self.names)}: the action has no parameters")
         self.in_observation = source is None and bool(self.names)
+        if source is None and not self.names and sum(actions.parameter_dims):
+            self.names = tuple(name for name in _NAMES if first_info.get(name) is not None)
         self._may_be_unread = source is None and not self.names and sum(actions.parameter_dims) > 0
         self._actions = actions
         self._has_whole = bool(actions.is_whole.any())

@@ -135,7 +135,7 @@ class ProcessCopies:
         flattens_pictures: whether pictures are part of the vectors.
 
     Attributes:
-        max_steps, option_names, has_pictures, pictures_per_second: as those of `Copies`.
+        max_steps, usual_length, option_names, first_info, has_pictures, pictures_per_second: as those of `Copies`.
         options, actions, observations, layout, table, results, pixels: as those of `Copies`.
         envs: empty, since the copies live elsewhere.
         example: a closed copy, to read its spaces.
@@ -153,6 +153,7 @@ class ProcessCopies:
         probe.close()
         self.example = probe.example
         self.max_steps, self.option_names, self.layout = probe.max_steps, probe.option_names, probe.layout
+        self.first_info, self.usual_length = probe.first_info, probe.usual_length
         self.has_pictures, self.pictures_per_second = probe.has_pictures, probe.pictures_per_second
         self.options, self.actions, self.observations = probe.options, probe.actions, probe.observations
         self.table = np.zeros((num, self.layout.num_result_columns))

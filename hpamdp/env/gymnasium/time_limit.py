@@ -8,8 +8,8 @@ from gymnasium.wrappers import TimeLimit
 from hpamdp.settings import SettingError
 
 
-def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
-    """Return the number of steps after which an episode of the environment is truncated.
+def limit_of(env: gymnasium.Env, max_steps: int | None) -> int | None:
+    """Return the number of steps after which an episode of the environment is truncated; None if nothing names one.
 
     Args:
         env: its own limit is the lowest one of its TimeLimit wrappers and, in a problem of this package, of the
@@ -17,7 +17,7 @@ def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
         max_steps: a limit of at most the environment's own. If None, the latter.
 
     Raises:
-        SettingError: the environment has no limit of its own and none is given, or `max_steps` is above its own.
+        SettingError: `max_steps` is above the environment's own limit.
     """
     limits = _applied_limits(env)
     own = getattr(env.unwrapped, "own_time_limit", None)  # of this package's problems, which end their episodes
@@ -42,8 +42,6 @@ def _applied_limits(env: gymnasium.Env) -> list[int]:
     return limits
 
 
-def _limit_of_spec(env: gymnasium.Env) -> int:
+def _limit_of_spec(env: gymnasium.Env) -> int | None:
     limit = getattr(env.unwrapped.spec, "max_episode_steps", None)
-    if limit is None or limit < 1:  # `gymnasium.make` takes -1 as no limit
-        raise SettingError("has no time limit of its own; set env.max_steps")
-    return int(limit)
+    return None if limit is None or limit < 1 else int(limit)  # `gymnasium.make` takes -1 as no limit
