@@ -177,8 +177,7 @@ def test_the_closing_table_sets_this_agent_beside_the_references_in_their_order(
         },
         BoatDockEnv.table_metrics,
     )
-    head, score, success, agreement, gaps, effort = table.splitlines()
-    assert gaps == "empty cells: no figure is stored for that reference with these settings"
+    head, score, success, agreement, effort = table.splitlines()
     assert head.split("   ")[-5:] == ["this agent", "random", "people", "best person", "ceiling"]
     assert score.split() == ["score", "3.200", "-0.930", "1.970", "3.021", "3.600"]
     assert success.split() == ["success", "97.0%", "86.0%", "98.9%", "100.0%"]

@@ -97,8 +97,6 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
         values = [measured.get(metric.name) for measured in columns.values()]
         cells.append([metric.title, *(_WRITE[metric.kind](value) if _is_known(value) else "" for value in values)])
     lines = aligned(cells)
-    if any("" in row[1:] for row in cells[1:]):
-        lines.append("empty cells: no figure is stored for that reference with these settings")
     lines += [line for name in (SHORT_SIGHT, ONE_OPTION, ONE_ACTION) for line in summary.get(name, [])]
     if EVALUATED_FRAMES in summary:
         lines.append(f"these figures are of the agent after {summary[EVALUATED_FRAMES]:,.0f} frames")

@@ -377,7 +377,8 @@ class Trainer:
         row = self.recorder.log(self.frames, self.wall_s, self.cpu_s, is_evaluated=True, own=own)
         success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
         self.last_score = row["eval/score"]
-        self._last_evaluation = f"score {self.last_score:.2f}{success} at {self.frames:,}{self.unit}"
+        if self.frames:  # the untrained agent's score says nothing of what is learned
+            self._last_evaluation = f"score {self.last_score:.2f}{success} at {self.frames:,}{self.unit}"
         self._show(bar)
         self._call(lambda callback: callback.on_evaluation(self, row))
         self.is_evaluation_due = False
