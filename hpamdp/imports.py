@@ -6,6 +6,9 @@ import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+# Imports make hundreds of thousands of objects, the parts of a run some ten thousand.
+_MANY = 50_000
+
 
 @contextmanager
 def collector_paused() -> Iterator[None]:
@@ -19,7 +22,9 @@ def collector_paused() -> Iterator[None]:
     try:
         yield
     finally:
-        if gc.get_freeze_count() == 0:  # else objects that somebody has frozen would be freed, too
+        # Few new objects are left to the collector. Counting those that somebody has frozen, which would be freed, too,
+        # takes a tenth of a second in a process that has frozen its imports.
+        if gc.get_count()[0] > _MANY and gc.get_freeze_count() == 0:
             gc.freeze()
             gc.unfreeze()  # moves all objects to the oldest generation, so that short collections leave them out
         if was_enabled:
