@@ -99,9 +99,7 @@ def _as_plain_values(
             if names.get(group) is not None:
                 raise ConfigError(f"{group}={names[group]}: {file_of(group, names[group])} names no class as {TARGET}")
             raise ConfigError(f"{group}: nothing chosen; set {group}=NAME with one of the files in conf/{group}")
-    own = cfg.copy()
-    OmegaConf.set_struct(own, False)
-    own.pop("hydra", None)
+    own = OmegaConf.masked_copy(cfg, [str(name) for name in cfg if name != "hydra"])
     folders: tuple[str, ...] = ()
     if "hydra" in cfg or HydraConfig.initialized():
         node = cfg.hydra if "hydra" in cfg else HydraConfig.get()

@@ -99,8 +99,8 @@ def _wrong_setting(line: CommandLine, conf: Path) -> str | None:
 
 def missing_setting(cfg: DictConfig, setting: str, conf: Path) -> str | None:
     """Return a message that a setting with a dotted name is not in the config; None if it is."""
-    node: Any = OmegaConf.to_container(cfg)
     names = setting.split(".")
+    node: Any = OmegaConf.to_container(OmegaConf.masked_copy(cfg, names[0]) if names[0] in [*cfg] else cfg)
     for depth, name in enumerate(names):
         if not isinstance(node, dict):
             return None
