@@ -175,13 +175,13 @@ def make_actor() -> Actor:
 
 
 def test_meta_critic_chooses_options_of_a_fixed_length_optimally_and_better_than_for_whole_episodes():
-    anew, whole = (trained(make_meta_critic(updates_per_decision=0.15), length, 20) for length in (2, None))
+    anew, whole = (trained(make_meta_critic(updates_per_decision=0.15), length, 12) for length in (2, None))
     assert anew >= 0.95 * best_value(GAMMA, 2)
     assert whole <= best_value(GAMMA, Crossing.max_steps) + 1e-6 < 0.5 * anew
 
 
 def test_actor_chooses_options_of_a_fixed_length_optimally():
-    assert trained(make_actor(), 2, 60) >= 0.95 * best_value(GAMMA, 2)
+    assert trained(make_actor(), 2, 24) >= 0.95 * best_value(GAMMA, 2)
 
 
 def test_an_environment_of_choices_closes_the_one_that_it_wraps():

@@ -12,7 +12,7 @@ from hpamdp.policies.low_level.hyar import LATENT, HyAR
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
-    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], codec_pretrain_updates=700,
+    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], codec_pretrain_updates=300,
     relabelling="mean", buffer_size=20_000, batch_size=64, gamma=0.9, tau=0.02, critic_lr=1e-3, lr_final_fraction=1.0,
     lr_steps=0, epsilon_steps=3000,
 )  # fmt: skip
@@ -47,7 +47,7 @@ def learn(learner: HyAR, num_batches: int, size: int = 200) -> dict[str, float]:
 def trained(request) -> HyAR:
     torch.manual_seed(0)
     learner = make(discrete=request.param)
-    learn(learner, 24)
+    learn(learner, 16)
     return learner
 
 
@@ -197,7 +197,7 @@ def test_the_search_tries_no_forbidden_action(discrete):
 
 def test_ddpg_has_one_critic_an_actor_update_each_time_and_no_noise_in_its_targets():
     learner = make(twin=False, target_smoothing=0.5, policy_delay=2, warmup_steps=200, codec_pretrain_updates=1)
-    learn(learner, 2)
+    learn(learner, 1)
     assert learner.critics(torch.zeros(5, 4), torch.zeros(5, 1, 6)).shape == (1, 5, 1)
     assert make().critics(torch.zeros(5, 4), torch.zeros(5, 1, 6)).shape == (2, 5, 1)
     before = learner.actor.net[0].weight.clone()
@@ -337,7 +337,7 @@ def test_the_mean_loss_averages_over_an_actions_own_parameters_and_the_dimension
 
 def test_the_latest_error_is_that_of_the_transitions_from_which_the_range_of_z_was_estimated():
     torch.manual_seed(0)
-    learner = make(correction_error="latest", codec_pretrain_updates=30)
+    learner = make(correction_error="latest", codec_pretrain_updates=30, updates_per_step=0.01)
     learn(learner, 10)
     latest = learner.dynamics_error.item()
     for _ in range(5):
@@ -363,13 +363,13 @@ def test_the_codec_is_updated_once_in_so_many_episodes_after_the_first(monkeypat
 
 def test_with_a_window_the_critics_see_the_newest_steps_alone_and_none_of_the_warm_up():
     torch.manual_seed(0)
-    learner = make(critic_window=80, warmup_steps=200, codec_pretrain_updates=1, updates_per_step=1.0, batch_size=60)
+    learner = make(critic_window=80, warmup_steps=200, codec_pretrain_updates=1, updates_per_step=0.1, batch_size=60)
     learn(learner, 1)
     assert learner.updates == 0 and len(learner.buffer) == 200
     learn(learner, 1, 50)
     assert learner.updates == 0, "fewer than a batch"
     learn(learner, 1, 50)
-    assert learner.updates == 50
+    assert learner.updates == 5
     newest = {row.tobytes() for row in learner.buffer[220:300]["state"].numpy()}
     seen = {row.tobytes() for sample in learner.sample_batches(20) for row in sample["state"].numpy()}
     assert seen == newest
@@ -380,13 +380,13 @@ def test_with_a_window_the_critics_see_the_newest_steps_alone_and_none_of_the_wa
 
 def test_with_a_window_a_run_that_resumes_without_its_steps_learns_from_the_new_ones_at_once():
     torch.manual_seed(0)
-    settings = dict(critic_window=80, warmup_steps=200, codec_pretrain_updates=1, updates_per_step=1.0, batch_size=60)
+    settings = dict(critic_window=80, warmup_steps=200, codec_pretrain_updates=1, updates_per_step=0.1, batch_size=60)
     earlier, resumed = make(**settings), make(**settings)
     learn(earlier, 1)
     learn(earlier, 1, 100)
     resumed.load_state_dict(earlier.state_dict())
     learn(resumed, 1, 70)
-    assert resumed.updates == earlier.updates + 70
+    assert resumed.updates == earlier.updates + 7
 
 
 def test_the_noise_falls_with_the_episodes_after_the_warm_up():

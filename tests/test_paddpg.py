@@ -33,7 +33,7 @@ def rows_with_scores(num: int = 200) -> TensorDict:
 def test_the_learner_finds_the_best_discrete_action_and_its_parameters(twin):
     torch.manual_seed(0)
     learner = make(twin=twin)
-    for _ in range(30):
+    for _ in range(22):
         learner.learn(one_step_rows(learner, 200), torch.ones(200, 1, dtype=torch.bool))
     with GREEDY:
         rows = one_step_rows(learner, 1000)

@@ -38,7 +38,7 @@ OTHER_FORMS = [PUBLISHED, {"bounding": "inverting_gradients", "double_q": True}]
 def test_the_learner_finds_the_best_discrete_action_and_its_parameters(changes):
     torch.manual_seed(0)
     learner = make(**changes)
-    learn(learner, 30)
+    learn(learner, 18 if not changes else 30)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(learner, 1000)
     assert (rows[keys.DISCRETE] == 1).float().mean() > 0.98

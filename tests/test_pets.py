@@ -36,7 +36,7 @@ SEARCH = dict(
 )  # fmt: skip
 OPTIONS = dict(
     num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], lr=2e-3, weight_decay=0.1, warmup_steps=64,
-    updates_per_step=2.0, batch_size=32, buffer_size=4000, posterior_sampling=True, optimism=0.0, gamma=0.97,
+    updates_per_step=0.1, batch_size=32, buffer_size=4000, posterior_sampling=True, optimism=0.0, gamma=0.97,
     planning_precision="float32", **SEARCH,
 )  # fmt: skip
 
@@ -301,7 +301,7 @@ def test_the_linear_part_knows_polynomial_changes_after_few_steps():
     batch = pushes(300)
     error = {}
     for linear_part in (True, False):
-        learner = make(linear_part=linear_part, warmup_steps=100)
+        learner = make(linear_part=linear_part, warmup_steps=100, updates_per_step=0.5)
         learn(learner, batch[:100])
         error[linear_part] = change_error(learner, batch[100:])
     assert error[True][0] < 0.5 * error[False][0]
@@ -525,7 +525,7 @@ def test_before_planning_the_value_assumes_the_only_known_reward():
 def test_plans_avoid_or_reach_terminations_if_every_reward_is_the_same(reward, is_good):
     """Action 1 ends the episode if its first parameter is above the state's first entry; nothing else does."""
     torch.manual_seed(0)
-    learner = make(warmup_steps=64, lr=5e-3)
+    learner = make(warmup_steps=64, updates_per_step=2.0, lr=5e-3)
 
     def play(state):
         td = learner.policy(TensorDict({keys.OBSERVATION: state}, [len(state)]))
