@@ -71,27 +71,57 @@ CASES = {
 QUICK = ["pdqn_that_searches", "hyar_nearest", "td3_bc", "exp3", "value_of_shared", "grouped_chosen"]
 
 
-class Own(gymnasium.Env):
-    """An option, a mask in the info, and observations of different scales."""
+class Plain(gymnasium.Env):
+    """Observations and actions of any space, drawn at random."""
 
-    option_names = ("slow", "medium", "fast")
-    observation_space = spaces.Dict(far=spaces.Box(-900.0, 100.0, (2,), np.float64), kind=spaces.Discrete(3))
-    action_space = spaces.Dict(
-        option=spaces.Discrete(3),
-        action=spaces.Tuple(
-            [spaces.Discrete(2), spaces.Tuple([spaces.Box(-1.0, 3.0, (1,)), spaces.Box(0.0, 9.0, (2,))])]
-        ),
-    )
+    observation_space: spaces.Space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        return self._observation(), {"action_mask": np.array([True, True])}
+        return self.observation_space.sample(), {}
 
     def step(self, action):
-        return self._observation(), 0.0, False, False, {"action_mask": np.array([True, False])}
+        return self.observation_space.sample(), 0.0, False, False, {}
 
-    def _observation(self):
-        return {"far": self.np_random.uniform(-900.0, 100.0, 2), "kind": int(self.np_random.integers(3))}
+
+class Own(Plain):
+    """An option, a mask in the info, and numbers that float32 cannot hold or that do not begin at 0."""
+
+    option_names = ("slow", "medium", "fast")
+    observation_space = spaces.Dict(
+        count=spaces.Box(2_000_000_000, 2_000_000_009, (1,), np.int64),
+        kind=spaces.Discrete(3),
+        time=spaces.Box(1.7e9, 1.7e9 + 100.0, (2,), np.float64),
+    )
+    action_space = spaces.Dict(
+        action=spaces.Tuple(
+            [
+                spaces.Discrete(2, start=5),
+                spaces.Tuple(
+                    [
+                        spaces.Box(1.7e9, 1.7e9 + 3600.0, (1,), np.float64),
+                        spaces.Tuple(
+                            [
+                                spaces.Box(20_000_000, 20_000_009, (2,), np.int64),
+                                spaces.Box(-50_000_000, 50_000_000, (2,), np.int64),
+                                spaces.Box(0.0, 9.0, (1,)),
+                                spaces.Box(-3, 4, (1,), np.int64),
+                            ]
+                        ),
+                    ]
+                ),
+            ]
+        ),
+        option=spaces.Discrete(3, start=7),
+    )
+
+    def reset(self, *, seed=None, options=None):
+        observation, _ = super().reset(seed=seed)
+        return observation, {"action_mask": np.array([True, True])}
+
+    def step(self, action):
+        observation, *more, _ = super().step(action)
+        return observation, *more, {"action_mask": np.array([True, False])}
 
 
 def spread(agent: torch.nn.Module) -> None:
@@ -177,11 +207,35 @@ def session_of(path):
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
+def own_observations() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        "count": rng.integers(2_000_000_000, 2_000_000_010, (64, 1)),
+        "kind": rng.integers(0, 3, 64),
+        "time": rng.uniform(1.7e9, 1.7e9 + 100.0, (64, 2)),
+    }
+
+
+def own_inputs() -> dict[str, np.ndarray]:
+    """Return the inputs of the file for these observations."""
+    seen = own_observations()
+    rows = [spaces.flatten(Own.observation_space, {name: each[i] for name, each in seen.items()}) for i in range(64)]
+    masks = np.random.default_rng(1).random((64, 2)) < 0.5
+    masks[:, 0] |= ~masks.any(1)
+    return {
+        "observation": np.stack(rows),
+        "action_mask": masks,
+        "option_mask": np.ones((64, 3), bool),
+        "held_option": np.zeros(64, np.int64),
+        "is_decision": np.ones(64, bool),
+    }
+
+
 @pytest.fixture(scope="module")
 def own_agent() -> Agent:
     own = ["env=gymnasium", "env.entry_point=test_export:Own", "env.max_steps=5", "env.action_mask=info"]
     agent = fresh_agent(*own, "env.observation_scaling=running", "high=linucb", "low=hppo")
-    agent._env.scaling.statistics.update(np.random.default_rng(1).uniform(-500.0, 100.0, (50, 5)))
+    agent._env.scaling.statistics.update(own_inputs()["observation"][:50])
     return agent
 
 
@@ -216,43 +270,27 @@ def test_options_end_where_the_selector_ends_them():
 
 def test_the_file_acts_as_the_agent_on_raw_observations_alone_and_in_a_batch(own_agent, own_session):
     session, _ = own_session
-    rng = np.random.default_rng(0)
-    far, kind = rng.uniform(-900.0, 100.0, (64, 2)), rng.integers(0, 3, 64)
-    masks = rng.random((64, 2)) < 0.5
-    masks[:, 0] |= ~masks.any(1)
-    space = own_agent.observation_space
-    rows = [spaces.flatten(space, {"far": far[i], "kind": kind[i]}) for i in range(64)]
-    inputs = {
-        "observation": np.stack(rows),
-        "action_mask": masks,
-        "option_mask": np.ones((64, 3), bool),
-        "held_option": np.zeros(64, np.int64),
-        "is_decision": np.ones(64, bool),
-    }
+    inputs = own_inputs()
     outputs = session.run(None, inputs)
     own_agent.reset()
-    own_agent.act({"far": far, "kind": kind}, {"action_mask": masks})
-    expected = [own_agent._last[key].numpy() for key in (keys.DISCRETE, keys.PARAMETERS, keys.OPTION)]
-    assert len({*expected[0]}) == 2 and len({*expected[2]}) > 1
-    for output, value in zip(outputs, expected, strict=True):
-        assert output.dtype == value.dtype
-        np.testing.assert_allclose(output, value, atol=1e-5)
-    for output, value in zip(
-        session.run(None, {name: each[:1] for name, each in inputs.items()}), expected, strict=True
+    own_agent.act(own_observations(), {"action_mask": inputs["action_mask"]})
+    discrete, _, option = outputs
+    for found, key in ((discrete, keys.DISCRETE), (option, keys.OPTION)):
+        expected = own_agent._last[key].numpy()
+        assert found.dtype == expected.dtype and len({*expected}) > 1
+        np.testing.assert_array_equal(found, expected)
+    for alone, together in zip(
+        session.run(None, {name: each[:1] for name, each in inputs.items()}), outputs, strict=True
     ):
-        np.testing.assert_allclose(output, value[:1], atol=1e-5)
+        np.testing.assert_allclose(alone, together[:1], rtol=1e-5)
 
 
 def test_the_file_holds_an_option_until_a_decision_is_due_where_it_may_be_any_number(own_session):
     session, _ = own_session
     held = np.arange(8) % 3
-    inputs = {
-        "observation": np.zeros((8, 5)),
-        "action_mask": np.ones((8, 2), bool),
-        "option_mask": np.ones((8, 3), bool),
-        "held_option": held,
-        "is_decision": np.zeros(8, bool),
-    }
+    inputs = {name: each[:8] for name, each in own_inputs().items()}
+    inputs |= {"observation": inputs["observation"][:1].repeat(8, 0), "action_mask": np.ones((8, 2), bool)}
+    inputs |= {"held_option": held, "is_decision": np.zeros(8, bool)}
     np.testing.assert_array_equal(session.run(["option"], inputs)[0], held)
     chosen = session.run(["option"], {**inputs, "is_decision": np.arange(8) < 4})[0]
     assert len({*chosen[:4]}) == 1
@@ -274,49 +312,6 @@ def test_selectors_that_read_the_held_option_ignore_it_at_a_decision(name):
     assert all(map(np.array_equal, found, expected))
 
 
-class Plain(gymnasium.Env):
-    """Observations and actions of any space, drawn at random."""
-
-    observation_space: spaces.Space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        return self.observation_space.sample(), 0.0, False, False, {}
-
-
-class Mapped(Plain):
-    """Times and counts that float32 cannot tell apart, parameters that it cannot hold, numbers that begin elsewhere."""
-
-    observation_space = spaces.Dict(
-        count=spaces.Box(2_000_000_000, 2_000_000_009, (1,), np.int64),
-        time=spaces.Box(1.7e9, 1.7e9 + 100.0, (2,), np.float64),
-    )
-    action_space = spaces.Dict(
-        action=spaces.Tuple(
-            [
-                spaces.Discrete(2, start=5),
-                spaces.Tuple(
-                    [
-                        spaces.Box(1.7e9, 1.7e9 + 3600.0, (1,), np.float64),
-                        spaces.Tuple(
-                            [
-                                spaces.Box(20_000_000, 20_000_009, (2,), np.int64),
-                                spaces.Box(-50_000_000, 50_000_000, (2,), np.int64),
-                                spaces.Box(0.0, 9.0, (1,)),
-                                spaces.Box(-3, 4, (1,), np.int64),
-                            ]
-                        ),
-                    ]
-                ),
-            ]
-        ),
-        option=spaces.Discrete(3, start=7),
-    )
-
-
 class Parts(Plain):
     """Several components, each with numbers of its own."""
 
@@ -336,23 +331,17 @@ def about(session) -> dict:
     return {name: json.loads(value) for name, value in session.get_modelmeta().custom_metadata_map.items()}
 
 
-def test_numbers_that_float32_cannot_hold_are_those_of_the_environment(tmp_path):
-    agent = fresh_agent(*own("Mapped"), "env.observation_scaling=running", "high=linucb", "low=hppo")
-    rng = np.random.default_rng(0)
-    time, count = rng.uniform(1.7e9, 1.7e9 + 100.0, (64, 2)), rng.integers(2_000_000_000, 2_000_000_010, (64, 1))
-    vectors = np.concatenate([count, time], -1)
-    agent._env.scaling.statistics.update(vectors[:50])
-    agent.export(tmp_path / "a.onnx")
-    session = session_of(tmp_path / "a.onnx")
+def test_numbers_that_float32_cannot_hold_are_those_of_the_environment(own_agent, own_session):
+    session, _ = own_session
     assert session.get_inputs()[0].type == "tensor(double)"
     said = about(session)
     assert (said["discrete_starts"], said["option_start"]) == ([5], 7)
     assert said["parameter_low"] == [1.7e9, 2e7, 2e7, -5e7, -5e7, 0.0, -3.0]
     assert said["parameter_high"] == [1.7e9 + 3600.0, 20_000_009, 20_000_009, 5e7, 5e7, 9.0, 4.0]
     assert said["integer_parameters"] == [False, True, True, True, True, False, True]
-    inputs = {"observation": vectors, "held_option": np.zeros(64, np.int64), "is_decision": np.ones(64, bool)}
-    discrete, parameters, option = session.run(None, inputs)
-    acted = agent.act({"time": time, "count": count})
+    discrete, parameters, option = session.run(None, own_inputs())
+    own_agent.reset()
+    acted = own_agent.act(own_observations(), {"action_mask": own_inputs()["action_mask"]})
     chosen, (seconds, (counts, many, real, few)) = acted["action"]
     np.testing.assert_array_equal(discrete + said["discrete_starts"][0], chosen)
     np.testing.assert_array_equal(option + said["option_start"], acted["option"])
@@ -385,12 +374,11 @@ def test_the_file_says_what_its_numbers_mean_and_holds_no_code(own_session):
     session, data = own_session
     said = about(session)
     assert said["option_names"] == ["slow", "medium", "fast"]
-    assert said["parameter_dims"] == [1, 2]
-    assert (said["parameter_low"], said["parameter_high"]) == ([-1.0, 0.0, 0.0], [3.0, 9.0, 9.0])
+    assert said["parameter_dims"] == [1, 6]
     assert (said["high"], said["low"], said["env"]) == ("linucb", "hppo", "gymnasium")
     assert said["hpamdp_version"] == hpamdp.__version__
     shapes = {each.name: each.shape for each in (*session.get_inputs(), *session.get_outputs())}
-    assert shapes["observation"] == ["N", 5] and shapes["parameters"] == ["N", 3]
+    assert shapes["observation"] == ["N", 6] and shapes["parameters"] == ["N", 7]
     assert not [word for word in (b".py", b"import ", b"def ", b"site-packages") if word in data]
 
 
