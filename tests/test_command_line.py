@@ -1,10 +1,7 @@
 """The command line: a mistake costs one line and exit code 2, a bug keeps its traceback, help is read from conf/."""
 
-import subprocess
-import sys
-
 import pytest
-from conftest import CONF, choices
+from conftest import choices
 from omegaconf.errors import ConfigAttributeError
 
 from hpamdp.config.components import GROUPS
@@ -18,10 +15,8 @@ MISTAKES = [
     (["sed=3"], "sed: no such group or value of the run (conf/config.yaml); did you mean seed? It has "),
     (["eval.evry=3"], "eval.evry: no such value of eval; did you mean every? It has every, layouts, seed"),
     (["low=pdqn", "low.lr_final=0.1"], "low.lr_final: is called low.lr_final_fraction now"),
-    (["agent.uniform_option_steps=5"], "agent.uniform_option_steps: is called agent.practice now"),
     (["high=ucb", "high.windw=3"], "high.windw: no such setting of UCB; did you mean window? It"),
     (["high=none", "high.window=3"], "high.window: high=none has no settings; choose another high, too"),
-    (["exploration.epsilon=0.5"], "exploration.epsilon: exploration=none has no settings; choose another exploration"),
     (["+low=hppo"], "Multiple values for low. To override a value use 'override low: hppo'"),
     (["low=hppo", "low.learning_rate=1"], "no such setting of HPPO; did you mean lr or critic_lr? It has "),
     (["total_timesteps=64"], "did you mean total_frames? It has "),
@@ -40,7 +35,6 @@ MISTAKES = [
     (["mode=eval"], "checkpoint: missing; mode=eval needs the output folder of a run"),
     (["checkpoint=x"], "checkpoint: goes with mode=eval only"),
     (["low._target_=os.path.join"], "low._target_=os.path.join: there is no class join in os.path"),
-    (["env.reward=big"], "env.reward=\"big\": must be 'paper' or 'sparse' (BoatDockEnv)"),
     # The same in a sweep.
     (["-m", "high=ucb,fixed", "high.window=1,2"], "high.window: no such setting of Fixed; it has"),
     (["-m", "seed=range(0,0)"], "seed=range(0,0): no job to run"),
@@ -51,7 +45,6 @@ MISTAKES = [
         "env=platform: the experiments of a sweep choose env themselves; leave it out",
     ),
     (["-m", "low=glob(x*)"], "low=glob(x*): matches no choice; conf/low has "),
-    (["-m", "seed=glob(*)"], "seed=glob(*): matches no choice; conf/seed has"),
     (["low=glob(h*)"], "low=glob(h*): several values; add --multirun"),
     (["seed=1", "-m", "low=random"], "low=random: settings on both sides of a flag; write all of them after the flags"),
 ]
@@ -111,7 +104,7 @@ def test_jobs_get_their_config_folder_and_overrides(command, tmp_path, monkeypat
     assert out == "Job 0: seed=4\nJob 1: seed=5\n2 jobs: 2 finished\n"
 
 
-@pytest.mark.parametrize("bug", [ZeroDivisionError("bug"), ValueError("bug"), ConfigAttributeError("bug")])
+@pytest.mark.parametrize("bug", [ValueError("bug"), ConfigAttributeError("bug")])
 def test_a_bug_keeps_its_traceback(command, monkeypatch, bug):
     def run(cfg, folder, overrides, **known):
         raise bug
@@ -154,9 +147,3 @@ def test_help_explains_the_settings_of_the_choices_that_are_named(command):
     assert code == 0 and not err
     assert "Settings of low=hppo\n" in out and "  low.gamma=0.5\n      Discount of a step.\n" in out
     assert "Settings of high" not in out
-
-
-def test_help_does_not_wait_for_torch():
-    code = "import sys; from hpamdp.cli import main; main(); assert 'torch' not in sys.modules"
-    done = subprocess.run([sys.executable, "-c", code, "--help"], cwd=CONF.parent, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr

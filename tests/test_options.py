@@ -81,14 +81,14 @@ MISTAKES = (
 
 @pytest.fixture(scope="module")
 def refusals(tmp_path_factory) -> dict[str, list]:
-    """The exit code and stderr of each mistake, and whether torch or tensordict was imported by then."""
+    """The exit code and stderr of each mistake and of help, and whether torch or tensordict was imported by then."""
     program = f"""
 import contextlib, io, json, sys
 from hpamdp.cli import main
 refusals = {{}}
-for words in {MISTAKES!r}:
+for words in {("--help", *MISTAKES)!r}:
     sys.argv, code = ["hpamdp", *words.split()], 0
-    with contextlib.redirect_stderr(io.StringIO()) as err:
+    with contextlib.redirect_stderr(io.StringIO()) as err, contextlib.redirect_stdout(io.StringIO()):
         try:
             main()
         except SystemExit as end:
@@ -105,6 +105,10 @@ print(json.dumps(refusals))
 def test_a_wrong_setting_is_refused_before_torch_is_imported(words, refusals):
     code, err, is_imported = refusals[words]
     assert (code, err.count("\n"), is_imported) == (2, 1, False), err
+
+
+def test_help_does_not_wait_for_torch(refusals):
+    assert refusals["--help"] == [0, "", False]
 
 
 def test_classes_of_a_user_that_groups_and_values_name_are_imported(tmp_path):
@@ -124,11 +128,15 @@ def test_classes_of_a_user_that_groups_and_values_name_are_imported(tmp_path):
     words = ["--config-dir", "conf", "low=mine", "env=platform", "high=uniform", "+env.grouping=default"]
     words += ["+low.per_option={jump: own}", "callbacks=[weight]"]
     short = ["total_frames=64", "num_envs=4", "steps_per_batch=8", "eval.layouts=4", "film=false"]
-    run = "import sys\nfrom hpamdp.cli import main\nsys.path.insert(0, '.')\nmain()\n"
-    (tmp_path / "go.py").write_text(run)
+    # First the help, which ends by `SystemExit`, then the run.
+    (tmp_path / "go.py").write_text(
+        "import contextlib, sys\nfrom hpamdp.cli import main\nsys.path.insert(0, '.')\n"
+        "words, sys.argv = sys.argv, [*sys.argv, '--help']\nwith contextlib.suppress(SystemExit):\n    main()\n"
+        "sys.argv = words\nmain()\n"
+    )
     done = python("go.py", *words, *short, "hydra.run.dir=out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert yaml.safe_load((tmp_path / "out/config.yaml").read_text())["low"]["weight"] == 2.0
     with (tmp_path / "out/metrics.csv").open() as file:
         assert {row["own/weight"] for row in csv.DictReader(file)} == {"3.0"}
-    assert "Settings of low=mine\n  low.weight=2.0\n" in python("go.py", *words, "--help", cwd=tmp_path).stdout
+    assert "Settings of low=mine\n  low.weight=2.0\n" in done.stdout
