@@ -40,9 +40,9 @@ def press(env: UnseenBoatsEnv, explorer: Any) -> Tensor | None:
     return boat
 
 
-def ceiling(env: UnseenBoatsEnv) -> Tensor:
-    """Return the best score `[N]` of the trips that begin now, with each session's best boat."""
-    state = env.state
+def ceiling(env: UnseenBoatsEnv, rows: Tensor) -> Tensor:
+    """Return the best scores of the trips that begin now in these rows, with each session's best boat."""
+    state = type(env.state)(*(column[rows] for column in env.state))
     place = state.start_x, state.start_y, state.goal_x, state.goal_y, torch.full_like(state.start_x, TANK)
     shortest = env.options.shortest_press
     plans = [best_plan(*place, *boats, shortest_press=shortest) for boats in env.known_boats(state)]
@@ -56,9 +56,9 @@ def sail(env: UnseenBoatsEnv) -> tuple[Tensor, Tensor, list[Tensor]]:
     ceilings = torch.full((env.num_envs, env.options.trips), torch.nan)
     chosen = []
     for _ in range(env.max_steps):
-        rows = torch.arange(env.num_envs)
-        begins = env.state.presses == 0
-        ceilings[rows[begins], env.state.trip[begins].long()] = ceiling(env)[begins]
+        begins = (env.state.presses == 0).nonzero().squeeze(-1)
+        if len(begins):
+            ceilings[begins, env.state.trip[begins].long()] = ceiling(env, begins)
         boat = press(env, explorer)
         if boat is not None:
             chosen.append(boat)

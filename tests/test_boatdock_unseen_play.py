@@ -185,7 +185,7 @@ def test_unlike_boats_end_in_the_page_where_python_ends_them(tmp_path):
     given = []
     for each in data["sessions"]:
         (boat,) = each["boats"]
-        for layout in 5 * each["trips"]:
+        for layout in 3 * each["trips"]:
             given.append({"boat": boat, **layout, "events": random_events(rng, rng.randint(1, 12))})
     script = """
         const physics = makePhysics(given.rules);

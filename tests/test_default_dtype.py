@@ -113,7 +113,7 @@ def test_a_learner_learns_the_same_with_float64_as_the_default_dtype(name):
 
 
 def test_training_and_loading_give_the_same_numbers_with_float64_as_the_default_dtype_and_leave_it(tmp_path):
-    settings = {"env.grouping": "default", "low.minibatch_size": 16, "eval.layouts": 4, "eval.every": 0}
+    settings = {"grouping": "default", "max_steps": 5, "low.minibatch_size": 16, "eval.layouts": 4, "eval.every": 0}
     file = tmp_path / "agent.zip"
 
     def trained() -> dict[str, Any]:

@@ -37,7 +37,7 @@ def test_an_option_policy_in_plain_torchrl_beats_either_boat_alone(capsys):
 def test_the_command_of_crossing_runs(tmp_path):
     (command,) = re.findall(r"^python -m hpamdp\.cli (.*)$", (CROSSING / "README.md").read_text(), re.MULTILINE)
     short = ["low.warmup_steps=64", "high.warmup_decisions=20", "high.updates_per_decision=0.1"]
-    short += ["total_frames=256", "num_envs=8", "eval.every=0", "eval.layouts=10", f"hydra.run.dir={tmp_path}"]
+    short += ["total_frames=128", "num_envs=8", "eval.every=0", "eval.layouts=4", f"hydra.run.dir={tmp_path}"]
 
     def run() -> None:
         os.chdir(CROSSING)
@@ -53,7 +53,7 @@ def test_the_commands_of_the_kinds_of_actions_run(problem, tmp_path):
     folder = EXAMPLES / "spaces"
     commands = re.findall(r"^python -m hpamdp\.cli (.*)$", (folder / "README.md").read_text(), re.MULTILINE)
     (command,) = [each for each in commands if f"shop:{problem} " in each]
-    short = ["total_frames=1280", "eval.every=0", "eval.layouts=10", "film=false", f"hydra.run.dir={tmp_path}"]
+    short = ["total_frames=640", "eval.every=0", "eval.layouts=4", "film=false", f"hydra.run.dir={tmp_path}"]
 
     def run() -> None:
         os.chdir(folder)

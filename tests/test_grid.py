@@ -26,8 +26,8 @@ SHORT = {
     ],
     "hppo": ["low.minibatch_size=16", "low.epochs=2"],
     "hppo_published": ["low.minibatch_size=16", "low.critic_epochs=1"],
-    "iql": ["low.warmup_steps=64", "low.batch_size=16"],
-    "td3_bc": ["low.warmup_steps=64", "low.batch_size=16"],
+    "iql": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
+    "td3_bc": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
     "hsac": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
     "hyar": ["low.warmup_steps=64", "low.codec_pretrain_updates=2", "low.updates_per_step=0.05", "low.batch_size=16"],
     "hyar_published": [

@@ -323,7 +323,7 @@ def test_the_mask_of_options_says_which_goals_are_open(has, is_open):
 
 
 def test_an_agent_that_chooses_goals_acts_in_gymnasium_whose_infos_say_which_are_open():
-    sizes = {"num_envs": 4, "steps_per_batch": 4, "total_frames": 16, "eval.layouts": 2}
+    sizes = {"num_envs": 4, "steps_per_batch": 4, "total_frames": 16, "eval.layouts": 2, "max_steps": 20}
     agent = hpamdp.train("office", chooses_goal=True, high="uniform", low="random", progress=False, **sizes)
     env = hpamdp.make_gymnasium("office", chooses_goal=True)
     observation, info = env.reset(seed=0)

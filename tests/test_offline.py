@@ -28,7 +28,7 @@ from hpamdp.specs import PAMDPSpecs
 
 ALL = {"complete": False, "successes": False, "best_people": None, "checksum": None}
 SMALL = ["mode=offline", "data=human", "data.checksum=null", "offline.updates=6", "offline.eval_every=3"]
-SMALL += ["eval.layouts=10", "low.batch_size=16"]
+SMALL += ["eval.layouts=4", "low.batch_size=16"]
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,11 @@ def human_batch(path: str, rest_to_rest: bool = False, **env):
 
 
 def overrides(path: str, low: str, high: str = "human") -> list[str]:
-    plans = ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"] if low in ("dlpa", "pets") else []
+    plans = (
+        ["low.horizon=2", "low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"]
+        if low in ("dlpa", "pets")
+        else []
+    )
     plans += ["low.greedy_samples=8", "low.max_sequences=8", "low.num_members=2"] if low == "pets" else []
     plans += ["low.transition_dims=[16]", "low.outcome_dims=[16]"] if low == "pets" else []
     return [*SMALL, f"data.path={path}", f"low={low}", f"high={high}", *plans]

@@ -190,7 +190,7 @@ def test_a_player_says_where_no_way_leads(tmp_path):
 
 def test_a_run_does_not_continue_on_a_map_that_was_edited_since(tmp_path):
     file, folder = written(tmp_path, TABLE), tmp_path / "run"
-    words = ["env=pinball", "high=none", "low=random", f"env.map={file}", *SMALL, "total_frames=64"]
+    words = ["env=pinball", "high=none", "low=random", f"env.map={file}", *SMALL, "total_frames=64", "env.max_steps=20"]
     assert run(compose_config(words), folder, words) == 0
     resume = [f"resume={folder}", "trust=true", "total_frames=128"]
     written(tmp_path, TABLE | {"start": [0.2, 0.6]})

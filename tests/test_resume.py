@@ -19,10 +19,10 @@ from hpamdp.run.recorder import Recorder
 from hpamdp.run.stopping import STOP_SIGNALS
 from hpamdp.run.train import run
 
-SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=416", "eval.layouts=2", "eval.every=0", "log_every=64"]
+SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=320", "eval.layouts=2", "eval.every=0", "log_every=64"]
 # Before the stop and after it; evaluations take longer than the training. What resumes in one way alone goes without.
-EVALUATED = "eval.every=224"
-STOPPED_AFTER = 9  # batches, in the middle of a log interval
+EVALUATED = "eval.every=160"
+STOPPED_AFTER = 7  # batches, in the middle of a log interval
 SELECTORS = ("ucb", "linucb", "meta_critic", "actor", "exp3")
 
 
@@ -91,7 +91,7 @@ def interrupt(given: list[str], folder: Path) -> None:
 
 def kill(given: list[str], folder: Path) -> None:
     """Run in a process of its own that is killed; what it saved last is some batches old."""
-    words = [*given, "checkpoint_every=96"]
+    words = [*given, "checkpoint_every=128"]
     assert forked(run, compose_config(words), folder, words) == -signal.SIGKILL
 
 
@@ -160,6 +160,7 @@ def test_options_that_end_with_the_last_batch_before_a_stop_are_learned_from(col
         f"collector={collector}",
     ]
     given[given.index("steps_per_batch=4")] = "steps_per_batch=1"
+    given[given.index("total_frames=320")] = "total_frames=96"
     stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
 
 
