@@ -5,6 +5,7 @@ Tensors there have no values. A question for one is answered with 1 or True, and
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,7 +15,8 @@ import test_hyar
 import test_paddpg
 import test_pdqn
 import torch
-from conftest import choices, make_config
+from conftest import CONF, choices, make_config
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch.fx.experimental import _config
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -22,6 +24,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_steps import SPECS, sample
 
 from hpamdp import keys
+from hpamdp.config.components import component
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.policies.low_level.hyar import LATENT
 from hpamdp.policies.low_level.paddpg import SCORES
@@ -41,10 +44,17 @@ class Answers(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def agent_of(words: list[str]):
-    """Return an agent for boats that is built on the CPU and moved, since fused optimizers refuse the device."""
+def agent_of(**names: str):
+    """Return an agent for boats that is built on the CPU and moved, since fused optimizers refuse the device.
+
+    Its levels are read from their yaml files alone: composing takes longer than the rest.
+    """
     specs = PAMDPSpecs.from_env(BoatDockEnv(1))
-    return make_agent(make_config(words), specs, torch.device("cpu")).to(META), specs
+    files = {group: OmegaConf.load(CONF / group / f"{name}.yaml") for group, name in names.items()}
+    given = OmegaConf.to_container(OmegaConf.create({**files, "total_frames": 1000}), resolve=True)
+    levels = {group: component(group, name, given[group]) for group, name in names.items()}
+    config = replace(make_config(["high=uniform", "low=random"]), **levels)
+    return make_agent(config, specs, torch.device("cpu")).to(META), specs
 
 
 @pytest.fixture(autouse=True)
@@ -63,7 +73,7 @@ def observed(specs: PAMDPSpecs) -> TensorDict:
 # DLPA's plans use autocast, which knows no such device.
 @pytest.mark.parametrize("low", sorted({*choices("low")} - {"planner", "dlpa"}))
 def test_policies_stay_on_their_device(low):
-    agent, specs = agent_of(["high=uniform", f"low={low}"])
+    agent, specs = agent_of(low=low)
     for mode in (ExplorationType.DETERMINISTIC, ExplorationType.RANDOM):
         with Answers(), set_exploration_type(mode):
             acted = agent.learners[0].policy(observed(specs))
@@ -72,7 +82,7 @@ def test_policies_stay_on_their_device(low):
 
 @pytest.mark.parametrize("high", sorted({*choices("high")} - {"none", "oracle", "human", "value"}))
 def test_selectors_stay_on_their_device(high):
-    agent, specs = agent_of([f"high={high}", "low=random"])
+    agent, specs = agent_of(high=high)
     for mode in (ExplorationType.DETERMINISTIC, ExplorationType.RANDOM):
         with Answers(), set_exploration_type(mode):
             assert agent.selector(observed(specs))[keys.OPTION].device == META
