@@ -424,7 +424,7 @@ def test_circuits_that_are_put_elsewhere_have_the_plans_of_that_place(begin):
 
 
 def test_the_oracle_with_the_planner_reaches_the_ceiling_and_always_chooses_right():
-    settings = {"env.task": "random_state", "env.gate_set": "choose", "eval.layouts": 50, "film": False}
+    settings = {"env.task": "random_state", "env.gate_set": "choose", "eval.layouts": 4, "film": False}
     sizes = {"num_envs": 4, "steps_per_batch": 4, "total_frames": 16}
     agent = hpamdp.train("circuit", high="oracle", low="planner", progress=False, **sizes, **settings)
     means = agent.evaluate(episodes=50)

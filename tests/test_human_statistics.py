@@ -103,7 +103,7 @@ def simulated_singles(num: int, glide: float, limit: float) -> Singles:
 
 
 def test_fit_finds_the_constants_that_made_the_presses():
-    fit = load_script(STUDY).fit_constants(simulated_singles(400, glide=1.1, limit=80.0), num_bootstraps=50)
+    fit = load_script(STUDY).fit_constants(simulated_singles(400, glide=1.1, limit=80.0), num_bootstraps=30)
     for glide in (fit.likely_glide, fit.agreeing_glide):
         assert glide[0] == pytest.approx(1.1, abs=0.05) and glide[1] <= 1.1 <= glide[2]
     for speed in (fit.likely_speed, fit.agreeing_speed):

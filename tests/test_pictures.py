@@ -324,7 +324,7 @@ def test_a_picture_of_a_gymnasium_environment_is_refused_after_it_is_built():
 
 @pytest.mark.parametrize("low", ["pdqn", *(pytest.param(low, marks=pytest.mark.slow) for low in ("hppo", "hsac"))])
 def test_a_run_with_pictures_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
-    small = ["num_envs=4", "steps_per_batch=4", "total_frames=208", "eval.layouts=2", "eval.every=0", "log_every=32"]
+    small = ["num_envs=4", "steps_per_batch=4", "total_frames=160", "eval.layouts=2", "eval.every=0", "log_every=32"]
     stop_and_resume([*CATCH, f"low={low}", *SHORT[low], *TINY, *small], tmp_path, monkeypatch, signal.SIGINT)
 
 

@@ -19,7 +19,7 @@ from hpamdp.env.boatdock.harbour import (
 from hpamdp.env.boatdock.harbour import score as score_of
 from hpamdp.env.boatdock.planner import Plan, best_plan, best_plans, better_option
 
-NUM = 1000
+NUM = 400
 
 
 def filled(value: int, num: int) -> Tensor:

@@ -267,7 +267,7 @@ def test_entries_that_cannot_reveal_directions_are_told_of(changes, misfit):
     assert re.match(misfit, told)
 
 
-RUN = ["env=boatdock_unseen", "high=none", "low=pets", "num_envs=8", "steps_per_batch=4", "total_frames=416"]
+RUN = ["env=boatdock_unseen", "high=none", "low=pets", "num_envs=8", "steps_per_batch=4", "total_frames=320"]
 RUN += ["eval.layouts=2", "eval.every=0", "log_every=64", "low.updates_per_step=0.1", "low.num_iterations=1"]
 RUN += ["low.num_members=2", "low.greedy_samples=8", "low.num_samples=8", "low.horizon=2", "env.trips=2"]
 
