@@ -52,12 +52,12 @@ class ParameterBounds:
         space = env.observation_space
         entries = space.spaces if isinstance(space, spaces.Dict) and source is None else {}
         self.names = tuple(name for name in _NAMES if source == "info" or name in entries)
-        if self.names and not sum(actions.parameter_dims):
+        if self.names and not any(actions.parameter_dims):
             raise SettingError(f"{' and '.join(self.names)}: the action has no parameters")
         self.in_observation = source is None and bool(self.names)
-        if source is None and not self.names and sum(actions.parameter_dims):
+        if source is None and not self.names and any(actions.parameter_dims):
             self.names = tuple(name for name in _NAMES if first_info.get(name) is not None)
-        self._may_be_unread = source is None and not self.names and sum(actions.parameter_dims) > 0
+        self._may_be_unread = source is None and not self.names and any(actions.parameter_dims)
         self._actions = actions
         self._has_whole = bool(actions.is_whole.any())
         self.low = np.tile(actions.own_low, (num_envs, 1))
