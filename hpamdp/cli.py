@@ -22,6 +22,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from hpamdp.children import protect_children, unprotect_children
 from hpamdp.config.command_line import CommandLine, completed, parse, saved_run
 from hpamdp.config.compose import conf_dir, job_overrides
 from hpamdp.config.errors import ConfigError, problems_explained
@@ -41,7 +42,7 @@ from hpamdp.messages import (
 )
 from hpamdp.run import compatibility, sweep
 from hpamdp.run.folder import is_about_folder, locked
-from hpamdp.search_path import is_command_line, protect_children, put_working_directory_last, unprotect_children
+from hpamdp.search_path import is_command_line, put_working_directory_last
 from hpamdp.shell import program
 
 # Further commands, and the modules whose `main` gets the words that follow and a parser.

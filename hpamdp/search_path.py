@@ -5,9 +5,6 @@ from __future__ import annotations
 import os
 import sys
 
-# If this variable is set, Python 3.11 or later does not put the working directory first.
-_VARIABLE, _OURS = "PYTHONSAFEPATH", "hpamdp"
-
 
 def is_command_line() -> bool:
     """Return whether this package is being imported to run its command line."""
@@ -23,25 +20,14 @@ def put_working_directory_last() -> None:
     Python still finds the user's own classes there. If this package lies there, as in a clone, the order stays.
     """
     directory = os.getcwd()
-    if not _is_clone(directory):
+    if not is_clone(directory):
         sys.path[:] = [entry for entry in sys.path if os.path.realpath(entry) != directory]
     if directory not in map(os.path.realpath, sys.path):
         sys.path.append(directory)
 
 
-def protect_children() -> None:
-    """Make Python processes that are started from now on look in the working directory last as well."""
-    if not _is_clone(os.getcwd()):
-        os.environ.setdefault(_VARIABLE, _OURS)
-
-
-def unprotect_children() -> None:
-    """Undo `protect_children`, in this process or in a child process."""
-    if os.environ.get(_VARIABLE) == _OURS:
-        del os.environ[_VARIABLE]
-
-
-def _is_clone(directory: str) -> bool:
+def is_clone(directory: str) -> bool:
+    """Return whether a directory is a clone of the repository from which this package is imported."""
     return directory == _root()
 
 

@@ -337,14 +337,11 @@ def forked_workers() -> Iterator[None]:
     from hpamdp.env.gymnasium import processes
 
     before = multiprocessing.get_start_method()
-    spawned = processes.AsyncVectorEnv
     multiprocessing.set_forkserver_preload([*WORKER_MODULES])
     multiprocessing.set_start_method("forkserver", force=True)
     try:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(
-                processes, "AsyncVectorEnv", lambda *args, **more: spawned(*args, **{**more, "context": "forkserver"})
-            )
+            patch.setattr(processes, "START_METHOD", "forkserver")
             yield
     finally:
         multiprocessing.set_start_method(before, force=True)

@@ -1,8 +1,8 @@
-"""Copies of a Gymnasium environment, stepped one after another, and what they return in one table of numbers."""
+"""Copies of a Gymnasium environment, stepped one after another, and what they return."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -26,8 +26,6 @@ from hpamdp.settings import SettingError
 
 # If an info has both entries, the first one counts.
 _SUCCESS_ENTRIES = ("is_success", "success")
-# Columns of a table of results after the observation, before the masks.
-_NUM_AFTER = len(("reward", "terminated", "truncated", "success", "has_success"))
 _ALL = slice(None)  # rows
 _SPACES = ("action_space", "observation_space")
 _PICTURES_PER_SECOND = 4.0
@@ -38,16 +36,17 @@ _TRIED_STEPS, _MOST_STEPS = 1_000, 10_000
 
 @dataclass(frozen=True)
 class Results:
-    """What the copies have last returned, float64, a row for each copy.
+    """What the copies have last returned, with a row for each copy.
 
     Attributes:
-        observation: `[N, dim]`, flattened but not scaled, without pictures.
-        reward: `[N]`.
+        observation: float64 `[N, dim]`, flattened but not scaled, without pictures.
+        reward: float64 `[N]`.
         flags: whether the episode terminated, whether it was truncated, its success, and whether the last info had one,
-            0 or 1, `[4, N]`.
-        masks: by name, `[N, K]`.
-        bounds: the parameters' lower and upper bounds in the space's own numbers, `[N, num_parameters]` each; None if
-            the bounds do not depend on the state.
+            bool `[N, 4]`.
+        masks: by name, bool `[N, K]`.
+        bounds: the parameters' lower and upper bounds in the space's own numbers, float64 `[N, num_parameters]` each;
+            None if the bounds do not depend on the state.
+        pixels: of all pictures, uint8 `[N, num_pixels]`.
     """
 
     observation: np.ndarray
@@ -55,39 +54,23 @@ class Results:
     flags: np.ndarray
     masks: dict[str, np.ndarray]
     bounds: tuple[np.ndarray, np.ndarray] | None
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where things are in a table of results, which has a row for each copy.
-
-    Attributes:
-        dim: length of the observation without pictures.
-        mask_sizes: lengths of the masks, by name.
-        num_bounded: number of parameters whose bounds depend on the state.
-        num_pixels: number of pixels of all pictures, which have a table of their own.
-    """
-
-    dim: int
-    mask_sizes: dict[str, int]
-    num_bounded: int
-    num_pixels: int = 0
+    pixels: np.ndarray
 
     @property
-    def num_result_columns(self) -> int:
-        """Number of columns of a table of results."""
-        return self.dim + _NUM_AFTER + sum(self.mask_sizes.values()) + 2 * self.num_bounded
+    def num_bounded(self) -> int:
+        """Number of parameters whose bounds depend on the state."""
+        return 0 if self.bounds is None else self.bounds[0].shape[1]
 
-    def results(self, table: np.ndarray) -> Results:
-        """Return views into a table of results."""
-        masks, start = {}, self.dim + _NUM_AFTER
-        for name, size in self.mask_sizes.items():
-            masks[name] = table[:, start : start + size]
-            start += size
-        middle = start + self.num_bounded
-        bounds = (table[:, start:middle], table[:, middle:]) if self.num_bounded else None
-        reward, *_ = after = table[:, self.dim : self.dim + _NUM_AFTER].T
-        return Results(table[:, : self.dim], reward, after[1:], masks, bounds)
+    def arrays(self) -> list[np.ndarray]:
+        """Return all arrays, in an order that depends on nothing but the spaces."""
+        return [self.observation, self.reward, self.flags, *self.masks.values(), *(self.bounds or ()), self.pixels]
+
+    def changed(self, change: Callable[[np.ndarray], np.ndarray]) -> Results:
+        """Return results of which every array is changed."""
+        observation, reward, flags, *others, pixels = map(change, self.arrays())
+        masks = dict(zip(self.masks, others, strict=False))
+        bounds = None if self.bounds is None else (others[-2], others[-1])
+        return Results(observation, reward, flags, masks, bounds, pixels)
 
 
 class Copies:
@@ -110,7 +93,6 @@ class Copies:
         option_names: what the environment calls its options, unchecked.
         first_info: of a reset; which masks and bounds are in it tells which ones to read.
         results: what the copies have last returned.
-        pixels: the pictures that the copies have last returned, uint8 `[N, num_pixels]`.
 
     Raises:
         SettingError: the spaces are not accepted, or differ between copies.
@@ -161,20 +143,20 @@ class Copies:
         self.option_names = getattr(self.envs[0].unwrapped, "option_names", ())
         self.has_pictures = self.envs[0].render_mode == "rgb_array"
         self.pictures_per_second = _rate_of(self.envs[0])
-        mask_sizes = {mask: rows.shape[1] for mask, rows in self._masks.rows.items()}
-        num_bounded = sum(self.actions.parameter_dims) if self._bounds.names else 0
-        self.layout = Layout(self.observations.dim, mask_sizes, num_bounded, self.observations.num_pixels)
-        self.table = np.zeros((num, self.layout.num_result_columns))
-        self.pixels = np.zeros((num, self.layout.num_pixels), np.uint8)
-        self.results = self.layout.results(self.table)
+        self.results = Results(
+            np.zeros((num, self.observations.dim)),
+            np.zeros(num),
+            np.zeros((num, 4), bool),
+            self._masks.rows,
+            (self._bounds.low, self._bounds.high) if self._bounds.names else None,
+            np.zeros((num, self.observations.num_pixels), np.uint8),
+        )
         # What each step needs, looked up once.
         # Without the outer check, whose work `step` does in its loop.
         self._inner = [env.env if isinstance(env, ContractCheck) else env for env in self.envs]
         self._num_steps = [0] * num
         self._spaces = [(env.action_space, env.observation_space) for env in self.envs]
-        self._after = self.table[:, self.layout.dim : self.layout.dim + _NUM_AFTER]
-        self._has_masks = bool(mask_sizes)
-        self._has_bounds = num_bounded > 0
+        self._reads_infos = bool(self._masks.rows or self._bounds.names)
         self._names_no_limit = None in limits
         self.usual_length = self._length_of_an_episode() if self._names_no_limit else self.max_steps
 
@@ -187,7 +169,7 @@ class Copies:
         rng, actions, num = np.random.default_rng(0), self.actions, len(self.envs)
         self.reset({0: 0})
         for step in range(1, _TRIED_STEPS + 1):
-            allowed = {name: rows[0] != 0.0 for name, rows in self.results.masks.items()}
+            allowed = {name: rows[0] for name, rows in self.results.masks.items()}
             mask = allowed.get(keys.ACTION_MASK, np.ones(len(actions.parameter_dims), bool))
             parts = np.split(mask, np.cumsum(actions.component_sizes)[:-1]) if actions.component_sizes else [mask]
             chosen = np.array([rng.choice(np.flatnonzero(part)) for part in parts])
@@ -196,7 +178,7 @@ class Copies:
             discrete = np.tile(chosen if actions.component_sizes else chosen[0], (num, 1) if len(parts) > 1 else num)
             parameters = np.tile(rng.uniform(actions.low, actions.high).astype(np.float32), (num, 1))
             self.step([0], option, discrete, parameters)
-            if self.results.flags[:2, 0].any():
+            if self.results.flags[0, :2].any():
                 return step
         raise SettingError(
             f"{self._name}: has no time limit of its own; set env.max_steps (an episode of random actions goes on "
@@ -260,7 +242,7 @@ class Copies:
                 self._settle(rows, rows, seen)
         except Exception as error:
             self._explain("reset", error)
-        self._after[rows] = 0.0
+        self.results.reward[rows], self.results.flags[rows] = 0.0, False
 
     def step(self, rows: list[int], option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> None:
         """Take a step with some copies.
@@ -295,7 +277,7 @@ class Copies:
                 num_steps[row] += 1
                 truncated = not terminated and (truncated or num_steps[row] >= limits[row])
                 success = None
-                if info or self._has_masks or self._has_bounds or type(observation) is not np.ndarray:
+                if info or self._reads_infos or type(observation) is not np.ndarray:
                     self._masks.keep(row, observation, info)
                     self._bounds.keep(row, observation, info)
                     success = _success_in(info)
@@ -308,10 +290,9 @@ class Copies:
                 self._settle(index, rows, seen)
         except Exception as error:
             self._explain("step", error)
-        self.results.flags[:, index] = 0.0
-        self.results.reward[index] = rewards
+        self.results.reward[index], self.results.flags[index] = rewards, False
         for row, of_row in flags.items():
-            self.results.flags[:, row] = of_row
+            self.results.flags[row] = of_row
 
     def _tell_if_cut(self, num_steps: int) -> None:
         """Warn once if an episode has been truncated for want of a time limit."""
@@ -335,7 +316,7 @@ class Copies:
         return [self.options.with_option(native, number) for native, number in chosen]
 
     def _settle(self, index: Any, rows: list[int], seen: list[Any]) -> None:
-        """Keep what these copies have returned: observations, masks and bounds.
+        """Keep the observations that these copies have returned.
 
         Args:
             index: of the copies' rows.
@@ -348,11 +329,7 @@ class Copies:
             for self._row, observation in zip(rows, seen, strict=True):
                 read.append(self.observations.read(observation))
             found = map(np.stack, zip(*read, strict=True))
-        self.results.observation[index], self.pixels[index] = found
-        for name, masks in self._masks.rows.items():
-            self.results.masks[name][:] = masks
-        if self.results.bounds is not None:
-            self.results.bounds[0][:], self.results.bounds[1][:] = self._bounds.low, self._bounds.high
+        self.results.observation[index], self.results.pixels[index] = found
 
     def pictures(self, num: int) -> list[np.ndarray]:
         """Return what `render` returns for the first `num` copies, uint8 `[height, width, 3]` each.

@@ -134,8 +134,9 @@ class GymnasiumEnv(PAMDPEnv):
         except ValueError as error:
             raise SettingError(f"{self._name}: {error}") from error
         self.option_names = self._names_of_options()
-        self.observation_entries = self._copies.observations.entries(2 * self._copies.layout.num_bounded)
-        self.bounds_place = self._copies.layout.dim if self._copies.layout.num_bounded else None
+        dim, num_bounded = self._copies.observations.dim, self._copies.results.num_bounded
+        self.observation_entries = self._copies.observations.entries(2 * num_bounded)
+        self.bounds_place = dim if num_bounded else None
         gamma = options.reward_scaling
         self._reward_scaling = None if gamma is None else RewardScaling(num_envs, gamma, options.reward_clip)
         if gamma is not None:
@@ -147,7 +148,7 @@ class GymnasiumEnv(PAMDPEnv):
             torch.Size((num_envs, num_parameters)),
         )
         self._last_choices = np.array(self.components.sizes) - 1
-        self._observation = np.zeros((num_envs, self._copies.layout.dim), np.float32)
+        self._observation = np.zeros((num_envs, dim), np.float32)
         self._is_over = np.zeros(num_envs, bool)
         self._rows = [*range(num_envs)]
         self._is_staggered = options.staggered
@@ -224,12 +225,12 @@ class GymnasiumEnv(PAMDPEnv):
         """The lowest and the highest scaled observation; None with running statistics or `out_of_bounds=allow`."""
         if self.scaling.statistics is not None or self._settings.out_of_bounds == "allow":
             return None
-        layout = self._copies.layout
+        observations, num_bounded = self._copies.observations, self._copies.results.num_bounded
         with np.errstate(over="ignore"):
-            both = self.scaling.rescaled(np.stack(self._copies.observations.bounds()))
+            both = self.scaling.rescaled(np.stack(observations.bounds()))
         ends = [(-1.0, 0.0), (1.0, 255.0)]  # of the bounds of the current state, and of pixels
         low, high = (
-            [*own.tolist(), *np.repeat(end, (2 * layout.num_bounded, layout.num_pixels))]
+            [*own.tolist(), *np.repeat(end, (2 * num_bounded, observations.num_pixels))]
             for own, end in zip(both, ends, strict=True)
         )
         return low, high
@@ -369,7 +370,7 @@ class GymnasiumEnv(PAMDPEnv):
     def _make_specs(self) -> None:
         n = self.num_envs
         device = self.device
-        layout, num_discrete = self._copies.layout, len(self.parameter_dims)
+        results, num_discrete = self._copies.results, len(self.parameter_dims)
         self.observation_spec = Composite(
             {
                 keys.OBSERVATION: self._observation_spec(),
@@ -379,11 +380,11 @@ class GymnasiumEnv(PAMDPEnv):
         )
         if self._reward_scaling is not None:
             self.observation_spec[_RETURN] = Unbounded(shape=(n,), device=device, dtype=torch.float32)
-        for name, size in layout.mask_sizes.items():
-            shape = (num_discrete, num_discrete) if name == keys.PAIR_MASK else (size,)
+        for name, mask in results.masks.items():
+            shape = (num_discrete, num_discrete) if name == keys.PAIR_MASK else mask.shape[1:]
             self.observation_spec[name] = Binary(shape[-1], shape=(n, *shape), dtype=torch.bool, device=device)
-        for name in (keys.PARAMETER_LOW, keys.PARAMETER_HIGH) if layout.num_bounded else ():
-            bound = Unbounded(shape=(n, layout.num_bounded), device=device, dtype=torch.float32)
+        for name in (keys.PARAMETER_LOW, keys.PARAMETER_HIGH) if results.num_bounded else ():
+            bound = Unbounded(shape=(n, results.num_bounded), device=device, dtype=torch.float32)
             self.observation_spec[name] = bound
         low = torch.from_numpy(self._copies.actions.low)
         high = torch.from_numpy(self._copies.actions.high)
@@ -392,8 +393,9 @@ class GymnasiumEnv(PAMDPEnv):
         self.done_spec = self.make_done_spec()
 
     def _observation_spec(self) -> TensorSpec:
-        layout, dtype = self._copies.layout, observation_dtype(self.observation_entries)
-        shape = (self.num_envs, layout.dim + 2 * layout.num_bounded + layout.num_pixels)
+        observations, dtype = self._copies.observations, observation_dtype(self.observation_entries)
+        num_bounds = 2 * self._copies.results.num_bounded
+        shape = (self.num_envs, observations.dim + num_bounds + observations.num_pixels)
         if dtype == torch.uint8:
             return Bounded(0, 255, shape=shape, device=self.device, dtype=dtype)
         return Unbounded(shape=shape, device=self.device, dtype=dtype)
@@ -435,11 +437,11 @@ class GymnasiumEnv(PAMDPEnv):
             is_stepped &= tensordict.get("_step").reshape(-1).numpy(force=True)
         is_all = bool(is_stepped.all())
         self._copies.step(self._rows if is_all else np.flatnonzero(is_stepped).tolist(), option, chosen, values)
-        terminated, truncated, *_ = results.flags
+        terminated, truncated, *_ = results.flags.T
         if self._terminates_at_limit:
-            terminated[is_stepped & (truncated > 0.0)] = 1.0
+            terminated[is_stepped & truncated] = True
         if self._first_ends.any():
-            truncated[is_stepped & (self._first_ends == 1) & (terminated == 0.0)] = 1.0
+            truncated[is_stepped & (self._first_ends == 1) & ~terminated] = True
             self._first_ends -= is_stepped & (self._first_ends > 0)
         self._scale(is_stepped, is_all=is_all)
         rewards = results.reward if is_all else np.where(is_stepped, results.reward, 0.0)
@@ -509,8 +511,8 @@ class GymnasiumEnv(PAMDPEnv):
     def _read(self, reward: np.ndarray | None = None) -> TensorDict:
         """Return the last results, with the rewards `[N]` if they are those of a step."""
         results = self._copies.results
-        # The comparison makes a new array, so that the next step does not change what was returned.
-        terminated, truncated, success, has_success = results.flags != 0.0
+        # A copy, so that the next step does not change what was returned.
+        terminated, truncated, success, has_success = results.flags.T.copy()
         self._reports_success = self._reports_success or bool(has_success.any())
         done = terminated | truncated
         self._is_over[:] = done
@@ -521,7 +523,7 @@ class GymnasiumEnv(PAMDPEnv):
             observation = np.concatenate([observation, seen], axis=-1)
             bounds = {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
         leaves = {
-            keys.OBSERVATION: torch.from_numpy(joined(observation, self._copies.pixels)),
+            keys.OBSERVATION: torch.from_numpy(joined(observation, results.pixels)),
             _SUCCESS: torch.from_numpy(success),
             keys.TERMINATED: torch.from_numpy(terminated[:, None]),
             keys.TRUNCATED: torch.from_numpy(truncated[:, None]),
@@ -530,7 +532,7 @@ class GymnasiumEnv(PAMDPEnv):
         if self._reward_scaling is not None:
             leaves[_RETURN] = torch.from_numpy(self._reward_scaling.totals.astype(np.float32))
         for name, mask in results.masks.items():
-            leaves[name] = as_leaf(name, torch.from_numpy(mask != 0.0), len(self.parameter_dims))
+            leaves[name] = as_leaf(name, torch.from_numpy(mask.copy()), len(self.parameter_dims))
         leaves |= bounds
         if reward is not None:
             leaves[keys.REWARD] = torch.from_numpy(reward[:, None])

@@ -9,13 +9,14 @@ from typing import Any
 
 from torchrl.collectors import MultiSyncCollector
 
+from hpamdp.children import children_protected, children_without, how_it_ended
 from hpamdp.config.schema import Config
 from hpamdp.limits import SHARED_MEMORY
 from hpamdp.messages import warn
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.options import CARDS, WorkerOptions
 from hpamdp.run.collection.worker import EnvShard, SharedMemoryCollector
-from hpamdp.run.collection.workers import WorkerCollection, children_without, modules_here_last
+from hpamdp.run.collection.workers import WorkerCollection
 from hpamdp.run.stopping import STOP_SIGNALS
 
 _PATIENCE_S = 2.0  # from the moment a worker's pipe is closed until it has an exit code
@@ -34,7 +35,7 @@ class MultiCollection(WorkerCollection):
         if num > num_cpus:
             warn(f"collector.num_workers={num}: more than the {num_cpus} CPUs, which the workers will share")
         # multiprocessing unblocks the signals when it starts this helper of its own.
-        with modules_here_last():
+        with children_protected():
             resource_tracker.ensure_running()
         super().__init__(config, parts, frames, options)
 
@@ -67,6 +68,4 @@ class MultiCollection(WorkerCollection):
         code = process.exitcode
         if code is None:
             return None
-        if code == -signal.SIGBUS:
-            return f"signal {signal.SIGBUS}, SIGBUS: {SHARED_MEMORY}"
-        return f"exit code {code}" if code >= 0 else f"signal {-code}, {signal.Signals(-code).name}"
+        return how_it_ended(code) + (f": {SHARED_MEMORY}" if code == -signal.SIGBUS else "")

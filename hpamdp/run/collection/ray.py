@@ -12,13 +12,14 @@ from typing import Any, NoReturn
 
 from torchrl.collectors.distributed import RayCollector
 
+from hpamdp.children import children_without
 from hpamdp.config.schema import Config
 from hpamdp.messages import first_line, one_line, warn
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import CollectionError
 from hpamdp.run.collection.options import CARDS, RayOptions
 from hpamdp.run.collection.worker import EnvShard, RemoteShard, ShardCollector, WorkingDir
-from hpamdp.run.collection.workers import WorkerCollection, children_without
+from hpamdp.run.collection.workers import WorkerCollection
 from hpamdp.run.stopping import STOP_SIGNALS
 
 

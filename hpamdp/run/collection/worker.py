@@ -19,13 +19,13 @@ from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
+from hpamdp.children import unprotect_children
 from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.messages import one_line
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run.assemble import env_and_policy, make_agent, make_env
-from hpamdp.search_path import unprotect_children
 from hpamdp.specs import PAMDPSpecs
 
 _CPU = torch.device("cpu")

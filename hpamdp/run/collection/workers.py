@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn, TypeVar
 
 import torch
@@ -16,6 +14,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.cards import CollectorCard
+from hpamdp.children import children_protected
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
@@ -26,7 +25,6 @@ from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, check_state, random_seeds
 from hpamdp.run.collection.options import WorkerOptions
 from hpamdp.run.collection.worker import EnvShard, RemoteError, pack_state
-from hpamdp.search_path import protect_children, unprotect_children
 
 _PATIENCE_S = 2.0  # for workers in the middle of a batch that is no longer needed
 
@@ -84,7 +82,7 @@ class WorkerCollection(Collection):
         self._coming: list[Future[TensorDictBase]] = []
         self._threads = ThreadPoolExecutor(num_workers)
         try:
-            with modules_here_last():
+            with children_protected():
                 self._on_all(self._start_first)
             for new in self._on_all(lambda number: call_worker(self.workers[number], "take_new_statistics")):
                 self._problem.add_statistics(new)
@@ -168,7 +166,7 @@ class WorkerCollection(Collection):
     def _attempt(self, number: int, call: Callable[[Any], _Returned]) -> _Returned:
         try:
             if self.workers[number] is None:
-                with self._restarting, modules_here_last():
+                with self._restarting, children_protected():
                     self.workers[number] = self._start(self._shard(number, self._restarts))
             return call(self.workers[number])
         except Exception as error:
@@ -335,26 +333,6 @@ def _done(batch: TensorDictBase) -> Future[TensorDictBase]:
     future: Future[TensorDictBase] = Future()
     future.set_result(batch)
     return future
-
-
-@contextmanager
-def children_without(*numbers: signal.Signals) -> Iterator[None]:
-    """Block these signals in all processes that this thread starts inside the block."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def modules_here_last() -> Iterator[None]:
-    """Make processes that are started inside the block look for modules in the working directory last."""
-    protect_children()
-    try:
-        yield
-    finally:
-        unprotect_children()
 
 
 def _side_by_side(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
