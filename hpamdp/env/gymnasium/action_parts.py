@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hpamdp.env.gymnasium.parameter_trees import NotAcceptedError, ParameterTree, by_row
-from hpamdp.env.gymnasium.values import MisfitError, as_numbers, parts_of
+from hpamdp.env.gymnasium.values import MisfitError, as_numbers, children, parts_of
 from hpamdp.messages import warn
 
 # Discrete actions of one choice, each of which has outputs of networks. More are too many to learn one by one.
@@ -381,10 +381,8 @@ def read_part(space: spaces.Space, *, finds_choices: bool) -> Part:
         return PlainChoices(space)
     if isinstance(space, spaces.Box):
         return BoxComponent(space)
-    if isinstance(space, spaces.Tuple):
-        return Group(space, [read_part(part, finds_choices=finds_choices) for part in space.spaces])
-    if isinstance(space, spaces.Dict):
-        return Group(space, [read_part(part, finds_choices=finds_choices) for part in space.spaces.values()])
+    if isinstance(space, spaces.Tuple | spaces.Dict):
+        return Group(space, [read_part(part, finds_choices=finds_choices) for part in children(space).values()])
     raise NotAcceptedError(f"has a {type(space).__name__}")
 
 

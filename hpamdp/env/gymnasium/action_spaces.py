@@ -54,7 +54,7 @@ from gymnasium import spaces
 from hpamdp.env.gymnasium.action_parts import MOST_VALUES, Bounds, Choice, Part, choice_form, read_part
 from hpamdp.env.gymnasium.options import ActionForm
 from hpamdp.env.gymnasium.parameter_trees import NotAcceptedError
-from hpamdp.env.gymnasium.values import MisfitError, as_numbers
+from hpamdp.env.gymnasium.values import MisfitError, as_numbers, children
 from hpamdp.env.gymnasium_form import ParameterMap
 from hpamdp.settings import SettingError
 
@@ -201,11 +201,7 @@ class OptionSpace:
     """
 
     def __init__(self, space: spaces.Space, option_key: int | str | None = None) -> None:
-        entries: dict[int | str, spaces.Space] = {}
-        if isinstance(space, spaces.Dict):
-            entries.update(space.spaces)
-        elif isinstance(space, spaces.Tuple):
-            entries.update(enumerate(space.spaces))
+        entries = children(space)
         self.rest = space
         self.num_options = 0
         self.start = 0
@@ -251,11 +247,9 @@ class OptionSpace:
 
 def _is_action(space: spaces.Space) -> bool:
     """Return whether a space holds a discrete action of its own."""
-    if isinstance(space, spaces.Tuple):
-        return any(isinstance(part, spaces.Discrete) for part in space.spaces)
-    if isinstance(space, spaces.Dict):
-        return any(isinstance(part, spaces.Discrete) for part in space.spaces.values())
-    return isinstance(space, spaces.OneOf)
+    return isinstance(space, spaces.OneOf) or any(
+        isinstance(part, spaces.Discrete) for part in children(space).values()
+    )
 
 
 def written(space: spaces.Space) -> str:

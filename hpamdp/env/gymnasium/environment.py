@@ -24,11 +24,10 @@ from hpamdp.env.base import OBSERVATION_ENTRIES, PAMDPEnv, ProblemError, checked
 from hpamdp.env.errors import closed_on_error
 from hpamdp.env.facts import NAMING_SETTINGS
 from hpamdp.env.gymnasium.copies import Copies
-from hpamdp.env.gymnasium.form import NativeForm, joined
+from hpamdp.env.gymnasium.form import NativeForm, observed_leaves
 from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.masks import as_leaf
 from hpamdp.env.gymnasium.options import CARDS, GymnasiumOptions, SimulatorOptions
-from hpamdp.env.gymnasium.parameter_bounds import agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics
 from hpamdp.env.registration import register
@@ -516,14 +515,8 @@ class GymnasiumEnv(PAMDPEnv):
         self._reports_success = self._reports_success or bool(has_success.any())
         done = terminated | truncated
         self._is_over[:] = done
-        observation = self._observation
-        bounds = {}
-        if results.bounds is not None:
-            low, high, seen = agent_bounds(self._copies.actions, *results.bounds)
-            observation = np.concatenate([observation, seen], axis=-1)
-            bounds = {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
-        leaves = {
-            keys.OBSERVATION: torch.from_numpy(joined(observation, results.pixels)),
+        leaves: dict[Any, Tensor] = {
+            **observed_leaves(self._observation, results.bounds, results.pixels, self._copies.actions),
             _SUCCESS: torch.from_numpy(success),
             keys.TERMINATED: torch.from_numpy(terminated[:, None]),
             keys.TRUNCATED: torch.from_numpy(truncated[:, None]),
@@ -533,7 +526,6 @@ class GymnasiumEnv(PAMDPEnv):
             leaves[_RETURN] = torch.from_numpy(self._reward_scaling.totals.astype(np.float32))
         for name, mask in results.masks.items():
             leaves[name] = as_leaf(name, torch.from_numpy(mask.copy()), len(self.parameter_dims))
-        leaves |= bounds
         if reward is not None:
             leaves[keys.REWARD] = torch.from_numpy(reward[:, None])
         device = self.device

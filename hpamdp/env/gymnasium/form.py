@@ -11,14 +11,17 @@ import torch
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from hpamdp import keys
+from hpamdp.env.gymnasium.action_spaces import ActionSpace
 from hpamdp.env.gymnasium.copies import Copies
 from hpamdp.env.gymnasium.masks import Masks, as_leaf
 from hpamdp.env.gymnasium.options import GymnasiumOptions
 from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds, agent_bounds
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling
+from hpamdp.env.gymnasium.values import children
 from hpamdp.env.gymnasium_form import GymnasiumForm, ParameterMap, VectorScaling, checked_mask
 
 _Shape: TypeAlias = tuple[int, ...]
@@ -65,11 +68,7 @@ class NativeForm(GymnasiumForm):
         for name, mask in masks.rows.items():
             component_sizes = actions.component_sizes if name == keys.ACTION_MASK else ()
             rows[name] = as_leaf(name, checked_mask(name, mask, component_sizes), len(actions.parameter_dims))
-        if bounds.names:
-            low, high, seen = agent_bounds(actions, bounds.low, bounds.high)
-            observed = np.concatenate([observed, seen], axis=-1)
-            rows |= {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
-        rows[keys.OBSERVATION] = torch.from_numpy(joined(observed, pixels))
+        rows |= observed_leaves(observed, (bounds.low, bounds.high) if bounds.names else None, pixels, actions)
         return TensorDict(rows, batch_size=[len(singles)]), num is not None
 
     def scaling(self) -> VectorScaling:
@@ -115,11 +114,24 @@ def _of_row(batch: Any, row: int) -> Any:
     return None if batch is None else batch[row]
 
 
-def joined(vectors: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return new observations of vectors float32 `[N, dim]` and pictures uint8 `[N, num_pixels]`, if there are any."""
-    if not pixels.shape[1]:
-        return vectors.copy()
-    return np.concatenate([vectors, pixels], 1) if vectors.shape[1] else pixels.copy()
+def observed_leaves(
+    vectors: np.ndarray, bounds: tuple[np.ndarray, np.ndarray] | None, pixels: np.ndarray, actions: ActionSpace
+) -> dict[str, Tensor]:
+    """Return the observations of scaled vectors, bounds and pictures, and the bounds of the agent's parameters.
+
+    Args:
+        vectors: float32 `[N, dim]`.
+        bounds: of the space's own parameters in these states, float64 `[N, num_parameters]` each, if there are any.
+        pixels: of all pictures, uint8 `[N, num_pixels]`.
+        actions: the action space.
+    """
+    leaves = {}
+    if bounds is not None:
+        low, high, seen = agent_bounds(actions, *bounds)
+        vectors = np.concatenate([vectors, seen], axis=-1)
+        leaves = {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
+    parts = [part for part in (vectors, pixels) if part.shape[1]] or [vectors]
+    return {keys.OBSERVATION: torch.from_numpy(np.concatenate(parts, axis=-1)), **leaves}
 
 
 def num_in_batch(space: spaces.Space, observation: Any) -> int | None:
@@ -149,8 +161,7 @@ def num_in_batch(space: spaces.Space, observation: Any) -> int | None:
 def _shapes(space: spaces.Space, observation: Any, name: str) -> Iterator[tuple[str, _Shape, _Shape]]:
     """Yield the name of each entry, its shape in the space and the given shape."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
-        inner = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        for part, its_space in inner:
+        for part, its_space in children(space).items():
             own = f"{name}.{part}" if name else str(part)
             try:
                 given = observation[part]

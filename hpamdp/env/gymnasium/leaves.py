@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.spaces.utils import flatdim, flatten
+from gymnasium.spaces.utils import flatdim
 
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.action_parts import max_values
 from hpamdp.env.gymnasium.options import OutOfBounds
-from hpamdp.env.gymnasium.values import as_numbers, shown
+from hpamdp.env.gymnasium.values import as_numbers, children, shown
 
 # Units in the last place beyond a bound that count as rounding.
 _ROUNDING = 4.0
@@ -67,13 +67,13 @@ class Leaf:
         self.clip_high = np.full(self.size, np.inf)
         self.rounding: np.dtype | None = None
         self._plain_dtypes = frozenset(_WHOLE)
-        self._offsets: np.ndarray | None = None  # of the numbers in a one-hot vector
+        self._start: np.ndarray | int = 0  # of numbers that are not in a Box, and how many values each has
+        self._sizes: np.ndarray | int = 2
         if isinstance(space, spaces.Box):
             self._read_bounds(space)
         elif isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
             sizes: Any = space.n if isinstance(space, spaces.Discrete) else space.nvec
             self._start, self._sizes = np.ravel(space.start), np.ravel(sizes)
-            self._offsets = np.cumsum(self._sizes) - self._sizes
 
     def quick(self, observations: Sequence[Any]) -> np.ndarray | None:
         """Return the leaf's part of M observations, float64 `[M, size]`; None if one has to be checked by `flat`.
@@ -92,13 +92,8 @@ class Leaf:
         if not are_plain:
             return None
         given = np.array(values).reshape(len(values), -1)
-        if self._offsets is not None:
-            whole = given.astype(np.int64) - self._start
-            if not ((whole >= 0) & (whole < self._sizes)).all():
-                return None
-            vectors = np.zeros((len(values), self.size))
-            np.put_along_axis(vectors, self._offsets + whole, 1.0, 1)
-            return vectors
+        if not isinstance(self.space, spaces.Box):
+            return self._encoded(given)
         vectors = given.astype(np.float64)
         if not ((vectors >= self.lowest) & (vectors <= self.highest)).all():
             return None
@@ -225,20 +220,22 @@ class Leaf:
         return values
 
     def _one_hot(self, numbers: np.ndarray, cure: str) -> np.ndarray:
-        dtype = self.space.dtype
-        assert dtype is not None
-        is_inside = True
-        if numbers.dtype.kind == "f":
-            is_inside = bool((numbers == np.floor(numbers)).all() and np.isfinite(numbers).all())
-        if is_inside:
-            whole = numbers.astype(np.int64)
-            low: Any = getattr(self.space, "start", 0)
-            size: Any = getattr(self.space, "nvec", 2 if isinstance(self.space, spaces.MultiBinary) else None)
-            size = self.space.n if isinstance(self.space, spaces.Discrete) else size
-            is_inside = bool(((whole >= low) & (whole < low + size)).all())
-        if not is_inside:
+        is_whole = numbers.dtype.kind != "f" or bool((np.isfinite(numbers) & (numbers == np.floor(numbers))).all())
+        encoded = self._encoded(numbers.reshape(1, -1)) if is_whole else None
+        if encoded is None:
             raise self._problem(f"is {shown(numbers.tolist())}, outside {self.space}{cure}")
-        return np.asarray(flatten(self.space, whole.astype(dtype)), np.float64)
+        return encoded[0]
+
+    def _encoded(self, numbers: np.ndarray) -> np.ndarray | None:
+        """Return whole numbers `[M, numbers]` one-hot, those of a `MultiBinary` as they are; None if one is outside."""
+        whole = numbers.astype(np.int64) - self._start
+        if not ((whole >= 0) & (whole < self._sizes)).all():
+            return None
+        if isinstance(self.space, spaces.MultiBinary):
+            return whole.astype(np.float64)
+        vectors = np.zeros((len(numbers), self.size))
+        np.put_along_axis(vectors, np.cumsum(self._sizes) - self._sizes + whole, 1.0, 1)
+        return vectors
 
     def _refuse_where(self, is_wrong: np.ndarray, values: np.ndarray, reason: str) -> None:
         if not is_wrong.any():
@@ -271,16 +268,6 @@ def leaves(
     for entry, child in entries.items():
         length = len(entries) if isinstance(space, spaces.Tuple) else None
         yield from leaves(child, out_of_bounds, (*path, entry), (*lengths, length))
-
-
-def children(space: spaces.Space) -> dict[int | str, spaces.Space]:
-    """Return the entries of a Tuple or Dict; an empty dictionary for any other space."""
-    entries: dict[int | str, spaces.Space] = {}
-    if isinstance(space, spaces.Tuple):
-        entries.update(enumerate(space.spaces))
-    elif isinstance(space, spaces.Dict):
-        entries.update(space.spaces.items())
-    return entries
 
 
 def _coarser(one: np.dtype, other: np.dtype) -> np.dtype:

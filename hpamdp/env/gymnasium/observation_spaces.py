@@ -22,8 +22,9 @@ from gymnasium.spaces.utils import flatdim, flatten_space
 
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.action_spaces import written
-from hpamdp.env.gymnasium.leaves import Leaf, children, leaves
+from hpamdp.env.gymnasium.leaves import Leaf, leaves
 from hpamdp.env.gymnasium.options import OutOfBounds
+from hpamdp.env.gymnasium.values import children
 from hpamdp.observation_entries import SMALLEST_PICTURE, ObservationEntry, is_picture_shape
 from hpamdp.settings import SettingError
 
@@ -226,8 +227,6 @@ def _check_entries(space: spaces.Space, entries: Sequence[int | str]) -> None:
 
 def _is_flat(space: spaces.Space) -> bool:
     """Return whether flattening the space gives a Box."""
-    if isinstance(space, spaces.Tuple):
-        return all(map(_is_flat, space.spaces))
-    if isinstance(space, spaces.Dict):
-        return all(map(_is_flat, space.spaces.values()))
+    if isinstance(space, spaces.Tuple | spaces.Dict):
+        return all(map(_is_flat, children(space).values()))
     return isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary)

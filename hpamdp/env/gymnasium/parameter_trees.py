@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.gymnasium.values import MisfitError, as_numbers, parts_of
+from hpamdp.env.gymnasium.values import MisfitError, as_numbers, children, parts_of
 from hpamdp.env.gymnasium_form import ParameterMap
 
 # Largest distance between neighbouring float32 numbers that is fine enough, as a fraction of the width of a Box.
@@ -144,8 +144,8 @@ class ParameterTree:
         if isinstance(space, spaces.Tuple | spaces.Dict | spaces.OneOf):
             names = list(space.spaces) if isinstance(space, spaces.Dict) else None
             number = self._read(spaces.Discrete(len(space.spaces)))[0] if isinstance(space, spaces.OneOf) else None
-            of_parts: Any = space.spaces
-            parts = [self._read(part) for part in (of_parts if names is None else of_parts.values())]
+            alternatives = space.spaces if isinstance(space, spaces.OneOf) else children(space).values()
+            parts = [self._read(part) for part in alternatives]
             build = _build_parts([part[0] for part in parts], names, number)
             return build, _fill_parts([part[1] for part in parts], names)
         low, high, is_free = bounds_of(space)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from hpamdp.env.errors import ProblemError
 from hpamdp.messages import one_line
@@ -31,6 +32,13 @@ class MisfitError(ProblemError):
         """Return the error about an entry of this name, of which the value is the whole or a part."""
         where = f"as {name}" if self._given is whole else f"in {name}"
         return ProblemError(f"gave {shown(self._given)} {where}, which must be {self._must_be}")
+
+
+def children(space: spaces.Space) -> dict[int | str, spaces.Space]:
+    """Return the entries of a Tuple or Dict; an empty dictionary for any other space."""
+    if isinstance(space, spaces.Dict):
+        return {**space.spaces}
+    return dict(enumerate(space.spaces)) if isinstance(space, spaces.Tuple) else {}
 
 
 def as_numbers(value: Any) -> np.ndarray | None:
