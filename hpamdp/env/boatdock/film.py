@@ -57,7 +57,7 @@ def film(
         for time in times.tolist():
             yield rendering.draw(_underway(scene, before, after, burnt, length, time, engine), size)
         late += len(times) / fps - seconds
-        scene = _rested(scene, before, after, burnt, length, engine)
+        scene = _rested(scene, before, after, engine)
     yield rendering.draw(scene, size)
 
 
@@ -103,18 +103,16 @@ def _underway(
     )
 
 
-def _rested(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, length: float, engine: Engine) -> Scene:
+def _rested(scene: Scene, before: BoatState, after: BoatState, engine: Engine) -> Scene:
     """Return the scene at the end of a press."""
-    start, end = (before.x.item(), before.y.item()), (after.x.item(), after.y.item())
-    pressed = engine.strength * physics.pressed_distance(burnt).item()
-    pressed = min(pressed / length, 1.0) if length > 0.0 else 1.0
+    leg = rendering.leg(before, after, strength=engine.strength)
     outcome = int(after.outcome)
     is_over = outcome != physics.SAILING
     return replace(
         scene,
-        boat=end,
-        heading=(after.velocity_x.item(), after.velocity_y.item()) if length > 0.0 else scene.heading,
-        legs=(*scene.legs, Leg(start, end, pressed)),
+        boat=leg.end,
+        heading=(after.velocity_x.item(), after.velocity_y.item()) if leg.start != leg.end else scene.heading,
+        legs=(*scene.legs, leg),
         fuel=after.fuel.item() / physics.TANK,
         presses=min(scene.presses + 1, MAX_PRESSES),
         controller=int(after.controller),

@@ -224,13 +224,23 @@ def _zoom(course: _Course, first: Tensor, second: Tensor, max_presses: int) -> t
     return first, second
 
 
-def _search(course: _Course, max_presses: int) -> tuple[Tensor, Tensor]:
-    """Return each boat's best sequence `[N]` and the seconds of its presses `[N, 3]`, given courses `[N, S]`."""
+def _search(course: _Course, max_presses: int, cost: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Return each boat's best sequence `[N]` and the seconds of its presses `[N, 3]`, given courses `[N, S]`.
+
+    With a `cost`, the seconds of fuel that each sequence takes besides its presses, `[S]`, only the best minima are
+    refined.
+    """
     sequence, first, second = _local_minima(course, max_presses)
     candidates = _Course(*(field.gather(1, sequence) for field in course))
+    if cost is not None:
+        coarse = _total_seconds(candidates, first, second, max_presses) + cost[sequence]
+        kept = coarse.topk(min(_CANDIDATES, coarse.shape[1]), dim=1, largest=False).indices
+        sequence, first, second = (field.gather(1, kept) for field in (sequence, first, second))
+        candidates = _Course(*(field.gather(1, sequence) for field in course))
     first, second = _zoom(candidates, first, second, max_presses)
     durations = torch.stack(_durations(candidates, first, second, max_presses), dim=-1)
-    best = durations.sum(-1).argmin(1, keepdim=True)
+    total = durations.sum(-1) if cost is None else durations.sum(-1) + cost[sequence]
+    best = total.argmin(1, keepdim=True)
     return sequence.gather(1, best).squeeze(1), durations.take_along_dim(best[..., None], 1).squeeze(1)
 
 
@@ -544,14 +554,4 @@ def _search_sequences(
     columns = [column[:, None].expand(num, len(directions)) for column in position]
     columns += [leg.expand(num, len(directions)) for leg in directions.flatten(1).unbind(1)]
     columns += [torch.ones_like(columns[0]), torch.zeros_like(columns[0])]
-    course = _Course(*columns)
-    sequence, first, second = _local_minima(course, num_presses)
-    candidates = _Course(*(field.gather(1, sequence) for field in course))
-    coarse = _total_seconds(candidates, first, second, num_presses) + cost[sequence]
-    kept = coarse.topk(min(_CANDIDATES, coarse.shape[1]), dim=1, largest=False).indices
-    sequence, first, second = (field.gather(1, kept) for field in (sequence, first, second))
-    candidates = _Course(*(field.gather(1, sequence) for field in course))
-    first, second = _zoom(candidates, first, second, num_presses)
-    durations = torch.stack(_durations(candidates, first, second, num_presses), dim=-1)
-    best = (durations.sum(-1) + cost[sequence]).argmin(1, keepdim=True)
-    return sequence.gather(1, best).squeeze(1), durations.take_along_dim(best[..., None], 1).squeeze(1)
+    return _search(_Course(*columns), num_presses, cost)

@@ -187,11 +187,12 @@ def fuel_at_press(before: BoatState, after: BoatState, switch_cost: float | None
     return (before.fuel - switch_cost).clip(0.0)
 
 
-def leg(before: BoatState, after: BoatState, switch_cost: float | None = None) -> Leg:
-    """Return the track of the press between two states of one boat."""
+def leg(before: BoatState, after: BoatState, switch_cost: float | None = None, strength: float = 1.0) -> Leg:
+    """Return the track of the press between two states of one boat, `strength` times as fast as people's boats."""
     start = (before.x.item(), before.y.item())
     end = (after.x.item(), after.y.item())
     # The fuel burnt equals the time that the key was down, after noise and after the limit of the tank.
-    pressed = physics.pressed_distance(fuel_at_press(before, after, switch_cost) - after.fuel).item()
+    burnt = fuel_at_press(before, after, switch_cost) - after.fuel
+    pressed = strength * physics.pressed_distance(burnt).item()
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     return Leg(start, end, min(pressed / length, 1.0) if length > 0.0 else 1.0)
