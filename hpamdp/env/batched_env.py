@@ -145,12 +145,12 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     # Bounds of the parameters of all discrete actions, side by side.
     parameter_low: Sequence[float]
     parameter_high: Sequence[float]
-    row_kernel: ClassVar[Advance | None] = None  # in place of `start`, `act` and `observe`
     result_keys: tuple[str, ...] = (keys.OUTCOME,)
     reset_returns_all_rows = True
     num_envs: int
-    rows: KernelRows | None = None  # the state that the kernel moves; None if the tensor functions do
+    rows: KernelRows | None  # the state that a kernel moves; None if the tensor functions do
     planning_oracle: PlanningOracle | None = None  # which `_prepare` makes, if `_has_oracle` asks for it
+    _state: EpisodeState
     limit_terminates = False  # whether the time limit terminates an episode instead of truncating it
     float_type = torch.float32  # of observations and rewards
     seconds_per_step: ClassVar[float] = 0.25  # in films
@@ -189,9 +189,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         )
         self._make_specs(low, high)
         self._place_parameters(low, high)
+        self.rows = self._make_rows()
         self._set_seed(seed)
-        if self.row_kernel is not None:
-            self._use_kernel(self.row_kernel)
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
@@ -210,49 +209,9 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         """Return the problem's own numbers for its kernel."""
         return ()
 
-    def _use_kernel(self, advance: Advance) -> None:
-        """Let a kernel move the environments."""
-        owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
-        replaced = [name for name in _RULES if getattr(type(self), name) is not getattr(owner, name)]
-        if replaced:
-            name = type(self).__name__
-            raise TypeError(
-                f"{name}: overrides {', '.join(replaced)}, but only the kernel of {owner.__name__} has rules"
-            )
-        bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
-        state = self._columns
-        num_integers = sum(not column.is_floating_point() for column in state)
-        self.rows = KernelRows(
-            advance,
-            self.num_envs,
-            num_columns=(len(state._fields) - num_integers, num_integers),
-            reading_dims=(len(self.observation_names), len(self.extra_names)),
-            parameter_dims=self.parameter_dims,
-            bounds=torch.stack([bounds.low.reshape(-1), bounds.high.reshape(-1)]).numpy(force=True),
-            settings=[self.max_steps, len(self.option_names) if self._chooses else 0, *self.kernel_settings()],
-            first_env=int(self._environment[0]),
-        )
-        self.rows.set_seed(int(self._seed), self._streams)
-        self._state = state
-
-    @property
-    def _state(self) -> EpisodeState:
-        """The columns; a kernel changes them in place."""
-        if self.rows is None:
-            return self._columns
-        shared = self._shared_columns(self.rows)
-        return shared if self._is_on_cpu else type(shared)(*(column.to(self.device) for column in shared))
-
-    @_state.setter
-    def _state(self, state: EpisodeState) -> None:
-        if self.rows is None:
-            self._columns = state
-        else:
-            overwrite(self._shared_columns(self.rows), state)
-
-    def _shared_columns(self, rows: KernelRows) -> EpisodeState:
-        """Return the kernel's columns, which share its memory."""
-        return from_arrays(type(self._columns), (*rows.floats, *rows.integers))
+    def _make_rows(self) -> KernelRows | None:
+        """Return the rows of a problem that a kernel moves."""
+        return None
 
     @abstractmethod
     def start(self, episode: Tensor, rng: RngKey) -> EpisodeState:
@@ -508,9 +467,10 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     def _begin(self) -> None:
         """Put every environment before its first episode."""
         self._has_episodes = False
-        self._state = self._start(torch.full_like(self._environment, -1))
-        if self.rows is not None:
-            self.rows.set_seed(int(self._seed), self._streams)
+        if self.rows is None:
+            self._state = self._start(torch.full_like(self._environment, -1))
+        else:
+            self.rows.begin(int(self._seed), self._streams)
 
     def _start(self, episode: Tensor) -> EpisodeState:
         return self.start(episode, counter_rng.rng_key(self._seed, self._streams[0], self._environment, episode))
@@ -708,13 +668,51 @@ class KernelEnv(BatchedEnv[EpisodeState]):
     Actions move to the CPU, and what is observed to the device. Nothing has gradients.
     """
 
+    row_kernel: ClassVar[Advance | None]  # None in a subclass that has tensor functions after all
     state_type: type[EpisodeState]
     num_columns: tuple[int, int]  # of the state: float32 columns, which come first, and int32 columns
 
+    def _make_rows(self) -> KernelRows | None:
+        if self.row_kernel is None:
+            return None
+        owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
+        replaced = [rule for rule in _RULES if getattr(type(self), rule) is not getattr(owner, rule)]
+        if replaced:
+            name, rules = type(self).__name__, ", ".join(replaced)
+            raise TypeError(f"{name}: overrides {rules}, but only the kernel of {owner.__name__} has rules")
+        bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
+        return KernelRows(
+            self.row_kernel,
+            self.num_envs,
+            num_columns=self.num_columns,
+            reading_dims=(len(self.observation_names), len(self.extra_names)),
+            parameter_dims=self.parameter_dims,
+            bounds=torch.stack([bounds.low.reshape(-1), bounds.high.reshape(-1)]).numpy(force=True),
+            settings=[self.max_steps, len(self.option_names) if self._chooses else 0, *self.kernel_settings()],
+            first_env=int(self._environment[0]),
+        )
+
+    @property
+    def _state(self) -> EpisodeState:
+        """The columns, which the kernel changes in place."""
+        if self.rows is None:
+            return self._columns
+        return self.state_type(*(column.to(self.device) for column in self._shared_columns(self.rows)))
+
+    @_state.setter
+    def _state(self, state: EpisodeState) -> None:
+        if self.rows is None:
+            self._columns = state
+        else:
+            overwrite(self._shared_columns(self.rows), state)
+
+    def _shared_columns(self, rows: KernelRows) -> EpisodeState:
+        """Return the kernel's columns, which share its memory."""
+        return from_arrays(self.state_type, (*rows.floats, *rows.integers))
+
     def start(self, episode: Tensor, rng: RngKey) -> EpisodeState:
-        """Return columns of zeros, which the first reset replaces."""
-        zeros, (num_floats, num_integers) = torch.zeros_like(episode), self.num_columns
-        return self.state_type(*[zeros.float()] * num_floats, *[zeros] * (num_integers - 1), episode)
+        """Refuse: the kernel starts episodes."""
+        raise NotImplementedError
 
     def act(self, state: EpisodeState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[EpisodeState, Tensor]:
         """Refuse: the kernel acts."""

@@ -84,17 +84,13 @@ class KernelRows:
         self._no_choice = np.zeros(num_rows, np.int64)
         self._no_parameters = np.zeros((num_rows, sum(parameter_dims)), np.float32)
 
-    def set_seed(self, seed: int, streams: tuple[int, int]) -> None:
-        """Set the seed and the streams of episodes and of noise."""
-        self._settings[kernels.SEED] = folded(seed)
-        self._settings[kernels.EPISODE_STREAM], self._settings[kernels.NOISE_STREAM] = streams
-
-    def begin(self, seed: int) -> None:
-        """Put every row before its first training episode with this seed."""
+    def begin(self, seed: int, streams: tuple[int, int] = (TRAINING, NOISE)) -> None:
+        """Put every row before its first episode with this seed and these streams of episodes and of noise."""
         self.floats[:] = 0.0
         self.integers[:] = 0
         self.integers[kernels.EPISODE_ROW] = -1
-        self.set_seed(seed, (TRAINING, NOISE))
+        self._settings[kernels.SEED] = folded(seed)
+        self._settings[kernels.EPISODE_STREAM], self._settings[kernels.NOISE_STREAM] = streams
 
     def act(
         self,
