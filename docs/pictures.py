@@ -12,9 +12,9 @@ import numpy as np
 from PIL import Image
 
 from hpamdp.analysis import film
+from hpamdp.commands import watch
 from hpamdp.env.primitives import players
 from hpamdp.env.primitives.manipulation import Manipulation
-from hpamdp.run import watch
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAYERS = {

@@ -47,10 +47,10 @@ from hpamdp.shell import program
 
 # Further commands, and the modules whose `main` gets the words that follow and a parser.
 _COMMANDS = {
-    "watch": "hpamdp.run.watch",
-    "play": "hpamdp.run.play",
+    "watch": "hpamdp.commands.watch",
+    "play": "hpamdp.commands.play",
     "report": "hpamdp.analysis.seed_report",
-    "judge": "hpamdp.run.judge",
+    "judge": "hpamdp.commands.judge",
     "tune": "hpamdp.api.tuning",
 }
 # Errors that Hydra raises for a wrong command line or yaml file.

@@ -10,10 +10,10 @@ import yaml
 from conftest import SIMULATORS, choices, compose_config
 
 import hpamdp
+from hpamdp.commands.play import own_agents
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import upgraded
 from hpamdp.run import checkpoint
-from hpamdp.run.play import own_agents
 from hpamdp.run.players import load_agent
 from hpamdp.run.train import run
 
@@ -70,7 +70,9 @@ def test_an_agent_scores_as_its_summary_says(name):
 def test_those_on_boats_can_be_played_against_and_the_others_are_not_even_built(monkeypatch):
     config = load_agent(str(FOLDER / "linucb_hppo"), ["eval.layouts=1"]).config
     built = []
-    monkeypatch.setattr("hpamdp.run.play.load_agent", lambda path, words: built.append(path) or load_agent(path, words))
+    monkeypatch.setattr(
+        "hpamdp.commands.play.load_agent", lambda path, words: built.append(path) or load_agent(path, words)
+    )
     agents = own_agents(config)
     on_boats = [name for name in AGENTS if config_of(name)["choices"]["env"] == "boatdock"]
     assert [agent["name"] for agent in agents] == [Path(path).name for path in built] == on_boats

@@ -10,6 +10,7 @@ import torch
 from play_players import docked, events_of, random_events, recorded, sailed
 from test_play_replay import in_node, needs_node
 
+from hpamdp.commands.page_server import EpisodeFile
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.play.replay import Press, settle
@@ -19,7 +20,6 @@ from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
 from hpamdp.env.boatdock_unseen.play import sessions
 from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
 from hpamdp.env.play_page import EpisodeError
-from hpamdp.run.page_server import EpisodeFile
 
 TRIPS = 3
 

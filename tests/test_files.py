@@ -10,8 +10,8 @@ import pytest
 from conftest import compose_config
 
 import hpamdp
+from hpamdp.commands import play
 from hpamdp.files import kept_in_cache, replacing
-from hpamdp.run import play
 from hpamdp.run.folder import locked
 from hpamdp.run.train import run
 

@@ -6,12 +6,12 @@ from conftest import compose_config, make_config
 
 import hpamdp
 from hpamdp import keys
+from hpamdp.commands.judge import judged
+from hpamdp.commands.recorded_problem import RecordedProblem, starts_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.run.assemble import assemble
-from hpamdp.run.judge import judged
 from hpamdp.run.players import load_agent
-from hpamdp.run.recorded_problem import RecordedProblem, starts_of
 from hpamdp.run.train import run
 
 WORDS = ["data=human", "data.checksum=null", "offline.updates=400", "low.batch_size=32"]

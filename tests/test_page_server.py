@@ -12,10 +12,10 @@ from contextlib import contextmanager
 import pytest
 from play_players import docked
 
+from hpamdp.commands.page_server import EpisodeFile, PageServer
 from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
 from hpamdp.env.play_page import EpisodeError
-from hpamdp.run.page_server import EpisodeFile, PageServer
 
 EPISODES = docked(6)
 JSON = {"Content-Type": "application/json"}

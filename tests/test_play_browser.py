@@ -9,11 +9,11 @@ import time
 import pytest
 from test_page_server import serving
 
+from hpamdp.commands.play import export
 from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.boatdock_unseen.options import UnseenBoatsOptions
 from hpamdp.env.boatdock_unseen.play.session_page import SessionPage
-from hpamdp.run.play import export
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright")

@@ -11,6 +11,7 @@ from conftest import compose_config
 from play_players import docked, events_of, played
 
 from hpamdp import keys
+from hpamdp.commands.page_server import EpisodeFile
 from hpamdp.data import DataError
 from hpamdp.data.human import played_file
 from hpamdp.data.human.cli import main
@@ -21,7 +22,6 @@ from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.play.boat_page import BoatPage
-from hpamdp.run.page_server import EpisodeFile
 from hpamdp.run.train import run
 
 START, GOAL = (0.0, 60.0), (0.0, -60.0)

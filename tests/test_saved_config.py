@@ -12,12 +12,12 @@ import yaml
 from conftest import CONF, OWN, choices, compose_config, make_config, parts_of
 from test_grid import SHORT, SHORT_SELECTORS, SMALL
 
+from hpamdp.commands.play import permissions
 from hpamdp.config.components import GROUPS, card_named, load_class
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import needs_trust, read_saved
 from hpamdp.config.schema import Config
 from hpamdp.messages import one_line
-from hpamdp.run.play import permissions
 from hpamdp.run.state_file import write
 from hpamdp.run.train import run
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from hpamdp.api.arguments import count, path_argument
-from hpamdp.run.judge import DEFAULT_EPISODES, judged
+from hpamdp.commands.judge import DEFAULT_EPISODES, judged
 
 
 def judge(*agents: str | Path, data: str, episodes: int = DEFAULT_EPISODES, **settings: Any) -> list[dict[str, Any]]:

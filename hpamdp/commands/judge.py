@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from hpamdp import keys
 from hpamdp.analysis.statistics import mean_interval
+from hpamdp.commands.recorded_problem import RecordedProblem, Rollout, starts_of
 from hpamdp.config.compose import choosing, read, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed
@@ -28,7 +29,6 @@ from hpamdp.run.players import (
     whole_number,
     with_config_dirs,
 )
-from hpamdp.run.recorded_problem import RecordedProblem, Rollout, starts_of
 from hpamdp.specs import PAMDPSpecs
 
 DEFAULT_EPISODES = 100

@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from hpamdp.commands.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
 from hpamdp.config.compose import package_dir, read
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed
@@ -25,7 +26,6 @@ from hpamdp.files import replacing
 from hpamdp.messages import file_and_reason, first_line, reason_of, say, warn
 from hpamdp.run.assemble import make_env
 from hpamdp.run.checkpoint import find, progress_of
-from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
 from hpamdp.run.players import LoadedAgent, add_config_dir, load_agent, split_words, whole_number, with_config_dirs
 from hpamdp.run_files import POLICY_NAME, saved_summary
 

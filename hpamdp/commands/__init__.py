@@ -1,0 +1,1 @@
+"""Further commands of `hpamdp`, each with flags of its own: watch, play and judge."""
