@@ -334,13 +334,11 @@ def make_symmetries(
     return Symmetries(num_contexts=num_contexts, context_entry=context_entry, **tables)
 
 
-def plane_maps(num_turns: int, *, has_mirror: bool = True) -> Tensor:
+def plane_maps(num_turns: int) -> Tensor:
     """Return rotations `[G, 2, 2]` by multiples of 1 / `num_turns` of a turn, then the same after a mirror x -> -x."""
     angle = 2.0 * torch.pi * torch.arange(num_turns, dtype=torch.float64) / num_turns
     cos, sin = angle.cos(), angle.sin()
     turns = torch.stack([torch.stack([cos, -sin], -1), torch.stack([sin, cos], -1)], -2)
-    if not has_mirror:
-        return turns
     return torch.cat([turns, turns @ torch.tensor([[-1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])
 
 

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from hpamdp.components import Components
 from hpamdp.env.actions import check_action_values
 from hpamdp.env.gymnasium_checks import single_action
 
 DIMS = (2, 0, 1)
 
 
-def check(discrete: list[int], parameters: list[list[float]], **names) -> None:
-    check_action_values(torch.tensor(discrete), torch.tensor(parameters), DIMS, **names)
+def check(discrete: list[int], parameters: list[list[float]]) -> None:
+    check_action_values(torch.tensor(discrete), torch.tensor(parameters), DIMS, Components((3,)))
 
 
 def test_parameters_of_other_discrete_actions_may_be_anything():
@@ -37,11 +38,6 @@ def test_the_parameters_of_the_chosen_action_must_be_finite(discrete, column, va
     parameters[column] = value
     with pytest.raises(ValueError, match=f"environment 0 got discrete={discrete} "):
         check([discrete], [parameters])
-
-
-def test_a_problem_may_use_its_own_words():
-    with pytest.raises(ValueError, match=r"got turn=7 \(allowed 0 to 2\), angles=\["):
-        check([7], [[0.0, 0.0, 0.0]], names=("turn", "angles"))
 
 
 NONE, ONE, PAIR = np.zeros(0), np.zeros(1), np.zeros(2)

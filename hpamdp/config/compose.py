@@ -26,7 +26,6 @@ from hpamdp.shell import for_hydra
 
 NESTED = "a yaml file names itself among its defaults, or a value nests too deep"
 RECIPE = "recipe"
-_EXPERIMENT = "experiment"
 _LONGEST_NAME = 200  # letters of a yaml file's name
 _SHOWN = 200  # letters of a command line in an error
 _MISSING = "???"  # what OmegaConf takes for a value that is missing

@@ -1,4 +1,4 @@
-"""Validation of the values of batched actions, with one wording of the error for all environments."""
+"""Validation of the values of batched actions."""
 
 from __future__ import annotations
 
@@ -12,12 +12,7 @@ from hpamdp.messages import invalid_action
 
 
 def check_action_values(
-    discrete: Tensor,
-    parameters: Tensor,
-    parameter_dims: Sequence[int],
-    *,
-    components: Components | None = None,
-    names: tuple[str, str] = ("discrete", "parameters"),
+    discrete: Tensor, parameters: Tensor, parameter_dims: Sequence[int], components: Components
 ) -> None:
     """Check that each discrete action exists and that its own parameters are finite.
 
@@ -25,13 +20,11 @@ def check_action_values(
         discrete: integers `[N]`, or `[N, num_components]`.
         parameters: float `[N, sum(parameter_dims)]`, the parameters of all discrete actions side by side.
         parameter_dims: number of parameters of each discrete action.
-        components: components of the action. If None, it has one.
-        names: what the error calls `discrete` and `parameters`.
+        components: components of the action.
 
     Raises:
         ValueError: an action is invalid; the message names the first such environment.
     """
-    components = Components((len(parameter_dims),)) if components is None else components
     device = discrete.device
     owner = torch.arange(len(parameter_dims), device=device)
     owner = owner.repeat_interleave(torch.tensor(parameter_dims, device=device))
@@ -39,12 +32,11 @@ def check_action_values(
     is_valid = components.exists(discrete) & (parameters.isfinite() | ~is_own).all(-1)
     if not is_valid.all():
         row = int((~is_valid).nonzero()[0])
-        discrete_name, parameters_name = names
         allowed = " and ".join(f"0 to {size - 1}" for size in components.sizes)
         raise invalid_action(
             row,
             {
-                discrete_name: (discrete[row].tolist(), f"allowed {allowed}"),
-                parameters_name: (parameters[row].tolist(), "those of the chosen action must be finite"),
+                "discrete": (discrete[row].tolist(), f"allowed {allowed}"),
+                "parameters": (parameters[row].tolist(), "those of the chosen action must be finite"),
             },
         )

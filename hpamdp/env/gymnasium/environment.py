@@ -484,7 +484,7 @@ class GymnasiumEnv(PAMDPEnv):
             exists = bool(((chosen >= 0) & (chosen <= self._last_choices)).all())
         # If the sum of squares is finite, so are the numbers. If not, the full check decides.
         if not (math.isfinite(np.vdot(values, values)) and exists):
-            check_action_values(discrete, parameters, self.parameter_dims, components=self.components)
+            check_action_values(discrete, parameters, self.parameter_dims, self.components)
         return chosen, values
 
     def _read_option(self, tensordict: TensorDictBase) -> np.ndarray | None:
