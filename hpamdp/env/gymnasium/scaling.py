@@ -49,6 +49,7 @@ class ObservationScaling:
         self._is_frozen = False
         self._centre = np.zeros(self.dim)
         self._half_width = np.ones(self.dim)
+        self._limit = np.full(self.dim, np.inf if self.statistics is None else _CLIP)
         self._space = space
         self._seen = np.full(self.dim, np.inf), np.full(self.dim, -np.inf)
         self._num_to_watch = _WATCHED if scaling == "bounds" else 0
@@ -90,23 +91,19 @@ class ObservationScaling:
 
     def rescaled(self, vectors: np.ndarray) -> np.ndarray:
         """Return observations `[M, dim]` scaled as by `scaled`, but without updating the statistics."""
-        scaled = self._all_scaled(vectors)
-        return scaled if self._is_raw is None else np.where(self._is_raw, vectors.astype(np.float32), scaled)
-
-    def _all_scaled(self, vectors: np.ndarray) -> np.ndarray:
         if self.is_unscaled:
             return vectors.astype(np.float32)
-        if self.statistics is None:
-            return ((vectors - self._centre) / self._half_width).astype(np.float32)
-        return self.statistics.normalised(vectors).clip(-_CLIP, _CLIP).astype(np.float32)
+        centre, width, limit = self.linear_map()
+        return ((vectors - centre) / width).clip(-limit, limit).astype(np.float32)
 
     def linear_map(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what `rescaled` does now: the centre, the width to divide by and the limit, float64 `[dim]` each."""
-        centre, width, limit = self._centre, self._half_width, np.full(self.dim, np.inf)
+        centre, width, is_raw = self._centre, self._half_width, self._is_raw
         if self.statistics is not None:
-            centre, width, limit = self.statistics.mean, self.statistics.unit(), np.full(self.dim, _CLIP)
-        is_raw = np.zeros(self.dim, bool) if self._is_raw is None else self._is_raw
-        return np.where(is_raw, 0.0, centre), np.where(is_raw, 1.0, width), np.where(is_raw, np.inf, limit)
+            centre, width = self.statistics.mean, self.statistics.unit()
+        if is_raw is None:
+            return centre, width, self._limit
+        return np.where(is_raw, 0.0, centre), np.where(is_raw, 1.0, width), np.where(is_raw, np.inf, self._limit)
 
     def share(self, other: ObservationScaling) -> None:
         """Scale by the statistics of `other`, now and later, without updating them.
@@ -215,10 +212,6 @@ class RunningStatistics(RunningMeanStd):
         count, mean, variance = (columns[name].numpy() for name in self.columns())
         if count > 0.0:
             self.update_from_moments(mean, variance, count.item())
-
-    def normalised(self, vectors: np.ndarray) -> np.ndarray:
-        """Return vectors `[M, dim]` minus the mean, in standard deviations; constant entries keep their unit."""
-        return (vectors - self.mean) / self.unit()
 
     def unit(self) -> np.ndarray:
         """Return the standard deviations, `[dim]`; 1 for constant entries."""
