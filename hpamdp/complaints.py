@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from hpamdp.renamed import renamed
+from hpamdp.renamed import elsewhere, renamed
 
 _MOST_COMPLAINTS = 3
 _MOST_GUESSES = 3
@@ -37,7 +37,7 @@ def no_such(
         where: what has these names, such as `conf/low`; None for the owner that `what` names.
     """
     known = sorted(known)
-    guesses = guesses or close_names(name, known)
+    guesses = guesses or elsewhere(name, known) or close_names(name, known)
     guess = f"did you mean {' or '.join(guesses)}? " if guesses else ""
     owner = where or ("It" if guesses else "it")
     return f"no such {what}; {guess}{owner} has {', '.join(known) or 'none'}"

@@ -1,4 +1,4 @@
-"""Translate old names of settings, in errors and in saved runs."""
+"""Translate names: old ones of settings in errors and saved runs, and those of other libraries in errors."""
 
 from __future__ import annotations
 
@@ -9,12 +9,79 @@ from typing import Any
 _NEW_NAMES = {"agent.uniform_option_steps": "practice", "low.lr_final": "lr_final_fraction"}
 # Settings that some classes have no longer; they changed no result but its rounding.
 _GONE = ("env.compile_rules",)
+# Names of settings in Stable-Baselines3, CleanRL and Spinning Up, and ours.
+_ELSEWHERE: dict[str, tuple[str, ...]] = {
+    "learning_rate": ("lr", "actor_lr", "critic_lr"),
+    "lr": ("actor_lr", "critic_lr"),
+    "batch_size": ("minibatch_size",),
+    "num_minibatches": ("minibatch_size",),
+    "n_epochs": ("epochs",),
+    "update_epochs": ("epochs",),
+    "clip_range": ("clip",),
+    "clip_coef": ("clip",),
+    "ent_coef": ("discrete_entropy", "parameter_entropy", "discrete_temperature", "parameter_temperature"),
+    "vf_coef": ("critic_weight",),
+    "tau": ("actor_tau", "critic_tau"),
+    "learning_starts": ("warmup_steps",),
+    "gradient_steps": ("updates_per_step",),
+    "train_freq": ("updates_per_step",),
+    "policy_frequency": ("policy_delay",),
+    "exploration_fraction": ("epsilon_steps",),
+    "exploration_final_eps": ("epsilon_final",),
+    "end_e": ("epsilon_final",),
+    "exploration_noise": ("parameter_noise",),
+    "net_arch": ("hidden_dims",),
+    "hidden_sizes": ("hidden_dims",),
+    "n_steps": ("steps_per_batch",),
+    "num_steps": ("steps_per_batch",),
+    "rollout_length": ("steps_per_batch",),
+    "total_timesteps": ("total_frames",),
+    "num_timesteps": ("total_frames",),
+    "total_steps": ("total_frames",),
+    "n_envs": ("num_envs",),
+    "eval_freq": ("eval.every",),
+    "n_eval_episodes": ("eval.layouts",),
+    "policy_kwargs": ("hidden_dims",),
+    "tensorboard_log": ("logger",),
+}
+# Arguments of other libraries' evaluations, and those of `Agent.evaluate`.
+OF_EVALUATION = {
+    "n_eval_episodes": "episodes",
+    "num_episodes": "episodes",
+    "n_episodes": "episodes",
+    "eval.layouts": "episodes",
+    "return_episode_rewards": "per_episode",
+    "deterministic": "act, as evaluate is always greedy",
+}
+# Methods of other libraries' agents, and what to use here.
+_MEMBERS_ELSEWHERE = {
+    "predict": "act(observation)",
+    "get_action": "act(observation)",
+    "get_action_and_value": "act(observation)",
+    "learn": "hpamdp.train",
+    "load": "hpamdp.load",
+}
+# Names that stand for values of the run, which a group does not have.
+_OF_RUN = ("steps_per_batch", "total_frames", "num_envs", "eval.every", "eval.layouts", "logger")
 
 
 def renamed(setting: str, known: Iterable[str]) -> str | None:
     """Return a message with the new name of a setting, if it is among the group's known names; otherwise None."""
     new = _NEW_NAMES.get(setting)
     return f"is called {setting.rpartition('.')[0]}.{new} now" if new is not None and new in known else None
+
+
+def elsewhere(name: str, known: Iterable[str]) -> list[str]:
+    """Return our names for a setting of another library: those among the known names, or values of the run."""
+    known = set(known)
+    return [ours for ours in _ELSEWHERE.get(name, ()) if ours in known or ours in _OF_RUN]
+
+
+def no_member(owner: object, name: str) -> AttributeError:
+    """Return the error for a missing attribute, which names ours for one of another library."""
+    ours = _MEMBERS_ELSEWHERE.get(name)
+    hint = "" if ours is None else f"; use {ours} (docs/coming-from.md)"
+    return AttributeError(f"{type(owner).__name__!r} object has no attribute {name!r}{hint}", name=name, obj=owner)
 
 
 def with_new_names(group: str, settings: Mapping[str, Any], known: Collection[str]) -> dict[str, Any]:

@@ -689,6 +689,7 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.report(__file__), r"test_api\.py: a file; give the folder of a run, or one that contains runs"),
         (lambda: hpamdp.HPPO("platform"), r"specs='platform': must be PAMDPSpecs.from_env\(env\)"),
         (lambda: hpamdp.UCB(policy="MlpPolicy", env=3), r"specs='MlpPolicy': .* hpamdp.train\(env, low=...\) trains"),
+        (lambda: hpamdp.load("hppo_platform").evaluate(n_eval_episodes=3), "no such argument; use episodes"),
         (lambda: hpamdp.PAMDPSpecs.from_env("platform"), "'platform' is no PAMDPEnv; hpamdp.make makes one"),
     ],
 )

@@ -18,6 +18,8 @@ MISTAKES = [
     (["high=ucb", "high.windw=3"], "high.windw: no such setting of UCB; did you mean window? It"),
     (["high=none", "high.window=3"], "high.window: high=none has no settings; choose another high, too"),
     (["+low=hppo"], "Multiple values for low. To override a value use 'override low: hppo'"),
+    (["low=hppo", "low.learning_rate=1"], "no such setting of HPPO; did you mean lr or critic_lr? It has "),
+    (["total_timesteps=64"], "did you mean total_frames? It has "),
     (["hydra.run.dri=x"], "hydra.run.dri: no such value of hydra.run; did you mean dir? It has dir"),
     (["low=3"], "low=3: Config group override must be a string or a list. Got int"),
     (["hydra=null"], "hydra=null: not understood"),

@@ -30,6 +30,7 @@ from hpamdp.env.decisions import DecisionTracker, decision_tracker
 from hpamdp.env.facts import SOURCE_SETTINGS
 from hpamdp.messages import as_code
 from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.renamed import OF_EVALUATION, no_member
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env, make_evaluation, option_length
 from hpamdp.run.resume import warn_of_other_ranges
@@ -84,6 +85,11 @@ class Agent:
         frames = self._progress.get("frames")
         trained = "untrained" if not frames else f"after {frames:,} frames"
         return f"Agent({self._config.high}, {self._config.low}, {self._config.env}, {trained})"
+
+    def __getattr__(self, name: str) -> Any:
+        if hasattr(type(self), name):  # a property raised an AttributeError: raise it once more, from there
+            return object.__getattribute__(self, name)
+        raise no_member(self, name)
 
     @property
     def num_parameters(self) -> int:
@@ -225,6 +231,9 @@ class Agent:
             ConfigError: the problem has other sizes, or a number is wrong.
         """
         flag("per_episode", per_episode)
+        for name in settings:
+            if name in OF_EVALUATION:
+                raise ConfigError(f"evaluate: {name}: no such argument; use {OF_EVALUATION[name]}")
         of_problem = without_env_prefix(settings)
         for name in EnvConfig.model_fields:
             if name in of_problem:

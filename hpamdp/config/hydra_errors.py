@@ -21,7 +21,7 @@ from hpamdp.config.components import GROUPS, TARGET
 from hpamdp.config.compose import NESTED, beginning_of
 from hpamdp.config.schema import RUN_FILE
 from hpamdp.messages import file_and_reason, first_line
-from hpamdp.renamed import renamed
+from hpamdp.renamed import elsewhere, renamed
 
 # Launchers in separate packages, and the extra of pyproject.toml that installs each.
 _LAUNCHER = "hydra/launcher"
@@ -115,14 +115,18 @@ def _in_groups(cfg: DictConfig, name: str) -> list[str]:
     """Return the settings of groups, such as `env.max_steps`, that have a name, or else one close to it."""
     settings = {group: [*cfg[group]] for group in GROUPS if isinstance(cfg.get(group), DictConfig)}
     exact = [f"{group}.{name}" for group, names in settings.items() if name in names]
-    return exact or [f"{group}.{each}" for group, names in settings.items() for each in close_names(name, names)]
+    return exact or [
+        f"{group}.{each}"
+        for group, names in settings.items()
+        for each in elsewhere(name, names) or close_names(name, names)
+    ]
 
 
 def _no_such_setting(cfg: DictConfig, path: list[str], name: str, known: list[str], conf: Path) -> str:
     if not path:
         folders = {folder.name for folder in conf.iterdir() if folder.is_dir()}
         names = sorted({*known, *folders} - {"hydra", SEARCH})
-        guesses = close_names(name, names) or _in_groups(cfg, name)
+        guesses = elsewhere(name, names) or close_names(name, names) or _in_groups(cfg, name)
         return no_such(f"group or value of the run ({RUN_FILE})", name, names, guesses=guesses)
     if len(path) == 1 and path[0] in GROUPS:
         group, target = path[0], OmegaConf.to_container(cfg[path[0]]).get(TARGET)  # type: ignore[union-attr]
