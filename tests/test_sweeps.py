@@ -87,7 +87,7 @@ def test_a_sweep_ends_with_a_table_of_means_over_all_its_seeds_also_of_earlier_s
         "hydra.sweep.dir=sweep",
         "hydra.sweep.subdir=${hydra:runtime.choices.low}_${low.lr}/${seed}",
     ]
-    command("-m", "low=hppo", "low.lr=0.1,0.2", "seed=4,8", *words)
+    command("-m", "low=hppo", "low.lr=0.1,0.2", "seed=4", *words)
     code, out, err = command("-m", "low=hppo", "low.lr=0.1,0.2", "seed=4,8,12", *words)
     table = out[out.index("            ") : out.index("6 jobs: ")].splitlines()
     assert (code, err) == (0, "") and [line.split() for line in table[1:3]] == [
