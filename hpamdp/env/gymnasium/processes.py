@@ -10,6 +10,7 @@ import multiprocessing
 import signal
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -74,8 +75,8 @@ class ProcessCopies:
             with children_protected(), children_without(*_SIGNALS_OF_THE_RUN):
                 for block in self._blocks:
                     pipe, theirs = context.Pipe()
-                    arguments = make, len(block), settings, flattens_pictures, block.start
-                    worker = context.Process(target=_serve, args=(theirs, CloudpickleWrapper(arguments)), daemon=True)
+                    made: Any = partial(Copies, make, len(block), settings, flattens_pictures, block.start)
+                    worker = context.Process(target=_serve, args=(theirs, CloudpickleWrapper(made)), daemon=True)
                     worker.start()
                     theirs.close()
                     self._pipes.append(pipe)
@@ -153,17 +154,17 @@ class ProcessCopies:
         self._pipes, self._workers = [], []
 
 
-def _serve(pipe: Connection, arguments: CloudpickleWrapper) -> None:
+def _serve(pipe: Connection, make: CloudpickleWrapper) -> None:
     """Answer calls of the methods of copies, which the first call makes, until the pipe is closed."""
     unprotect_children()
     register()
-    copies: Copies | None = None
+    copies: Any = None
     with suppress(EOFError, OSError):  # the run has closed the pipe, or has ended
         while True:
             method, given = pipe.recv()
             answer: Any
             try:
-                copies = Copies(*arguments.fn) if copies is None else copies
+                copies = make() if copies is None else copies
                 answer = getattr(copies, method)(*given), copies.results
             except Exception as error:
                 answer = error

@@ -36,9 +36,12 @@ class MisfitError(ProblemError):
 
 def children(space: spaces.Space) -> dict[int | str, spaces.Space]:
     """Return the entries of a Tuple or Dict; an empty dictionary for any other space."""
+    entries: dict[int | str, spaces.Space] = {}
     if isinstance(space, spaces.Dict):
-        return {**space.spaces}
-    return dict(enumerate(space.spaces)) if isinstance(space, spaces.Tuple) else {}
+        entries.update(space.spaces.items())
+    elif isinstance(space, spaces.Tuple):
+        entries.update(enumerate(space.spaces))
+    return entries
 
 
 def as_numbers(value: Any) -> np.ndarray | None:
