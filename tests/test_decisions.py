@@ -13,6 +13,7 @@ from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.env.option_choice import OptionChoiceEnv
+from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Selector
 from hpamdp.policies.high_level.actor import Actor
@@ -188,3 +189,17 @@ def test_an_environment_of_choices_closes_the_one_that_it_wraps():
     inner = BoatDockEnv(2)
     OptionChoiceEnv(Random(PAMDPSpecs.from_env(inner)).policy, inner).close()
     assert inner.is_closed
+
+
+@pytest.mark.parametrize("option_length", [None, 2])
+def test_a_step_with_a_restart_returns_what_torchrls_own_does(option_length):
+    fast, slow = (with_decisions(PlatformEnv(50, seed=2, max_steps=3), 0.9, option_length) for _ in range(2))
+    slow.base_env.step_and_restart = lambda td: None
+    one, other = fast.reset(), slow.reset()
+    for _ in range(7):
+        action = fast.rand_action(one.clone()).select(keys.ACTION)
+        mark = torch.rand(50, 3)  # what a policy keeps from step to step
+        fast_step, one = fast.step_and_maybe_reset(one.update(action).set("mark", mark))
+        slow_step, other = slow.step_and_maybe_reset(other.update(action.clone()).set("mark", mark))
+        assert set(fast_step.keys(True)) == set(slow_step.keys(True)) and set(one.keys(True)) == set(other.keys(True))
+        assert (fast_step == slow_step).all() and (one == other).all()

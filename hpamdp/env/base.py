@@ -204,6 +204,18 @@ class PAMDPEnv(EnvBase):
         named = f" or {', '.join(names)}" if names else ""
         raise ValueError(f"{self.title} has no discrete action {action}; it has 0 to {num_discrete - 1}{named}")
 
+    def step_and_restart(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase] | None:
+        """Step all environments, and begin new episodes where one ends, faster than by a step and a reset.
+
+        Args:
+            tensordict: the states with their actions, `[N]`.
+
+        Returns:
+            What followed the step, with its reward, and the states to go on from; or None, with nothing done, if step
+            and reset must be called instead.
+        """
+        return None
+
     def check_masks(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the result of a step or a reset with masks that allow something in every row.
 

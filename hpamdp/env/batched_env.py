@@ -388,6 +388,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         outcome = Categorical(len(self.outcomes), shape=(n,), device=device)
         knowledge = self._knowledge_specs()
         self._has_knowledge = bool(knowledge)
+        ways = ("_step", "_reset", "_on_start")
+        self._steps_plainly = not knowledge and all(getattr(type(self), n) is getattr(BatchedEnv, n) for n in ways)
         self._plain_keys = _PLAIN_KEYS.union(self.extra_names)
         self.observation_spec = Composite(
             {keys.OBSERVATION: observation, keys.OUTCOME: outcome, **extras, **knowledge}, shape=(n,), device=device
@@ -556,12 +558,11 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         return self.read().set(keys.REWARD, reward.unsqueeze(-1))
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        is_plain = self.rows is not None and not self._has_knowledge and tensordict.device == self.device
-        if not is_plain or not self._plain_keys.issuperset(tensordict.keys()):
+        is_plain = self._plain_keys.issuperset(tensordict.keys())
+        results = self._act_and_restart(tensordict) if is_plain else None
+        if results is None:
             return super()._step_and_maybe_reset(tensordict)
-        results = self._act(self.action_leaves(tensordict), None, restarts=True)
-        # The same in one pass, because TorchRL's work between step and reset takes longer than the kernel. As in
-        # TorchRL, the root keeps the action. It is in a tensordict of its own, since updates of the root change it.
+        # As in TorchRL, the root keeps the action, in a tensordict of its own, since updates of the root change it.
         action = TensorDict._new_unsafe(
             dict(tensordict.get(keys.ACTION).items()), batch_size=self.batch_size, device=self.device
         )
@@ -570,6 +571,23 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             kept[keys.OPTION] = tensordict.get(keys.OPTION)
         root = self._reading(results, number=1, kept=kept)
         return tensordict.set("next", self._reading(results, has_reward=True)), root
+
+    def step_and_restart(self, tensordict: TensorDictBase) -> tuple[TensorDict, TensorDict] | None:
+        """Step and reset with one call of the kernel, see `PAMDPEnv.step_and_restart`."""
+        results = self._act_and_restart(tensordict)
+        if results is None:
+            return None
+        return self._reading(results, has_reward=True), self._reading(results, number=1)
+
+    def _act_and_restart(self, tensordict: TensorDictBase) -> Results | None:
+        """Act with the kernel, and begin new episodes where one ends; None if this takes TorchRL's way.
+
+        One pass, because TorchRL's work between step and reset takes longer than the kernel.
+        """
+        is_plain = self._steps_plainly and self.rows is not None and tensordict.device == self.device
+        if not is_plain or "_step" in tensordict.keys():
+            return None
+        return self._act(self.action_leaves(tensordict), None, restarts=True)
 
     def action_leaves(self, tensordict: TensorDictBase) -> tuple[Tensor | None, Tensor, Tensor]:
         """Return option, discrete actions and parameters, whose values are still to be checked.

@@ -165,6 +165,24 @@ class DecisionTracker(Transform):
         next_tensordict.set(keys.EPISODE_STEPS, tensordict.get(keys.EPISODE_STEPS) + 1)
         return next_tensordict
 
+    def restarted(self, root: TensorDictBase, after: TensorDictBase) -> dict[str, Tensor]:
+        """Return the tracked entries of the states to go on from.
+
+        Args:
+            root: these states `[N]`, with new episodes where the step ended one.
+            after: what followed the step, with its tracked entries.
+        """
+        done = after.get(keys.DONE)
+        sums = (keys.OPTION_RETURN, keys.OPTION_STEPS, keys.EPISODE_RETURN, keys.EPISODE_STEPS)
+        entries = {name: _zero_where(done, after.get(name)) for name in sums}
+        entries[keys.IS_DECISION] = after.get(keys.IS_DECISION)
+        if self.ends_inside:
+            entries[keys.OPTION_ENDED] = after.get(keys.OPTION_ENDED) & ~done
+        if self.keeps_observation:
+            seen = root.get(keys.OBSERVATION), after.get(keys.DECISION_OBSERVATION)
+            entries[keys.DECISION_OBSERVATION] = torch.where(done, *seen)
+        return entries
+
     def _decision_observation(self, tensordict: TensorDictBase) -> Tensor:
         """Return the observation at which the option of this step was chosen, `[*B, observation_dim]`."""
         decision_observation: Tensor = tensordict.get(keys.DECISION_OBSERVATION)
@@ -291,6 +309,20 @@ class DecisionEnv(TransformedEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._problem.check_masks(super()._step(tensordict))
+
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        tracker = self.transform
+        assert isinstance(tracker, DecisionTracker)
+        both = self._problem.step_and_restart(tensordict) if tracker.option_actions is None else None
+        if both is None:
+            return super()._step_and_maybe_reset(tensordict)
+        after, root = both
+        after = tracker._step(tensordict, after)
+        root.update(tracker.restarted(root, after))
+        # As in TorchRL, the root keeps what the policy wrote, with zeros where an episode begins.
+        begins = after.get(keys.DONE)
+        kept = tensordict.exclude(*root.keys()).apply(lambda leaf: leaf.masked_fill(_like(begins, leaf), 0))
+        return tensordict.set("next", after), root.update(kept)
 
     @property
     def _problem(self) -> PAMDPEnv:
