@@ -19,7 +19,6 @@ from torchrl.envs.transforms import MacroPrimitiveTransform
 from torchrl.envs.utils import step_mdp
 
 import hpamdp
-from hpamdp.config.errors import ConfigError
 from hpamdp.env.gymnasium.from_torchrl import FromTorchRL
 from hpamdp.settings import SettingError
 
@@ -176,5 +175,3 @@ def test_transforms_that_lose_the_end_of_an_episode_are_refused(transform):
 def test_a_batch_is_refused_in_a_line():
     with pytest.raises(SettingError, match="steps 2 environments at once; give a single one"):
         FromTorchRL(SerialEnv(2, limited))
-    with pytest.raises(ConfigError, match=r"set env\.max_steps"):
-        hpamdp.train(Tanks, low="hppo")
