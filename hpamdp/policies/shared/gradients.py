@@ -88,57 +88,9 @@ class Descent:
             groups_apart = [list(group) for group in clipped_apart]
             apart = {id(parameter) for group in groups_apart for parameter in group}
             for part in ([each for each in parameters if id(each) not in apart], *groups_apart):
-                clip_gradients(part, max_grad_norm)
-        take_step(optimizer)
-        return scalars
-
-
-def clip_gradients(parameters: Sequence[Tensor], limit: float) -> None:
-    """Scale gradients down to a common norm of at most `limit`: `nn.utils.clip_grad_norm_`, with fewer calls."""
-    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-    if gradients:
-        norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
-        torch._foreach_mul_(gradients, (limit / (norm + 1e-6)).clamp(max=1.0))
-
-
-@torch.no_grad()
-def take_step(optimizer: torch.optim.Optimizer) -> None:
-    """Take a step of an optimizer; of a fused Adam, without PyTorch's checks, which take longer than a small network's.
-
-    The first step, which makes the state, is PyTorch's own.
-    """
-    groups = optimizer.param_groups
-    learned = [[each for each in group["params"] if each.grad is not None] for group in groups]
-    kernels: dict[type, Callable[..., None]] = {
-        torch.optim.Adam: torch._fused_adam_,
-        torch.optim.AdamW: torch._fused_adamw_,
-    }
-    kernel = kernels.get(type(optimizer))
-    is_plain = kernel is not None and all(group["fused"] and not group["amsgrad"] for group in groups)
-    if kernel is None or not is_plain or any(each not in optimizer.state for part in learned for each in part):
+                nn.utils.clip_grad_norm_(part, max_grad_norm)
         optimizer.step()
-        return
-    for group, parameters in zip(groups, learned, strict=True):
-        states = [optimizer.state[each] for each in parameters]
-        steps = [state["step"] for state in states]
-        if not steps:
-            continue
-        torch._foreach_add_(steps, 1)
-        kernel(
-            parameters,
-            [each.grad for each in parameters],
-            [state["exp_avg"] for state in states],
-            [state["exp_avg_sq"] for state in states],
-            [],
-            steps,
-            lr=group["lr"],
-            beta1=group["betas"][0],
-            beta2=group["betas"][1],
-            weight_decay=group["weight_decay"],
-            eps=group["eps"],
-            amsgrad=False,
-            maximize=group["maximize"],
-        )
+        return scalars
 
 
 def adam(rate: float, *modules: nn.Module, weight_decay: float | None = None) -> torch.optim.Optimizer:
