@@ -347,7 +347,7 @@ def test_the_death_after_the_last_restart_ends_the_run_with_the_last_known_state
 
 def fail_in_a_batch(collection, monkeypatch):
     """Have a batch fail at its second step."""
-    step, numbers = BoatDockEnv._step, itertools.count()
+    step, numbers = BoatDockEnv.step_and_restart, itertools.count()
 
     def failing(self, td):
         if next(numbers):
@@ -355,7 +355,7 @@ def fail_in_a_batch(collection, monkeypatch):
         return step(self, td)
 
     with monkeypatch.context() as patch, pytest.raises(ProblemError, match="broken"):
-        patch.setattr(BoatDockEnv, "_step", failing)
+        patch.setattr(BoatDockEnv, "step_and_restart", failing)
         collection.next()
 
 
@@ -406,7 +406,7 @@ def test_an_error_in_a_workers_environment_is_no_death(error, kind, text, tmp_pa
 
     with closing(Mortal(tmp_path, 5)) as collection:
         with monkeypatch.context() as patch, pytest.raises(kind) as raised:
-            patch.setattr(BoatDockEnv, "_step", failing)
+            patch.setattr(BoatDockEnv, "step_and_restart", failing)
             collection.next()
         assert str(raised.value).startswith(text) and collection.notices() == []
 

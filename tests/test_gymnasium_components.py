@@ -253,7 +253,7 @@ def test_a_pair_mask_says_what_goes_together(place):
 @pytest.mark.parametrize(
     ("tree", "said", "settings", "line"),
     [
-        ("two discretes", {}, {"pair_mask": "info"}, "gave None as pair_mask, which must be 5 rows of 5 numbers"),
+        ("two discretes", {}, {"pair_mask": "info"}, "gave no pair_mask, which must come with every reset"),
         ("nested", {}, {"pair_mask": "info"}, "pair_mask=info: the action has one component, so there are no pairs"),
     ],
 )
@@ -306,7 +306,7 @@ def test_bounds_may_have_the_structure_of_the_space(tree, low, flat):
 @pytest.mark.parametrize(
     ("said", "line"),
     [
-        ({}, "gave no parameter_low or parameter_high, one of which must come with every reset and step$"),
+        ({}, "gave no parameter_low or parameter_high, which must come with every reset and step; "),
         ({"parameter_high": [1.5, 12.0]}, r"parameter_high=1\.5 for parameter 0, outside the action space: 0 to 1$"),
         (
             {"parameter_low": [0.2, 15.0], "parameter_high": [0.5, 12.0]},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import ClassVar
 
 import gymnasium
 import numpy as np
@@ -114,15 +115,17 @@ def test_without_a_limit_the_line_asks_for_one(limit):
 class Forbidding(Toy):
     """Ends its episodes after 8 steps without naming a limit, and forbids all discrete actions but one."""
 
+    mask: ClassVar = [0, 1, 0]
+
     def __init__(self):
         super().__init__(length=8)
 
     def reset(self, **arguments):
-        return super().reset(**arguments)[0], {"action_mask": [0, 1, 0]}
+        return super().reset(**arguments)[0], {"action_mask": self.mask}
 
     def step(self, action):
         assert action[0] == 1
-        return *super().step(action)[:4], {"action_mask": [0, 1, 0]}
+        return *super().step(action)[:4], {"action_mask": self.mask}
 
 
 def test_an_environment_that_ends_by_itself_needs_no_limit(monkeypatch, capsys):
@@ -130,10 +133,16 @@ def test_an_environment_that_ends_by_itself_needs_no_limit(monkeypatch, capsys):
     env.reset()
     first = [step(env, torch.ones(4, dtype=torch.int64))["done"].squeeze(-1) for _ in range(8)]
     assert torch.stack(first).int().argmax(0).tolist() == [7, 4, 1, 6]  # apart by parts of eight steps
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("names no time limit, so episodes are truncated after 10,000 steps; see env.max_steps")
     monkeypatch.setattr(copies, "_MOST_STEPS", 3)
     assert episode_length(GymnasiumEnv(make=lambda: Toy(length=8), observation_scaling="none")) == 3
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith("an episode without a time limit was truncated after 3 steps; set env.max_steps")
+
+
+def test_where_pairs_or_all_actions_are_forbidden_no_episode_is_tried(monkeypatch):
+    monkeypatch.setattr(Forbidding, "mask", [0, 0, 0])
+    with pytest.raises(SettingError, match=r"has no time limit of its own; set env\.max_steps"):
+        GymnasiumEnv(make=Forbidding, observation_scaling="none")
 
 
 def test_an_environment_that_ends_the_program_while_it_is_built_is_reported_in_one_line(tmp_path):

@@ -179,6 +179,16 @@ def test_numbers_begin_at_their_defaults_or_in_mid_range_if_random_play_is_bette
 
 
 @needs_simulator
+def test_numbers_begin_at_their_defaults_if_a_rule_of_the_domain_fails_in_random_play(monkeypatch):
+    def failing(*given):
+        raise ValueError("a probability of 1.5")
+
+    monkeypatch.setattr(RDDLProblem, "_trial", failing)
+    _, bias = RDDLEnv(1, domain="SupplyChain_or", **SHIPS).initial_parameters()
+    assert bias.tolist() == [-1.0] * 4
+
+
+@needs_simulator
 def test_files_of_ones_own_are_read_and_watched(tmp_path):
     from rddlrepository.core.manager import RDDLRepoManager
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import Any, NoReturn
 
 import gymnasium
@@ -29,9 +30,11 @@ _SUCCESS_ENTRIES = ("is_success", "success")
 _ALL = slice(None)  # rows
 _SPACES = ("action_space", "observation_space")
 _PICTURES_PER_SECOND = 4.0
-# An environment that names no time limit must end an episode of random actions within the first number of steps.
-# Episodes are truncated after the second number.
-_TRIED_STEPS, _MOST_STEPS = 1_000, 10_000
+# An environment that names no time limit must end an episode of random actions within so many steps.
+_TRIED_STEPS = 1_000
+# Then its episodes are truncated after so many steps.
+_MOST_STEPS = 10_000
+_warn_once = cache(warn)
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,6 @@ class Copies:
         envs: the copies.
         example: one of them, to read its spaces.
         max_steps: of the longest episode.
-        usual_length: `max_steps`, or the steps of a random episode if the environment names no time limit.
         has_pictures: whether `pictures` returns some: the `render_mode` is `rgb_array`.
         pictures_per_second: `render_fps` of the environment's metadata, or 4.
         option_names: what the environment calls its options, unchecked.
@@ -158,35 +160,42 @@ class Copies:
         self._spaces = [(env.action_space, env.observation_space) for env in self.envs]
         self._reads_infos = bool(self._masks.rows or self._bounds.names)
         self._names_no_limit = None in limits
-        self.usual_length = self._length_of_an_episode() if self._names_no_limit else self.max_steps
 
-    def _length_of_an_episode(self) -> int:
-        """Return the steps of an episode of random actions with the first copy.
+    @cached_property
+    def usual_length(self) -> int:
+        """The time limit in steps; if the environment names none, those of an episode of random actions.
 
         Raises:
-            SettingError: it goes on.
+            SettingError: the episode goes on.
         """
+        if not self._names_no_limit:
+            return self.max_steps
         rng, actions, num = np.random.default_rng(0), self.actions, len(self.envs)
         self.reset({0: 0})
         for step in range(1, _TRIED_STEPS + 1):
             allowed = {name: rows[0] for name, rows in self.results.masks.items()}
             mask = allowed.get(keys.ACTION_MASK, np.ones(len(actions.parameter_dims), bool))
             parts = np.split(mask, np.cumsum(actions.component_sizes)[:-1]) if actions.component_sizes else [mask]
-            chosen = np.array([rng.choice(np.flatnonzero(part)) for part in parts])
             options = allowed.get(keys.OPTION_MASK, np.ones(max(1, self.options.num_options), bool))
+            if keys.PAIR_MASK in allowed or not all(part.any() for part in (*parts, options)):
+                break  # components drawn apart may be forbidden, or everything is
+            chosen = np.array([rng.choice(np.flatnonzero(part)) for part in parts])
             option = np.full(num, rng.choice(np.flatnonzero(options))) if self.options.num_options else None
             discrete = np.tile(chosen if actions.component_sizes else chosen[0], (num, 1) if len(parts) > 1 else num)
             parameters = np.tile(rng.uniform(actions.low, actions.high).astype(np.float32), (num, 1))
             self.step([0], option, discrete, parameters)
-            if self.results.flags[0, :2].any():
+            terminated, truncated = self.results.flags[0, :2]
+            if terminated:  # with other actions it may go on for longer
+                end = f"episodes are truncated after {_MOST_STEPS:,} steps"
+                _warn_once(f"{self._name}: names no time limit, so {end}; see env.max_steps")
+            if terminated or truncated:
                 return step
-        raise SettingError(
-            f"{self._name}: has no time limit of its own; set env.max_steps (an episode of random actions goes on "
-            f"after {_TRIED_STEPS:,} steps)"
-        )
+        raise SettingError(f"{self._name}: has no time limit of its own; set env.max_steps")
 
     def _first_info(self) -> Mapping[str, Any]:
-        """Return the info of a reset, which may hold masks and bounds."""
+        """Return the info of a reset, which may hold masks and bounds; nothing for the problems of this package."""
+        if getattr(self.envs[0].unwrapped, "own_time_limit", None) is not None:
+            return {}
         self._row = 0
         try:
             return self.envs[0].reset(seed=0)[1]
@@ -283,7 +292,6 @@ class Copies:
                     success = _success_in(info)
                 if terminated or truncated or num_steps[row] == 1:
                     self._check_unchanged(row)
-                    self._tell_if_cut(num_steps[row])
                 if terminated or truncated or success is not None:
                     flags[row] = (terminated, truncated, bool(success), success is not None)
             if rows:
@@ -293,13 +301,6 @@ class Copies:
         self.results.reward[index], self.results.flags[index] = rewards, False
         for row, of_row in flags.items():
             self.results.flags[row] = of_row
-
-    def _tell_if_cut(self, num_steps: int) -> None:
-        """Warn once if an episode has been truncated for want of a time limit."""
-        if self._names_no_limit and num_steps >= _MOST_STEPS:
-            self._names_no_limit = False
-            cut = f"an episode without a time limit was truncated after {num_steps:,} steps"
-            warn(f"{self._name}: {cut}; set env.max_steps")
 
     def _natives(
         self, index: Any, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray

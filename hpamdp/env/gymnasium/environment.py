@@ -122,7 +122,7 @@ class GymnasiumEnv(PAMDPEnv):
     def _set_up(self, seed: int) -> None:
         """Read from the copies what the environment is, and prepare for the first episodes."""
         options, num_envs = self.options, self.num_envs
-        self.max_steps = self._copies.max_steps
+        self.max_steps, self._usual_length = self._copies.max_steps, self._copies.usual_length
         actions = self._copies.actions
         self.parameter_dims = actions.parameter_dims
         self.component_sizes, self.integer_parameters = actions.component_sizes, actions.integer_parameters
@@ -421,7 +421,7 @@ class GymnasiumEnv(PAMDPEnv):
         self._first_ends[is_reset] = 0
         if self._is_staggered and mask is None and given is None:
             numbers = np.arange(self.first_env, self.first_env + self.num_envs)
-            self._first_ends[:] = np.ceil(numbers * _GOLDEN % 1.0 * self._copies.usual_length)
+            self._first_ends[:] = np.ceil(numbers * _GOLDEN % 1.0 * self._usual_length)
         self._scale(is_reset, is_all=len(rows) == self.num_envs)
         if self._reward_scaling is not None:
             self._reward_scaling.begin(is_reset)

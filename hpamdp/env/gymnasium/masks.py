@@ -110,6 +110,9 @@ class Masks:
             if given is None and name == keys.OPTION_MASK:
                 masks[row] = True
                 continue
+            if given is None:
+                ignored = f"{_SETTINGS[name]}=ignore ignores it"
+                raise ProblemError(f"gave no {name}, which must come with every reset and step; {ignored}")
             masks[row] = self._flat(name, given, masks.shape[1])
         if not self._unread.keys().isdisjoint(info):
             self._refuse("info[{!r}]", info, ProblemError)

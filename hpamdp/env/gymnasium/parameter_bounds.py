@@ -82,7 +82,10 @@ class ParameterBounds:
         source = observation if self.in_observation else info
         given = {name: source.get(name) for name in self.names}
         if all(value is None for value in given.values()):
-            raise ProblemError(f"gave no {' or '.join(self.names)}, one of which must come with every reset and step")
+            raise ProblemError(
+                f"gave no {' or '.join(self.names)}, which must come with every reset and step; "
+                "env.parameter_bounds=ignore ignores bounds"
+            )
         lowest, highest = self._actions.own_low, self._actions.own_high
         low = self._read(keys.PARAMETER_LOW, given, lowest)
         high = self._read(keys.PARAMETER_HIGH, given, highest)

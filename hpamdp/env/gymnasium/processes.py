@@ -9,7 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
@@ -56,13 +56,15 @@ class ProcessCopies:
 
     def __init__(self, make: Maker, num: int, settings: GymnasiumOptions, flattens_pictures: bool = False) -> None:
         self._name = make.name
-        self._is_waiting = False  # or an error has ended the wait for an answer
+        self._is_waiting = False  # for an answer; it stays true if an error ends the wait
+        self._cause = "its workers were interrupted in the middle of a step; make a new one"
         self.envs: list[gymnasium.Env] = []
         probe = Copies(make, 1, settings, flattens_pictures)
-        probe.close()
+        with closing(probe):
+            self.usual_length = probe.usual_length
         self.example = probe.example
         self.max_steps, self.option_names = probe.max_steps, probe.option_names
-        self.first_info, self.usual_length = probe.first_info, probe.usual_length
+        self.first_info = probe.first_info
         self.has_pictures, self.pictures_per_second = probe.has_pictures, probe.pictures_per_second
         self.options, self.actions, self.observations = probe.options, probe.actions, probe.observations
         self.results = probe.results.changed(lambda array: np.zeros((num, *array.shape[1:]), array.dtype))
@@ -116,14 +118,15 @@ class ProcessCopies:
             ProblemError: a worker has died, or the wait for an earlier answer was interrupted.
         """
         if self._is_waiting:
-            raise ProblemError(f"{self._name}: its workers were interrupted in the middle of a step; make a new one")
+            raise ProblemError(f"{self._name}: {self._cause}")
         self._is_waiting = True
         try:
             for pipe, given in zip(self._pipes, arguments, strict=True):
                 pipe.send((method, given))
             answers = [pipe.recv() for pipe in self._pipes]
         except (EOFError, OSError) as error:
-            raise ProblemError(f"{self._name}: {self._death()}") from error
+            self._cause = self._death()
+            raise ProblemError(f"{self._name}: {self._cause}") from error
         self._is_waiting = False
         for answer in answers:
             if isinstance(answer, Exception):
@@ -137,7 +140,7 @@ class ProcessCopies:
         """Return which worker has died, and how."""
         for number, worker in enumerate(self._workers):
             worker.join(_PATIENCE_S / len(self._workers))
-            if worker.exitcode:
+            if worker.exitcode is not None:
                 return f"worker {number} of {len(self._workers)} died ({how_it_ended(worker.exitcode)})"
         return "a worker no longer answers"
 

@@ -165,14 +165,20 @@ class RDDLProblem(gymnasium.Env):
         """Return where learners begin with the numbers that are always set, float64 `[P]`; `P` is 0 if there are none.
 
         They begin at their default values, or in mid-range if random play around it has a higher mean return, by more
-        than two standard errors. The episodes that tell begin here, so the last one must be over.
+        than two standard errors, and no rule of the domain fails. The episodes that tell begin here, so the last one
+        must be over.
         """
         fluents = [] if self._num_choices else [fluent for fluent in self._by_name.values() if not fluent.values]
         if not fluents:
             return np.zeros(0)
         low, high = np.array([_bounds_of(fluent.space) for fluent in fluents]).T
         starts = [np.array([fluent.default for fluent in fluents], np.float64).clip(low, high), 0.5 * (low + high)]
-        returns = np.array([[self._trial(start, low, high, seed) for seed in range(NUM_TRIALS)] for start in starts])
+        try:
+            returns = np.array(
+                [[self._trial(start, low, high, seed) for seed in range(NUM_TRIALS)] for start in starts]
+            )
+        except Exception:  # of the simulator, whose rules cannot take every action
+            return starts[0]
         error = np.sqrt(returns.var(-1, ddof=1).sum() / NUM_TRIALS)
         return starts[int(returns[1].mean() - returns[0].mean() > 2.0 * error)]
 
