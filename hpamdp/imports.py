@@ -22,8 +22,8 @@ def collector_paused() -> Iterator[None]:
     try:
         yield
     finally:
-        # Few new objects are left to the collector. Counting those that somebody has frozen, which would be freed, too,
-        # takes a tenth of a second in a process that has frozen its imports.
+        # The collector searches a few new objects anyway. Objects that somebody has frozen would be freed, too, and to
+        # count them takes a tenth of a second in a process that has frozen its imports.
         if gc.get_count()[0] > _MANY and gc.get_freeze_count() == 0:
             gc.freeze()
             gc.unfreeze()  # moves all objects to the oldest generation, so that short collections leave them out

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
+from functools import cache
 from io import TextIOWrapper
 from typing import Any, TextIO, cast
 
@@ -121,6 +122,10 @@ def say(text: str) -> None:
 def warn(message: str) -> None:
     """Write one line to stderr, if it is still there. This works if logging is switched off."""
     _print(message, sys.stderr)
+
+
+warn_once = cache(warn)
+"""`warn`, once in a process for each message."""
 
 
 def _print(text: str, stream: TextIO) -> None:

@@ -139,7 +139,7 @@ def test_an_environment_that_ends_by_itself_needs_no_limit(monkeypatch, capsys):
     assert episode_length(GymnasiumEnv(make=lambda: Toy(length=8), observation_scaling="none")) == 3
 
 
-def test_where_pairs_or_all_actions_are_forbidden_no_episode_is_tried(monkeypatch):
+def test_where_all_actions_are_forbidden_no_episode_is_tried(monkeypatch):
     monkeypatch.setattr(Forbidding, "mask", [0, 0, 0])
     with pytest.raises(SettingError, match=r"has no time limit of its own; set env\.max_steps"):
         GymnasiumEnv(make=Forbidding, observation_scaling="none")

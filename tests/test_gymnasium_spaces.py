@@ -8,7 +8,7 @@ from gymnasium import spaces
 from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiDiscrete, OneOf, Sequence, Text, Tuple
 from toy_environments import FORMS, MIXED
 
-from hpamdp.env.gymnasium import action_parts
+from hpamdp import messages
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 from hpamdp.env.gymnasium.scaling import ObservationScaling
@@ -57,7 +57,7 @@ def native(space: ActionSpace, discrete: int, parameters) -> tuple:
     ids=str,
 )
 def test_entries_with_very_many_values_are_read_as_ordered_numbers_with_a_warning(space, sizes, dims, capsys):
-    action_parts._warn_once.cache_clear()
+    messages.warn_once.cache_clear()
     read = ActionSpace(space)
     assert sorted(read.component_sizes) == sorted(sizes) or not sizes
     assert sorted(read.parameter_dims) == sorted(dims)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,10 @@ from gymnasium import spaces
 
 from hpamdp.env.gymnasium.parameter_trees import NotAcceptedError, ParameterTree, by_row
 from hpamdp.env.gymnasium.values import MisfitError, as_numbers, children, parts_of
-from hpamdp.messages import warn
+from hpamdp.messages import warn_once
 
 # Discrete actions of one choice, each of which has outputs of networks. More are too many to learn one by one.
 MOST_VALUES = 1000
-_warn_once = cache(warn)
 # Lower and upper bounds in the current state, in the space's own numbers, float64 `[M, size]` each.
 Bounds = tuple[np.ndarray, np.ndarray]
 
@@ -223,7 +221,7 @@ class BoxComponent(Part):
 
     def __init__(self, space: spaces.Box | spaces.Discrete | spaces.MultiDiscrete) -> None:
         if not isinstance(space, spaces.Box):
-            _warn_once(f"action space: {space} has more than {MOST_VALUES:,} values, so it is an ordered parameter")
+            warn_once(f"action space: {space} has more than {MOST_VALUES:,} values, so it is an ordered parameter")
         self._tree = ParameterTree(space)
         self.trees = (self._tree,)
         self.parameter_dims = (self._tree.size,)

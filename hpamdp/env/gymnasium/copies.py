@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, NoReturn
 
 import gymnasium
@@ -22,7 +22,7 @@ from hpamdp.env.gymnasium.options import GymnasiumOptions
 from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds
 from hpamdp.env.gymnasium.time_limit import limit_of
 from hpamdp.env.gymnasium.values import flag
-from hpamdp.messages import warn
+from hpamdp.messages import warn_once
 from hpamdp.settings import SettingError
 
 # If an info has both entries, the first one counts.
@@ -34,7 +34,6 @@ _PICTURES_PER_SECOND = 4.0
 _TRIED_STEPS = 1_000
 # Then its episodes are truncated after so many steps.
 _MOST_STEPS = 10_000
-_warn_once = cache(warn)
 
 
 @dataclass(frozen=True)
@@ -175,19 +174,19 @@ class Copies:
         for step in range(1, _TRIED_STEPS + 1):
             allowed = {name: rows[0] for name, rows in self.results.masks.items()}
             mask = allowed.get(keys.ACTION_MASK, np.ones(len(actions.parameter_dims), bool))
-            parts = np.split(mask, np.cumsum(actions.component_sizes)[:-1]) if actions.component_sizes else [mask]
+            parts = np.split(mask, np.cumsum(actions.component_sizes[:-1], dtype=np.int64))
             options = allowed.get(keys.OPTION_MASK, np.ones(max(1, self.options.num_options), bool))
             if keys.PAIR_MASK in allowed or not all(part.any() for part in (*parts, options)):
                 break  # components drawn apart may be forbidden, or everything is
             chosen = np.array([rng.choice(np.flatnonzero(part)) for part in parts])
             option = np.full(num, rng.choice(np.flatnonzero(options))) if self.options.num_options else None
-            discrete = np.tile(chosen if actions.component_sizes else chosen[0], (num, 1) if len(parts) > 1 else num)
+            discrete = np.tile(chosen, (num, 1))
             parameters = np.tile(rng.uniform(actions.low, actions.high).astype(np.float32), (num, 1))
-            self.step([0], option, discrete, parameters)
+            self.step([0], option, discrete if actions.component_sizes else discrete[:, 0], parameters)
             terminated, truncated = self.results.flags[0, :2]
             if terminated:  # with other actions it may go on for longer
                 end = f"episodes are truncated after {_MOST_STEPS:,} steps"
-                _warn_once(f"{self._name}: names no time limit, so {end}; see env.max_steps")
+                warn_once(f"{self._name}: names no time limit, so {end}; see env.max_steps")
             if terminated or truncated:
                 return step
         raise SettingError(f"{self._name}: has no time limit of its own; set env.max_steps")
