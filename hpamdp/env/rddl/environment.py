@@ -34,10 +34,10 @@ class RDDLEnv(SimulatorEnv):
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
         """Return where numbers that are always set begin: `RDDLProblem.initial_numbers`."""
         rules = {name: getattr(self.options, name) for name in RDDLRules.model_fields}
-        numbers = RDDLProblem(**rules).initial_numbers()
-        if not len(numbers):
-            return None
         low, high = self._copies.actions.own_low, self._copies.actions.own_high
+        numbers = RDDLProblem(**rules).initial_numbers(low, high)
+        if numbers is None:
+            return None
         unit = torch.tensor(2.0 * (numbers - low) / (high - low) - 1.0, dtype=torch.float32)
         return torch.zeros(len(unit), self.observation_spec[keys.OBSERVATION].shape[-1], dtype=torch.float32), unit
 

@@ -7,7 +7,6 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import gymnasium
@@ -17,14 +16,13 @@ from gymnasium import spaces
 from hpamdp.complaints import no_such
 from hpamdp.env.gymnasium_checks import check_render_mode, reset_options
 from hpamdp.env.rddl.options import RDDLRules
-from hpamdp.messages import one_line, warn
+from hpamdp.messages import one_line, warn_once
 from hpamdp.settings import SettingError
 
 NUM_TRIALS = 4
 """Episodes that tell whether numbers begin at their default values or in mid-range."""
 
 _NONE = spaces.Box(0.0, 1.0, (0,), np.float32)
-_warn_once = cache(warn)
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,7 @@ class RDDLProblem(gymnasium.Env):
         self._has_mask = has_others and most == 1 and all(fluent.values for fluent in fluents)
         if has_others and not self._has_mask:
             cure = "; env.max_actions=1 makes masks of them" if all(fluent.values for fluent in fluents) else ""
-            _warn_once(f"{self._title}: the simulator does not enforce preconditions of several fluents{cure}")
+            warn_once(f"{self._title}: the simulator does not enforce preconditions of several fluents{cure}")
         state = spaces.Box(-np.inf, np.inf, (len(self.observation_names()),), np.float64)
         mask = spaces.MultiBinary(1 + len(self._settings))
         self.observation_space = spaces.Dict(state=state, action_mask=mask) if self._has_mask else state
@@ -161,17 +159,19 @@ class RDDLProblem(gymnasium.Env):
         names = [_name(fluent, value) for fluent in fluents for value in range(len(fluent.values))]
         return (*names, *(["numbers"] if any(not fluent.values for fluent in fluents) else []))
 
-    def initial_numbers(self) -> np.ndarray:
-        """Return where learners begin with the numbers that are always set, float64 `[P]`; `P` is 0 if there are none.
+    def initial_numbers(self, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
+        """Return where learners begin with the numbers that are always set, float64 `[P]`; None if no number is.
 
         They begin at their default values, or in mid-range if random play around it has a higher mean return, by more
         than two standard errors, and no rule of the domain fails. The episodes that tell begin here, so the last one
         must be over.
+
+        Args:
+            low, high: bounds of the numbers, `[P]`.
         """
         fluents = [] if self._num_choices else [fluent for fluent in self._by_name.values() if not fluent.values]
         if not fluents:
-            return np.zeros(0)
-        low, high = np.array([_bounds_of(fluent.space) for fluent in fluents]).T
+            return None
         starts = [np.array([fluent.default for fluent in fluents], np.float64).clip(low, high), 0.5 * (low + high)]
         try:
             returns = np.array(
@@ -287,12 +287,6 @@ def _space_of_number(low: float, high: float, *, is_whole: bool) -> spaces.Space
     if is_whole:
         return spaces.Discrete(int(high - low) + 1, start=int(low))
     return spaces.Box(low, high, (), np.float64)
-
-
-def _bounds_of(space: spaces.Discrete | spaces.Box) -> tuple[float, float]:
-    if isinstance(space, spaces.Box):
-        return float(space.low), float(space.high)
-    return float(space.start), float(space.start + space.n - 1)
 
 
 def _space_of_all(fluents: list[Fluent]) -> spaces.Dict:
