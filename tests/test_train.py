@@ -5,6 +5,7 @@ import itertools
 import json
 import os
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -164,6 +165,17 @@ def test_a_signal_in_the_batch_before_an_evaluation_leaves_it_to_the_resumed_run
         os.kill(os.getpid(), signal.SIGUSR1)
         with pytest.raises(KeyboardInterrupt), request.taken_at_once():
             pytest.fail("the evaluation began")
+
+
+def test_one_request_that_arrives_twice_does_not_interrupt_an_update(monkeypatch):
+    with stop_on_signals() as request:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)  # from make, to which the first one came too
+        assert request.signal == signal.SIGTERM
+        later = time.monotonic() + 2.0
+        monkeypatch.setattr(time, "monotonic", lambda: later)
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
 
 
 def test_an_evaluation_that_is_cut_off_leaves_the_film_of_the_one_before(monkeypatch):

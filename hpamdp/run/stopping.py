@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from hpamdp.messages import one_line
 # Ctrl-C, a cluster's stop, the warning of SLURM and others before the time limit, and a closed terminal.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGXCPU)
 _URGENT = (signal.SIGINT, signal.SIGTERM)
+_SAME_REQUEST_S = 1.0  # `timeout 60 make run` and some launchers deliver one signal twice
 
 
 class StopRequest:
@@ -25,6 +27,7 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
+        self._since = 0.0
         self._is_urgent = False
         StopRequest.latest = None
 
@@ -44,15 +47,16 @@ class StopRequest:
             self._is_urgent = False
 
     def note(self, number: int, frame: FrameType | None) -> None:
-        """Note the signal. A second Ctrl-C or SIGTERM interrupts at once.
+        """Note the signal. A second Ctrl-C or SIGTERM interrupts at once, unless it comes within the same second.
 
         Raises:
             KeyboardInterrupt: the signal is the second one, or came in a block of `taken_at_once`.
         """
-        is_first = self.signal is None
-        if is_first:
+        now = time.monotonic()
+        if self.signal is None:
             self.signal = StopRequest.latest = signal.Signals(number)
-        if self._is_urgent or (not is_first and number in _URGENT):
+            self._since = now
+        if self._is_urgent or (number in _URGENT and now - self._since > _SAME_REQUEST_S):
             self._is_urgent = False
             raise KeyboardInterrupt
 
