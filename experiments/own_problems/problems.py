@@ -365,8 +365,9 @@ TUNED: dict[str, type[OwnProblem]] = {
     "inventory": Inventory,
     "heating": Heating,
     "irrigation": Irrigation,
+    "vehicle": Vehicle,
 }
-HELD: dict[str, type[OwnProblem]] = {"queue": Queue, "vehicle": Vehicle}
+HELD: dict[str, type[OwnProblem]] = {"queue": Queue}
 PROBLEMS = TUNED | HELD
 EPISODES = 64
 EPISODE_SEEDS = tuple(range(900_000, 900_000 + EPISODES))  # of the fixed episodes on which all players are scored

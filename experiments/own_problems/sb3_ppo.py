@@ -5,7 +5,8 @@ python experiments/own_problems/sb3_ppo.py PROBLEM raw|normalised|informed SEED 
 
 The action is one Box: a score for each choice beside all numbers; the largest score chooses. `raw` has the defaults.
 `normalised` wraps the environment in VecNormalize, which scales observations and rewards. `informed` also has what
-hpamdp's defaults know of such problems: the time limit ends the episode, a discount of 0.997, and several copies.
+hpamdp's defaults know of such problems: the time limit ends the episode, a discount of 0.997, a lambda of 0.98, and
+several copies.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 GAMMA = 0.997
+GAE_LAMBDA = 0.98
 NUM_COPIES, STEPS = 8, 256  # as many steps in a batch as the defaults have
 
 
@@ -105,7 +107,7 @@ def main(problem: str, form: str, seed: int, file: Path, limit: float) -> None:
     settings = {}
     if form == "informed":
         copies = DummyVecEnv([lambda: Monitor(EndsAtLimit(Flat(PROBLEMS[problem]())))] * NUM_COPIES)
-        env, settings = VecNormalize(copies, gamma=GAMMA), {"gamma": GAMMA, "n_steps": STEPS}
+        env, settings = VecNormalize(copies, gamma=GAMMA), {"gamma": GAMMA, "gae_lambda": GAE_LAMBDA, "n_steps": STEPS}
     else:
         env = DummyVecEnv([lambda: Monitor(Flat(PROBLEMS[problem]()))])
         env = VecNormalize(env) if form == "normalised" else env
