@@ -360,6 +360,44 @@ class Vehicle(OwnProblem):
         return np.array([position, speed, max(800.0 - position, 0.0)], np.float32)
 
 
+class Pricing(OwnProblem):
+    """A shop's season of 90 days for one article: its price, a discount, or advertising, with a fraction or EUR.
+
+    State: stock, and the attention that the article has. Reward: EUR. Advertising pays later, by attention.
+    """
+
+    steps = 90
+    events = tuple((drift, factor) for drift in (-0.1, 0.1) for factor in (0.5, 1.0, 1.5))
+    grid = (np.linspace(0.0, 300.0, 61), np.linspace(0.0, 4.0, 17))
+    limits = (0.0, 0.6, 40.0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = Box(0.0, 300.0, (3,))
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return a full store and little attention."""
+        return float(rng.uniform(200.0, 300.0)), float(rng.uniform(0.0, 1.0))
+
+    @classmethod
+    def rules(cls, time, state, choice, amount, event):
+        """Return what is sold, less the cost of storing and advertising; what is left at the end is worth little."""
+        stock, attention = state
+        drift, factor = event
+        discount, spent = (amount if choice == kind else 0.0 * amount for kind in (1, 2))
+        sold = np.minimum(stock, (1.0 + attention) * factor * np.exp(2.5 * discount))
+        stock = stock - sold
+        reward = 20.0 * (1.0 - discount) * sold - 0.05 * stock - spent
+        if time == cls.steps - 1:
+            reward = reward + 2.0 * stock
+        return (stock, np.clip(0.95 * attention + 0.01 * spent + drift, 0.0, 4.0)), reward, stock <= 0.0
+
+    def observe(self) -> np.ndarray:
+        """Return stock, attention and day."""
+        return np.array([*self.state, self.time], np.float32)
+
+
 TUNED: dict[str, type[OwnProblem]] = {
     "battery": Battery,
     "inventory": Inventory,
@@ -367,7 +405,7 @@ TUNED: dict[str, type[OwnProblem]] = {
     "irrigation": Irrigation,
     "vehicle": Vehicle,
 }
-HELD: dict[str, type[OwnProblem]] = {"queue": Queue}
+HELD: dict[str, type[OwnProblem]] = {"queue": Queue, "pricing": Pricing}
 PROBLEMS = TUNED | HELD
 EPISODES = 64
 EPISODE_SEEDS = tuple(range(900_000, 900_000 + EPISODES))  # of the fixed episodes on which all players are scored

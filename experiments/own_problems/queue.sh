@@ -18,7 +18,7 @@ run() {  # run NAME PYTHON SCRIPT PROBLEM PLAYER SEED
 }
 
 for seed in "$@"; do
-    for problem in ${PROBLEMS:-queue irrigation vehicle battery inventory heating}; do
+    for problem in ${PROBLEMS:-queue pricing irrigation vehicle battery inventory heating}; do
         for learner in ${LEARNERS:-hppo pdqn hsac}; do
             run "${problem}_${learner}_$seed" "$hpamdp" hpamdp_learner.py "$problem" "$learner" "$seed"
         done
