@@ -1,6 +1,6 @@
 """Every learner in thirty action spaces: its actions lie inside, also after updates, or it refuses in one line.
 
-Each learner meets a fifth of the spaces, and the others with `-m slow`.
+Each learner meets a tenth of the spaces, and the others with `-m slow`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ LEARNERS = {
 
 
 PAIRS = [
-    pytest.param(tree, name, marks=() if (place + number) % 5 == 0 else pytest.mark.slow)
+    pytest.param(tree, name, marks=() if (place + number) % 10 == 0 else pytest.mark.slow)
     for place, tree in enumerate(TREES)
     for number, name in enumerate(LEARNERS)
 ]
