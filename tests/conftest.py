@@ -1,6 +1,8 @@
 """What the tests share."""
 
+import csv
 import gc
+import itertools
 import math
 import multiprocessing
 import os
@@ -9,11 +11,12 @@ import random
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -39,6 +42,7 @@ from hpamdp.data.human.released_file import HumanData
 from hpamdp.env.boatdock import harbour, planner
 from hpamdp.run import assemble
 from hpamdp.run.assemble import choose_selector
+from hpamdp.run.recorder import Recorder
 from hpamdp.run.state_file import StateFile
 
 # Tests that are started in the background or under nohup inherit ignored signals, and so would what they start.
@@ -80,6 +84,24 @@ def assert_same(one: object, other: object, where: str = "") -> None:
 
 def bytes_of(tensor: torch.Tensor) -> bytes:
     return tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of a run's metrics."""
+    with (folder / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def signal_after(number: int, sent: int = signal.SIGINT) -> AbstractContextManager[object]:
+    """Send this process a signal once this many batches have been learned from."""
+    take, batches = Recorder.take, itertools.count(1)
+
+    def watched(self, batch, scalars):
+        take(self, batch, scalars)
+        if next(batches) == number:
+            os.kill(os.getpid(), sent)
+
+    return mock.patch.object(Recorder, "take", watched)
 
 
 def parts_of(file: Path) -> dict[str, Any]:

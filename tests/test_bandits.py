@@ -121,21 +121,14 @@ def test_no_reward_is_logged_for_an_option_that_was_never_tried():
     assert make("ucb").learn(paid([1, 1], [-1.0, -2.0])) == {f"reward_{names[1]}": -1.5}
 
 
-def test_epsilon_falls_as_one_over_the_decisions_to_its_lower_bound():
+@pytest.mark.parametrize("at_once", [100, 10_000])
+def test_epsilon_falls_as_one_over_the_decisions_that_were_made_to_its_lower_bound(at_once):
     torch.manual_seed(0)
     bandit = make("epsilon_greedy", epsilon_scale=100.0, epsilon_final=0.05)
     bandit.learn(paid([0, 1] * 200, [1.0, 0.0] * 200))
+    chosen = torch.cat([bandit.select(due(at_once)) for _ in range(10_000 // at_once)])  # no reward in between
     # At decisions 401 to 10,400; with 2 options, half of the random choices are wrong.
     expected = sum(max(0.05, 100.0 / t) for t in range(401, 10_401)) / 2
-    assert bandit.select(due(10_000)).sum().item() == pytest.approx(expected, abs=4 * math.sqrt(expected))
-
-
-def test_the_clock_of_epsilon_greedy_counts_the_decisions_that_were_made():
-    torch.manual_seed(0)
-    bandit = make("epsilon_greedy", epsilon_scale=100.0, epsilon_final=0.0)
-    bandit.learn(paid([0, 1] * 200, [1.0, 0.0] * 200))
-    chosen = torch.cat([bandit.select(due(100)) for _ in range(100)])  # no reward is known in between
-    expected = sum(100.0 / t for t in range(401, 10_401)) / 2
     assert chosen.sum().item() == pytest.approx(expected, abs=4 * math.sqrt(expected))
     assert bandit.pending.tolist() == torch.bincount(chosen).tolist()
 

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import json
 import math
-import os
-import signal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from conftest import compose_config, make_config, parts_of
+from conftest import compose_config, make_config, parts_of, rows_of, signal_after
 from hydra.core.hydra_config import HydraConfig
 from test_folders import kill_at
 from toy_callbacks import Faulty
@@ -27,7 +24,6 @@ from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, OwnMetrics,
 from hpamdp.run.continuation import rest_of
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.players import load_agent
-from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import begin, run
 from hpamdp.run.trainer import Trainer
 
@@ -46,11 +42,6 @@ def train(*callbacks: Callback, words: list[str] = SMALL, folder: Path | None = 
     trainer.shows_progress = False
     trainer.train()
     return trainer
-
-
-def rows_of(folder: Path) -> list[dict[str, str]]:
-    with (folder / "metrics.csv").open() as file:
-        return list(csv.DictReader(file))
 
 
 def tensors_in(policy: Path) -> dict[str, torch.Tensor]:
@@ -299,23 +290,11 @@ def test_help_explains_the_settings_of_listed_callbacks(command):
 STOPPED_AT = 5  # batches
 
 
-def interrupt_at(batch: int, monkeypatch) -> None:
-    take, batches = Recorder.take, itertools.count(1)
-
-    def interrupted(self, *given):
-        take(self, *given)
-        if next(batches) == batch:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(Recorder, "take", interrupted)
-
-
 def test_a_resumed_run_counts_on_and_knows_its_best_agent(tmp_path, monkeypatch):
     words = [*PLATFORM, "env.max_steps=200", "total_frames=960", "save_best=true"]
     words += ["callbacks=[{name:patience,evaluations:4},recording]"]
     assert run(compose_config(words), tmp_path / "whole", words) == 0
-    with monkeypatch.context() as patch:
-        interrupt_at(STOPPED_AT, patch)
+    with signal_after(STOPPED_AT):
         assert run(compose_config(words), tmp_path / "stopped", words) == 130
     resumed = tmp_path / "resumed"
     again = [f"resume={tmp_path / 'stopped'}"]

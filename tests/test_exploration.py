@@ -484,17 +484,17 @@ def test_a_table_of_counts_is_saved_for_training_alone(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("low", "kind"), pairs(("pdqn", "held"), ("hppo", "novelty")))
-def test_a_run_with_exploration_resumes_to_the_last_bit(low, kind, tmp_path, monkeypatch):
+def test_a_run_with_exploration_resumes_to_the_last_bit(low, kind, tmp_path):
     given = ["high=ucb", f"low={low}", *SHORT.get(low, []), *SMALL, f"exploration={kind}"]
     given += ["exploration.epsilon=0.3", "exploration.epsilon_final=0.1"] if kind == "held" else []
-    stop_and_resume(given, tmp_path, monkeypatch, signal.SIGINT)
+    stop_and_resume(given, tmp_path, signal.SIGINT)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("low", "kind"), [("hppo", "held"), ("dlpa", "novelty")])
-def test_a_run_with_exploration_in_worker_processes_resumes_to_the_last_bit(low, kind, tmp_path, monkeypatch):
+def test_a_run_with_exploration_in_worker_processes_resumes_to_the_last_bit(low, kind, tmp_path):
     given = ["high=ucb", f"low={low}", *SHORT.get(low, []), *SMALL, f"exploration={kind}", "collector=multi"]
-    stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
+    stop_and_resume(given, tmp_path, signal.SIGTERM)
 
 
 # A reward that random actions do not reach. Without exploration each learner comes to rest, since steps cost something.

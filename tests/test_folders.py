@@ -1,18 +1,16 @@
 """A folder holds one run, whatever came before in it and whatever its logger does."""
 
-import itertools
 import json
 import math
-import os
 import signal
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import wandb
-from conftest import compose_config, make_config
+from conftest import compose_config, make_config, signal_after
 from test_metrics import without_login  # noqa: F401  (a fixture)
 
 from hpamdp.config.errors import ConfigError
@@ -362,18 +360,6 @@ def test_a_job_that_was_finished_by_hand_counts_as_finished_in_its_sweep(tmp_pat
     assert code == 0 and "1 job: 1 skipped, finished before\n" in out
 
 
-def after_batches(monkeypatch: pytest.MonkeyPatch, number: int, do: Callable[[], object]) -> None:
-    """Do something once this many batches have been learned from."""
-    take, batches = Recorder.take, itertools.count(1)
-
-    def watched(self, batch, scalars):
-        take(self, batch, scalars)
-        if next(batches) == number:
-            do()
-
-    monkeypatch.setattr(Recorder, "take", watched)
-
-
 def test_a_job_that_a_signal_stops_is_saved_before_its_launcher_gets_the_signal(tmp_path, command, monkeypatch):
     """As submitit does, whose handler requeues the job and exits."""
     found = []
@@ -385,8 +371,7 @@ def test_a_job_that_a_signal_stops_is_saved_before_its_launcher_gets_the_signal(
     before = signal.signal(signal.SIGUSR2, requeue)
     words = ["-m", *TINY, "film=false", "seed=0", "hydra.sweep.dir=sweep"]
     try:
-        with monkeypatch.context() as patch:
-            after_batches(patch, 2, lambda: os.kill(os.getpid(), signal.SIGUSR2))
+        with signal_after(2, signal.SIGUSR2):
             assert command(*words)[0] == 130
     finally:
         signal.signal(signal.SIGUSR2, before)

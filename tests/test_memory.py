@@ -402,12 +402,12 @@ def test_the_ratios_of_an_actors_sequences_are_one_before_an_update():
 
 
 @pytest.mark.parametrize("high", [pytest.param("actor", marks=pytest.mark.slow), "meta_critic"])
-def test_a_run_of_a_selector_with_a_recurrent_memory_resumes_to_the_last_bit(high, tmp_path, monkeypatch):
+def test_a_run_of_a_selector_with_a_recurrent_memory_resumes_to_the_last_bit(high, tmp_path):
     words = [
         *words_of(high, "random"), "env=rooms", "env.max_steps=12", "agent.termination=steps", "agent.option_length=2",
         "high.memory=gru", "high.memory_size=8",
     ]  # fmt: skip
-    stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)
+    stop_and_resume(words, tmp_path, signal.SIGINT)
 
 
 # In runs.
@@ -416,16 +416,16 @@ def test_a_run_of_a_selector_with_a_recurrent_memory_resumes_to_the_last_bit(hig
 @pytest.mark.parametrize(
     "low", ["pdqn", *(pytest.param(low, marks=pytest.mark.slow) for low in ("hppo", "hsac", "dlpa"))]
 )
-def test_a_run_with_a_recurrent_memory_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
+def test_a_run_with_a_recurrent_memory_resumes_to_the_last_bit(low, tmp_path):
     words = [*words_of("ucb", low), "low.memory=gru", "low.memory_size=8", "low.sequence_length=3"]
-    stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)
+    stop_and_resume(words, tmp_path, signal.SIGINT)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("more", [["collector=multi"], ["agent.sharing=shared"], ["low.memory=stack"]])
 @pytest.mark.parametrize("low", [*LEARNERS, "dlpa"])
-def test_other_runs_with_a_memory_resume_to_the_last_bit(low, more, tmp_path, monkeypatch):
-    stop_and_resume([*words_of("ucb", low), "low.memory=gru", *more], tmp_path, monkeypatch, signal.SIGTERM)
+def test_other_runs_with_a_memory_resume_to_the_last_bit(low, more, tmp_path):
+    stop_and_resume([*words_of("ucb", low), "low.memory=gru", *more], tmp_path, signal.SIGTERM)
 
 
 ENDING = list(itertools.product(LEARNERS, ["stack", "gru"], ["per_option", "shared"], ["steps", "learned"]))

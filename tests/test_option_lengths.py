@@ -274,15 +274,15 @@ def test_lengths_are_chosen_over_every_learner(high, low, sharing, tmp_path):
 @pytest.mark.parametrize(
     ("high", "low"), [("actor", "hppo"), pytest.param("meta_critic", "pdqn", marks=pytest.mark.slow)]
 )
-def test_a_run_that_chooses_lengths_resumes_to_the_last_bit(high, low, tmp_path, monkeypatch):
-    stop_and_resume([*words_of(high, low), *RESUMED], tmp_path, monkeypatch, signal.SIGINT)
+def test_a_run_that_chooses_lengths_resumes_to_the_last_bit(high, low, tmp_path):
+    stop_and_resume([*words_of(high, low), *RESUMED], tmp_path, signal.SIGINT)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ahead", [False, True])
-def test_workers_choose_lengths_and_resume_to_the_last_bit(ahead, quick_workers, tmp_path, monkeypatch):
+def test_workers_choose_lengths_and_resume_to_the_last_bit(ahead, quick_workers, tmp_path):
     given = [*words_of("meta_critic", "hppo"), *RESUMED, "collector=multi", f"collector.ahead={str(ahead).lower()}"]
-    stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
+    stop_and_resume(given, tmp_path, signal.SIGTERM)
 
 
 def test_an_agent_holds_options_for_the_chosen_steps_where_python_asks_step_by_step(tmp_path):

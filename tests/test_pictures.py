@@ -323,9 +323,9 @@ def test_a_picture_of_a_gymnasium_environment_is_refused_after_it_is_built():
 
 
 @pytest.mark.parametrize("low", ["pdqn", *(pytest.param(low, marks=pytest.mark.slow) for low in ("hppo", "hsac"))])
-def test_a_run_with_pictures_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
+def test_a_run_with_pictures_resumes_to_the_last_bit(low, tmp_path):
     small = ["num_envs=4", "steps_per_batch=4", "total_frames=160", "eval.layouts=2", "eval.every=0", "log_every=32"]
-    stop_and_resume([*CATCH, f"low={low}", *SHORT[low], *TINY, *small], tmp_path, monkeypatch, signal.SIGINT)
+    stop_and_resume([*CATCH, f"low={low}", *SHORT[low], *TINY, *small], tmp_path, signal.SIGINT)
 
 
 @pytest.mark.parametrize("high", ["actor", "meta_critic"])

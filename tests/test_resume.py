@@ -1,21 +1,17 @@
 """A resumed run is the run that was never stopped, to the last bit."""
 
-import csv
 import itertools
-import os
 import shutil
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from conftest import TRAINED, assert_same, compose_config, forked, parts_of
+from conftest import TRAINED, assert_same, compose_config, forked, parts_of, rows_of, signal_after
 from test_grid import SHORT, SHORT_SELECTORS
 
 import hpamdp
 from hpamdp.run import checkpoint
-from hpamdp.run.recorder import Recorder
 from hpamdp.run.stopping import STOP_SIGNALS
 from hpamdp.run.train import run
 
@@ -26,9 +22,8 @@ STOPPED_AFTER = 7  # batches, in the middle of a log interval
 SELECTORS = ("ucb", "linucb", "meta_critic", "actor", "exp3")
 
 
-def rows_of(folder: Path) -> list[dict[str, str]]:
-    with (folder / "metrics.csv").open() as file:
-        return [row | {"wall_s": "", "cpu_s": ""} for row in csv.DictReader(file)]
+def rows_without_times(folder: Path) -> list[dict[str, str]]:
+    return [row | {"wall_s": "", "cpu_s": ""} for row in rows_of(folder)]
 
 
 def parts_of_run(folder: Path) -> dict:
@@ -51,38 +46,23 @@ class Far(hpamdp.Callback):
             shutil.copytree(trainer.output_dir, trainer.output_dir.with_name("copy"))
 
 
-def stop_and_resume(
-    given: list[str], tmp_path: Path, monkeypatch, *numbers: int, on_resuming: tuple[str, ...] = ()
-) -> None:
+def stop_and_resume(given: list[str], tmp_path: Path, *numbers: int, on_resuming: tuple[str, ...] = ()) -> None:
     """Run once as a whole, and for each signal once with a resumption after it; assert that all are the same."""
     assert run(compose_config(given), tmp_path / "whole", given) == 0
     whole = parts_of_run(tmp_path / "whole")
     for number in numbers:
         stopped, resumed = tmp_path / f"stopped-{number}", tmp_path / f"resumed-{number}"
-        with monkeypatch.context() as patch:
-            patch.setattr(Recorder, "take", signalled(number))
+        with signal_after(STOPPED_AFTER, number):
             stop = kill if number == signal.SIGKILL else interrupt
             stop(given, stopped)
         words = [f"resume={stopped}", *on_resuming]
         torch.manual_seed(1234)  # nothing of another process's generators may matter
         assert run(compose_config(words), resumed, words) == 0
-        assert rows_of(resumed) == rows_of(tmp_path / "whole")
+        assert rows_without_times(resumed) == rows_without_times(tmp_path / "whole")
         parts = parts_of_run(resumed)
         for rng in (whole["rng"], parts["rng"]):
             rng.pop("python", None), rng.pop("numpy", None)  # which no part of a run uses
         assert_same(parts, whole)
-
-
-def signalled(number: int) -> Callable[..., None]:
-    """Return a `Recorder.take` that sends this process a signal after some batches."""
-    take, batches = Recorder.take, itertools.count(1)
-
-    def take_and_signal(self, batch, scalars):
-        take(self, batch, scalars)
-        if next(batches) == STOPPED_AFTER:
-            os.kill(os.getpid(), number)
-
-    return take_and_signal
 
 
 def interrupt(given: list[str], folder: Path) -> None:
@@ -101,24 +81,24 @@ def words_of(high: str, low: str) -> list[str]:
 
 # `test_every_pair_resumes_to_the_last_bit` has the others.
 @pytest.mark.parametrize(("high", "low"), [("meta_critic", "random"), ("ucb", "hppo")])
-def test_a_resumed_run_is_the_run_that_was_never_stopped(high, low, tmp_path, monkeypatch):
-    stop_and_resume([*words_of(high, low), EVALUATED], tmp_path, monkeypatch, signal.SIGINT)
+def test_a_resumed_run_is_the_run_that_was_never_stopped(high, low, tmp_path):
+    stop_and_resume([*words_of(high, low), EVALUATED], tmp_path, signal.SIGINT)
 
 
-def test_a_run_of_the_selector_alone_resumes_to_the_last_bit(tmp_path, monkeypatch):
-    stop_and_resume([*words_of("linucb", "random"), "low.freeze=true"], tmp_path, monkeypatch, signal.SIGINT)
+def test_a_run_of_the_selector_alone_resumes_to_the_last_bit(tmp_path):
+    stop_and_resume([*words_of("linucb", "random"), "low.freeze=true"], tmp_path, signal.SIGINT)
 
 
 @pytest.mark.slow
-def test_every_signal_that_stops_a_run_saves_it(tmp_path, monkeypatch):
-    stop_and_resume([*words_of("ucb", "random"), EVALUATED], tmp_path, monkeypatch, *STOP_SIGNALS)
+def test_every_signal_that_stops_a_run_saves_it(tmp_path):
+    stop_and_resume([*words_of("ucb", "random"), EVALUATED], tmp_path, *STOP_SIGNALS)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("high", "low"), list(itertools.product(SELECTORS, TRAINED)))
-def test_every_pair_resumes_to_the_last_bit(high, low, tmp_path, monkeypatch):
+def test_every_pair_resumes_to_the_last_bit(high, low, tmp_path):
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-    stop_and_resume([*words_of(high, low), EVALUATED], tmp_path, monkeypatch, *numbers)
+    stop_and_resume([*words_of(high, low), EVALUATED], tmp_path, *numbers)
 
 
 @pytest.mark.slow
@@ -132,27 +112,27 @@ def test_a_run_with_compiled_updates_resumes_to_the_last_bit(low, tmp_path, monk
         return in_this_process(*args, **kwargs)
 
     monkeypatch.setattr(torch, "compile", compile_afresh)
-    stop_and_resume([*words_of("ucb", low), "compile_updates=true"], tmp_path, monkeypatch, signal.SIGINT)
+    stop_and_resume([*words_of("ucb", low), "compile_updates=true"], tmp_path, signal.SIGINT)
 
 
-def test_a_killed_run_resumes_from_its_last_checkpoint_to_the_last_bit(tmp_path, monkeypatch):
-    stop_and_resume(words_of("ucb", "pdqn"), tmp_path, monkeypatch, signal.SIGKILL)
+def test_a_killed_run_resumes_from_its_last_checkpoint_to_the_last_bit(tmp_path):
+    stop_and_resume(words_of("ucb", "pdqn"), tmp_path, signal.SIGKILL)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("low", TRAINED)
-def test_a_run_with_worker_processes_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
-    stop_and_resume([*words_of("ucb", low), "collector=multi"], tmp_path, monkeypatch, signal.SIGTERM)
+def test_a_run_with_worker_processes_resumes_to_the_last_bit(low, tmp_path):
+    stop_and_resume([*words_of("ucb", low), "collector=multi"], tmp_path, signal.SIGTERM)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("high", SELECTORS)
-def test_a_killed_run_with_worker_processes_resumes_to_the_last_bit(high, tmp_path, monkeypatch):
-    stop_and_resume([*words_of(high, "hppo"), "collector=multi"], tmp_path, monkeypatch, signal.SIGKILL)
+def test_a_killed_run_with_worker_processes_resumes_to_the_last_bit(high, tmp_path):
+    stop_and_resume([*words_of(high, "hppo"), "collector=multi"], tmp_path, signal.SIGKILL)
 
 
 @pytest.mark.parametrize("collector", ["single", pytest.param("multi", marks=pytest.mark.slow)])
-def test_options_that_end_with_the_last_batch_before_a_stop_are_learned_from(collector, tmp_path, monkeypatch):
+def test_options_that_end_with_the_last_batch_before_a_stop_are_learned_from(collector, tmp_path):
     given = [
         *words_of("meta_critic", "random"),
         "agent.termination=learned",
@@ -161,13 +141,13 @@ def test_options_that_end_with_the_last_batch_before_a_stop_are_learned_from(col
     ]
     given[given.index("steps_per_batch=4")] = "steps_per_batch=1"
     given[given.index("total_frames=320")] = "total_frames=96"
-    stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
+    stop_and_resume(given, tmp_path, signal.SIGTERM)
 
 
 @pytest.mark.parametrize("env", [pytest.param("platform", marks=pytest.mark.slow), "boatdock_released"])
-def test_other_problems_resume_to_the_last_bit(env, tmp_path, monkeypatch):
+def test_other_problems_resume_to_the_last_bit(env, tmp_path):
     given = [*words_of("none", "pdqn"), f"env={env}", "env.max_steps=12"]
-    stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM)
+    stop_and_resume(given, tmp_path, signal.SIGTERM)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +158,7 @@ def test_several_components_resume_to_the_last_bit(low, collector, tmp_path, mon
     monkeypatch.syspath_prepend(Path(__file__).resolve().parents[1] / "examples" / "spaces")
     given = [*words_of("none", low), "low.autoregressive=true", "env=gymnasium", "env.entry_point=shop:Tour"]
     given += ["env.max_steps=1", "env.pair_mask=info", f"collector={collector}"]
-    stop_and_resume(given, tmp_path, monkeypatch, signal.SIGTERM, on_resuming=("trust=true",))
+    stop_and_resume(given, tmp_path, signal.SIGTERM, on_resuming=("trust=true",))
 
 
 def test_a_run_goes_on_past_the_largest_int32_of_steps_and_episodes_and_resumes_there(tmp_path):

@@ -279,8 +279,8 @@ TWO_BOATS = ["env.boats=2", "high=value", "high.untried_first=true", "agent.shar
     "words",
     [pytest.param([], id="one boat"), pytest.param(TWO_BOATS, id="two boats", marks=pytest.mark.slow)],
 )
-def test_a_run_that_remembers_directions_resumes_to_the_last_bit(words, tmp_path, monkeypatch):
-    stop_and_resume([*RUN, *words], tmp_path, monkeypatch, signal.SIGINT)
+def test_a_run_that_remembers_directions_resumes_to_the_last_bit(words, tmp_path):
+    stop_and_resume([*RUN, *words], tmp_path, signal.SIGINT)
 
 
 QUIET = {

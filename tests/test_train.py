@@ -1,6 +1,5 @@
 """A run from start to end: what it leaves behind, that it can be stopped, resumed and scored again."""
 
-import csv
 import itertools
 import json
 import os
@@ -10,7 +9,7 @@ import time
 import numpy as np
 import pytest
 import torch
-from conftest import compose_config, make_config
+from conftest import compose_config, make_config, rows_of, signal_after
 from PIL import Image
 
 from hpamdp.config.errors import ConfigError
@@ -22,7 +21,6 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.evaluate import Evaluation
-from hpamdp.run.recorder import Recorder
 from hpamdp.run.stopping import stop_on_signals
 from hpamdp.run.train import run
 
@@ -33,11 +31,6 @@ PICTURES = {"learning_curves.png", "trajectories.png", "choices.png"}
 
 def start(output_dir, *overrides):
     return run(compose_config([*SMALL, *overrides]), output_dir, list(overrides))
-
-
-def rows_of(folder):
-    with (folder / "metrics.csv").open() as file:
-        return list(csv.DictReader(file))
 
 
 def test_a_run_leaves_numbers_pictures_and_a_closing_table(tmp_path, capsys, with_figures):
@@ -112,16 +105,9 @@ def test_training_ends_at_the_first_evaluation_that_reaches_the_stop_score(tmp_p
         assert json.loads((tmp_path / name / "summary.json").read_text())["frames"] == frames
 
 
-def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, capsys, monkeypatch):
-    take, batches = Recorder.take, itertools.count(1)
-
-    def interrupted(self, batch, scalars):
-        take(self, batch, scalars)
-        if next(batches) == 5:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(Recorder, "take", interrupted)
-    assert start(tmp_path / "stopped", "low=random", "total_frames=100_000_000", "eval.every=0") == 130
+def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, capsys):
+    with signal_after(5):
+        assert start(tmp_path / "stopped", "low=random", "total_frames=100_000_000", "eval.every=0") == 130
     printed = capsys.readouterr().out
     assert f"resume={tmp_path / 'stopped'}" in printed
     stopped = json.loads((tmp_path / "stopped" / "summary.json").read_text())

@@ -401,9 +401,9 @@ def test_the_bounds_of_a_session_equal_those_by_hand():
 
 
 @pytest.mark.parametrize("high", ["ucb", pytest.param("thompson", marks=pytest.mark.slow)])
-def test_a_run_with_a_session_bandit_resumes_to_the_last_bit(high, tmp_path, monkeypatch):
+def test_a_run_with_a_session_bandit_resumes_to_the_last_bit(high, tmp_path):
     words = [*words_of(high, "random"), f"env={choosing_class('env', HiddenOption)}", "high.memory=session"]
-    stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)
+    stop_and_resume(words, tmp_path, signal.SIGINT)
 
 
 # Values of options.
