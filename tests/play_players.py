@@ -45,14 +45,7 @@ def sailed(start, goal, directions, events, *, strength=1.0, glide=1.0, shortest
 
 def recorded(*, index=0, player=PLAYER):
     """Return what every line of a file has."""
-    return {
-        "format": 1,
-        "software": "0.2.0",
-        "consent": True,
-        "player": player,
-        "index": index,
-        "resolution": 1e-4,
-    }
+    return {"format": 1, "software": "0.2.0", "consent": True, "player": player, "index": index, "resolution": 1e-4}
 
 
 def played(start, goal, controller, events, *, keymap=1, index=0, player=PLAYER, mode="round"):

@@ -5,14 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from released_players import (
-    FUEL,
-    IDLE,
-    X,
-    Y,
-    one,
-    press,
-)
+from released_players import FUEL, IDLE, X, Y, one, press
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 

@@ -21,11 +21,7 @@ EXPLORER = Path(__file__).parents[1] / "experiments/generalisation/explorer.py"
 def explorer_for(env: UnseenBoatsEnv) -> Any:
     options = env.options
     return load_script(EXPLORER).Explorer(
-        env.num_envs,
-        options.fleet,
-        num_boats=options.boats,
-        trips=options.trips,
-        shortest_press=options.shortest_press,
+        env.num_envs, options.fleet, num_boats=options.boats, trips=options.trips, shortest_press=options.shortest_press
     )
 
 

@@ -57,11 +57,7 @@ def dock(layout, does, tried, shortest):
     return sailed(layout["start"], layout["goal"], does["directions"], events, **unlike, shortest=shortest, longest=2.0)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{}, {"family": "strength", "boats": 2}],
-    ids=str,
-)
+@pytest.mark.parametrize("settings", [{}, {"family": "strength", "boats": 2}], ids=str)
 def test_a_session_that_was_sailed_is_accepted(settings):
     page = page_of(**settings)
     made = json.loads(json.dumps(play(page)))

@@ -157,10 +157,7 @@ def test_metrics_of_ones_own_are_columns_of_every_row_and_part_of_the_summary(tm
 
 
 @pytest.mark.parametrize(
-    ("returned", "complaint"),
-    [
-        ({"x": math.nan}, "OwnMetrics.metrics: x=nan: must be a finite number"),
-    ],
+    ("returned", "complaint"), [({"x": math.nan}, "OwnMetrics.metrics: x=nan: must be a finite number")]
 )
 def test_a_metric_that_is_no_number_is_told_in_one_line_after_training_was_saved(returned, complaint, tmp_path):
     own = OwnMetrics(lambda trainer: returned if trainer.frames == 64 else {})

@@ -130,8 +130,7 @@ def test_what_was_learned_reaches_the_workers_before_their_next_batch(workers):
 
 
 @pytest.mark.parametrize(
-    "low",
-    [pytest.param(low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow]) for low in TRAINED],
+    "low", [pytest.param(low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow]) for low in TRAINED]
 )
 def test_a_copy_takes_all_that_a_policy_acts_by(low):
     warmup = ["low.warmup_steps=8"] if low in ("hyar", "hsac", "iql", "pdqn", "qpamdp", "td3_bc") else []

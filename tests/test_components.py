@@ -84,10 +84,7 @@ def test_of_several_components_each_is_chosen_by_its_own_values():
     best = PAIR.best(values)
     assert best.tolist() == [[1, 2], [0, 0]]
     assert PAIR.of_choice(values, best).tolist() == [[1.0, 6.0], [2.0, 7.0]]
-    assert PAIR.is_chosen(best).tolist() == [
-        [False, True, False, False, True],
-        [True, False, True, False, False],
-    ]
+    assert PAIR.is_chosen(best).tolist() == [[False, True, False, False, True], [True, False, True, False, False]]
     log_probs = PAIR.log_softmax(values)
     torch.testing.assert_close(log_probs[:, :2].exp().sum(-1), torch.ones(2))
     torch.testing.assert_close(log_probs[:, 2:].exp().sum(-1), torch.ones(2))

@@ -6,15 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
-from torchrl.envs import (
-    Compose,
-    EnvBase,
-    FrameSkipTransform,
-    MultiAction,
-    SerialEnv,
-    StepCounter,
-    TransformedEnv,
-)
+from torchrl.envs import Compose, EnvBase, FrameSkipTransform, MultiAction, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.transforms import MacroPrimitiveTransform
 from torchrl.envs.utils import step_mdp
 

@@ -124,10 +124,7 @@ BAD_ACTIONS = {
     "no such option": {**GOOD, "option": 2},
     "no key": {"option": 1, "duration": GOOD["duration"]},
 }
-BAD_TUPLES = {
-    "too short": (1, (0.1, 0.1, 0.1)),
-    "flat": (1, 1, np.full(3, 0.1)),
-}
+BAD_TUPLES = {"too short": (1, (0.1, 0.1, 0.1)), "flat": (1, 1, np.full(3, 0.1))}
 
 
 @pytest.mark.parametrize(

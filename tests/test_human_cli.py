@@ -113,11 +113,7 @@ def test_options_that_an_export_would_ignore_are_refused(capsys, people_file, tm
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["check", "none.mat"], "there is no such file"),
-        (["download"], "required: --url"),
-    ],
+    ("arguments", "message"), [(["check", "none.mat"], "there is no such file"), (["download"], "required: --url")]
 )
 def test_usage_errors_are_one_line(capsys, arguments, message):
     assert message in error_of(capsys, *arguments)

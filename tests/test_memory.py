@@ -27,13 +27,7 @@ from hpamdp.policies.low_level.hppo import HPPO
 from hpamdp.policies.low_level.hsac import HSAC
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.policies.shared.replay import ReplayLearner
-from hpamdp.policies.shared.sequences import (
-    HistoryLinks,
-    ancestors,
-    sample_with_past,
-    sequence_starts,
-    states_of_past,
-)
+from hpamdp.policies.shared.sequences import HistoryLinks, ancestors, sample_with_past, sequence_starts, states_of_past
 from hpamdp.run.train import run
 from hpamdp.specs import PAMDPSpecs
 

@@ -307,13 +307,7 @@ def test_with_a_chosen_goal_the_agent_takes_that_first(option, first):
     assert reward.item() == -1.0 and after.coffee.item() == after.mail.item() == 0
 
 
-@pytest.mark.parametrize(
-    ("has", "is_open"),
-    [
-        ((0, 0), (True, True, False)),
-        ((1, 1), (False, False, True)),
-    ],
-)
+@pytest.mark.parametrize(("has", "is_open"), [((0, 0), (True, True, False)), ((1, 1), (False, False, True))])
 def test_the_mask_of_options_says_which_goals_are_open(has, is_open):
     env = OfficeEnv(1, chooses_goal=True)
     env.reset()

@@ -478,10 +478,7 @@ def test_in_greedy_plans_single_members_choose_the_sequences_that_all_refine(num
         found = learner.policy.plan(torch.randn(num_states, 4))
     assert [len(part) for part in found] == [num_states] * 3
     of_single = -(-num_states // 3) * 3
-    assert rows == [
-        *(of_single * num * 24 for num in (3, 9)),
-        *(num_states * 3 * num * 24 for num in (3, 3, 1, 1)),
-    ]
+    assert rows == [*(of_single * num * 24 for num in (3, 9)), *(num_states * 3 * num * 24 for num in (3, 3, 1, 1))]
 
 
 def test_nothing_is_planned_before_the_first_update_or_for_finished_episodes(monkeypatch):

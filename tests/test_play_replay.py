@@ -238,12 +238,7 @@ def test_the_layouts_of_the_page_are_those_of_no_evaluation_and_follow_the_rules
     assert BoatPage(seed=1).data([], has_server=False)["layouts"] != page_data["layouts"]
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"slip": 0.1}, "env.slip=0.1, but the page has 0.0"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "said"), [({"slip": 0.1}, "env.slip=0.1, but the page has 0.0")])
 def test_an_agent_of_other_rules_is_refused(settings, said):
     entry = {"name": "other", "title": "a", "score": None, "env": settings, "agent": {}}
     with pytest.raises(EpisodeError, match=f"^other: was trained with {re.escape(said)}$"):

@@ -53,11 +53,7 @@ def module():
 @pytest.fixture
 def experiments(tmp_path):
     """Make a folder of studies: one that works, one that fails, and a page without a study."""
-    pages = {
-        "fine": PAGE,
-        "sad": "# Sad\n\n<!-- table -->\n| kept |\n<!-- /table -->\n",
-        "no_study": "# No study\n",
-    }
+    pages = {"fine": PAGE, "sad": "# Sad\n\n<!-- table -->\n| kept |\n<!-- /table -->\n", "no_study": "# No study\n"}
     scripts = {"fine": STUDY, "sad": "def main(folders):\n    open('nowhere.csv')\n"}
     root = tmp_path / "experiments"
     for name, page in pages.items():

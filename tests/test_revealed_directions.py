@@ -276,8 +276,7 @@ TWO_BOATS = ["env.boats=2", "high=value", "high.untried_first=true", "agent.shar
 
 
 @pytest.mark.parametrize(
-    "words",
-    [pytest.param([], id="one boat"), pytest.param(TWO_BOATS, id="two boats", marks=pytest.mark.slow)],
+    "words", [pytest.param([], id="one boat"), pytest.param(TWO_BOATS, id="two boats", marks=pytest.mark.slow)]
 )
 def test_a_run_that_remembers_directions_resumes_to_the_last_bit(words, tmp_path):
     stop_and_resume([*RUN, *words], tmp_path, signal.SIGINT)

@@ -188,10 +188,7 @@ def test_play_accepts_a_guarded_setting_if_repeated_or_if_the_file_is_trusted(co
     ("words", "line"),
     [
         (["env.slip=abc"], 'env.slip="abc": must be a valid number (BoatDockEnv)'),
-        (
-            ["env=platform"],
-            "high=linucb: env=platform has no options to choose; use high=none",
-        ),
+        (["env=platform"], "high=linucb: env=platform has no options to choose; use high=none"),
     ],
 )
 def test_a_wrong_word_for_a_saved_agent_is_told(words, line, command):

@@ -49,11 +49,7 @@ def test_a_text_outside_the_grammar_is_printed_as_it_must_be_typed(command):
 
 
 @pytest.mark.parametrize(
-    ("started_as", "told"),
-    [
-        ("run.py", "python run.py"),
-        ("my clone/run.py", "python 'my clone/run.py'"),
-    ],
+    ("started_as", "told"), [("run.py", "python run.py"), ("my clone/run.py", "python 'my clone/run.py'")]
 )
 def test_the_program_is_named_as_it_was_started(command, monkeypatch, capsys, started_as, told):
     monkeypatch.setattr(sys, "argv", [started_as, "--help"])

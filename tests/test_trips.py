@@ -100,11 +100,7 @@ def test_without_a_choice_a_session_is_one_history():
 
 # Values.
 
-REPLAY = {
-    "pdqn": (PDQN, {}),
-    "hsac": (HSAC, {}),
-    "hyar": (HyAR, {}),
-}
+REPLAY = {"pdqn": (PDQN, {}), "hsac": (HSAC, {}), "hyar": (HyAR, {})}
 PLANNING = {"pets": PETS, "dlpa": DLPA}
 # Of the four steps of a session: the discount of what follows.
 DISCOUNTS = {"session": [GAMMA, GAMMA, GAMMA, 0.0], "trip": [GAMMA, 0.0, GAMMA, 0.0]}

@@ -52,8 +52,7 @@ class Run:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [low for low in choices("low") if low not in ("random", "planner") and not low.endswith("_published")],
+    "name", [low for low in choices("low") if low not in ("random", "planner") and not low.endswith("_published")]
 )
 def test_every_learner_has_a_space_of_allowed_values_around_its_defaults(name):
     space = parsed_space(space_of_learner(name, []))
