@@ -169,17 +169,12 @@ CHANGED = made(["congruent", "incongruent1", "sideways"], 0.15, SIDEWAYS)
 FREELY_CHANGED = made(["congruent", "incongruent1", "sideways"], 0.0, SIDEWAYS)
 
 
-@pytest.mark.parametrize(
-    ("rules", "held"),
-    [(CHANGED, None), pytest.param(FREELY_CHANGED, None, marks=pytest.mark.slow), (made(), 0), (made(), 1)],
-    ids=["changed", "changed freely", "incongruent", "congruent"],
-)
-def test_an_evolutionary_search_over_presses_and_boats_never_beats_the_planner(rules, held):
+@pytest.mark.parametrize("rules", [CHANGED, pytest.param(FREELY_CHANGED, marks=pytest.mark.slow)])
+def test_an_evolutionary_search_over_presses_and_boats_never_beats_the_planner(rules):
     num, samples, elite, children, num_presses = 25, 4000, 30, 8, 3
     layout = harbour.fixed_layouts(num, seed=3)
     generator = torch.Generator().manual_seed(num_presses)
-    best = planner.best_scores(rules, layout, torch.ones(num, dtype=torch.int32))
-    best = best.amax(1) if held is None else best[:, held]
+    best = planner.best_scores(rules, layout, torch.ones(num, dtype=torch.int32)).amax(1)
 
     def rand(*shape):
         return torch.rand(*shape, generator=generator)
@@ -203,8 +198,6 @@ def test_an_evolutionary_search_over_presses_and_boats_never_beats_the_planner(r
         return harbour.score(flat.outcome, flat.fuel / physics.TANK).reshape(shape)
 
     boats, pressed = (torch.randint(3, (num, samples, num_presses), generator=generator) for _ in range(2))
-    if held is not None:
-        boats = torch.full_like(boats, held)
     durations = physics.press_for(rand(num, samples, num_presses) * rand(num, samples, 1) * 230.0)
     score, kept = score_of(boats, pressed, durations).topk(elite, dim=1)
     boats, pressed, durations = (field.take_along_dim(kept[..., None], 1) for field in (boats, pressed, durations))
@@ -218,7 +211,7 @@ def test_an_evolutionary_search_over_presses_and_boats_never_beats_the_planner(r
         score = torch.maximum(score, best_found)
     excess = score.amax(1) - best
     assert excess.max() < 2e-3
-    assert excess.median() > (-0.05 if held is None else -0.01)  # a fair opponent
+    assert excess.median() > -0.05  # a fair opponent
 
 
 def test_gymnasium_has_the_boats_and_their_changes():

@@ -156,14 +156,11 @@ def test_metrics_of_ones_own_are_columns_of_every_row_and_part_of_the_summary(tm
     assert json.loads((folder / "summary.json").read_text())["own/frames"] == 128.0
 
 
-@pytest.mark.parametrize(
-    ("returned", "complaint"), [({"x": math.nan}, "OwnMetrics.metrics: x=nan: must be a finite number")]
-)
-def test_a_metric_that_is_no_number_is_told_in_one_line_after_training_was_saved(returned, complaint, tmp_path):
-    own = OwnMetrics(lambda trainer: returned if trainer.frames == 64 else {})
+def test_a_metric_that_is_no_number_is_told_in_one_line_after_training_was_saved(tmp_path):
+    own = OwnMetrics(lambda trainer: {"x": math.nan} if trainer.frames == 64 else {})
     with pytest.raises(CallbackError) as error:
         train(own, folder=tmp_path / "run")
-    assert complaint in str(error.value)
+    assert "OwnMetrics.metrics: x=nan: must be a finite number" in str(error.value)
     assert checkpoint.progress_of(tmp_path / "run/checkpoint.safetensors")["frames"] == 64
 
 

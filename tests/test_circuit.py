@@ -386,7 +386,7 @@ def test_no_circuit_found_by_another_search_beats_the_compilers(name):
     best = compiler.best(states(2, 2), gate_set).score
     for target, score in zip(states(2, 2), best, strict=True):
         found = -1.0
-        for _ in range(15):
+        for _ in range(8):
             numbers = rng.integers(len(gate_set) - 1, size=rng.integers(1, 9))
             cost = sum(gate_set[number].cost for number in numbers)
 

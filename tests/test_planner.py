@@ -1,4 +1,7 @@
-"""The planner's plans reach their scores in the simulator, and no plan found by other means beats them."""
+"""The planner's plans reach their scores in the simulator.
+
+That no plan found by other means beats them is shown in test_boats and test_boatdock_unseen_planner.
+"""
 
 from __future__ import annotations
 

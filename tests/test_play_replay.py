@@ -2,7 +2,6 @@
 
 import json
 import random
-import re
 import shutil
 import subprocess
 
@@ -238,8 +237,7 @@ def test_the_layouts_of_the_page_are_those_of_no_evaluation_and_follow_the_rules
     assert BoatPage(seed=1).data([], has_server=False)["layouts"] != page_data["layouts"]
 
 
-@pytest.mark.parametrize(("settings", "said"), [({"slip": 0.1}, "env.slip=0.1, but the page has 0.0")])
-def test_an_agent_of_other_rules_is_refused(settings, said):
-    entry = {"name": "other", "title": "a", "score": None, "env": settings, "agent": {}}
-    with pytest.raises(EpisodeError, match=f"^other: was trained with {re.escape(said)}$"):
+def test_an_agent_of_other_rules_is_refused():
+    entry = {"name": "other", "title": "a", "score": None, "env": {"slip": 0.1}, "agent": {}}
+    with pytest.raises(EpisodeError, match=r"^other: was trained with env\.slip=0\.1, but the page has 0\.0$"):
         BoatPage(seed=0).data([entry], has_server=True)

@@ -44,14 +44,8 @@ def leave_run(folder, low="hppo", seed=0, scores=(-0.9, 1.5, 2.5), high="none", 
     """Write what a finished run leaves behind, as far as studies read it."""
     folder.mkdir(parents=True, exist_ok=True)
     summary = {"low": low, "env": "boatdock", "controller": "congruent", "seed": seed, "score": scores[-1]}
-    summary |= {
-        "high": high,
-        "finished": finished,
-        "success": 0.9,
-        "ceiling": 3.4,
-        "references": {"random": {"score": -0.9}},
-    }
-    summary |= {"frames": 100 * (len(scores) - 1), "wall_s": 2.04, "cpu_s": 1.0}
+    summary |= {"high": high, "finished": finished, "success": 0.9, "references": {"random": {"score": -0.9}}}
+    summary |= {"frames": 100 * (len(scores) - 1), "ceiling": 3.4, "wall_s": 2.04, "cpu_s": 1.0}
     (folder / "summary.json").write_text(json.dumps(summary))
     (folder / "config.yaml").write_text(
         CONFIG.format(**{"twin": "true", "multipass": "true", "reward": "paper", "stop_score": "null"} | config)
@@ -112,27 +106,20 @@ def test_the_spread_is_the_deviation_of_a_sample_and_of_one_seed_there_is_none()
     assert spread([1.25], digits=1) == "1.2"
 
 
-def test_the_interquartile_mean_ignores_the_outer_quarters():
+def test_the_interquartile_mean_ignores_the_outer_quarters_and_is_shown_from_ten_seeds_on():
     middle, low, high = interquartile_mean([-100.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 100.0])
     assert middle == 3.5 and low < 3.5 < high
     assert interquartile_mean([1.0, 5.0, 9.0])[0] == 5.0  # a quarter of three seeds is none
+    for values in ([2.0], [2.0, 2.0, 2.0]):
+        middle, low, high = interquartile_mean(values)
+        assert middle == 2.0 and np.isnan([low, high]).all()
+    assert middle_half([1.0, 2.0, 3.0, 4.0] * 2) == "" and middle_half([1.0] * 10) == "1.000"
 
 
 def test_the_interval_covers_the_truth_about_as_often_as_it_says():
     draws = np.random.default_rng(0).normal(size=(60, 20))
     covers = [low <= 0.0 <= high for _, low, high in map(interquartile_mean, draws)]
     assert 0.83 < np.mean(covers) <= 1.0
-
-
-@pytest.mark.parametrize("values", [[2.0], [2.0, 2.0, 2.0]])
-def test_seeds_that_do_not_vary_have_an_interquartile_mean_without_an_interval(values):
-    middle, low, high = interquartile_mean(values)
-    assert middle == 2.0 and np.isnan([low, high]).all()
-
-
-def test_an_interquartile_mean_is_shown_from_ten_seeds_on():
-    assert middle_half([1.0, 2.0, 3.0, 4.0] * 2) == ""
-    assert middle_half([1.0] * 10) == "1.000"
 
 
 def test_a_difference_is_clear_where_its_interval_excludes_0():
@@ -154,16 +141,13 @@ def test_a_difference_counts_a_seed_that_failed_with_few_seeds_and_with_many():
         assert found.mean == pytest.approx(0.1 - 1.0 / num) and not found.is_clear
 
 
-def test_the_interval_of_a_difference_covers_the_truth_about_as_often_as_it_says():
-    generator = np.random.default_rng(0)
-    for num, repeats, least in ((3, 400, 0.93), (5, 400, 0.93), (12, 400, 0.93)):
-        pairs = [difference(generator.normal(size=num), generator.normal(size=num)) for _ in range(repeats)]
-        assert least <= np.mean([not pair.is_clear for pair in pairs]) <= 1.0
-
-
-def test_the_interval_of_a_mean_covers_the_truth_as_often_as_it_says():
+def test_intervals_of_means_and_of_differences_cover_the_truth_about_as_often_as_they_say():
     draws = np.random.default_rng(0).normal(size=(1000, 3))
     assert np.mean([low <= 0.0 <= high for low, high in map(mean_interval, draws)]) == pytest.approx(0.95, abs=0.02)
+    generator = np.random.default_rng(0)
+    for num in (3, 5, 12):
+        pairs = [difference(generator.normal(size=num), generator.normal(size=num)) for _ in range(400)]
+        assert 0.93 <= np.mean([not pair.is_clear for pair in pairs]) <= 1.0
 
 
 def test_seeds_that_do_not_vary_have_no_interval_and_no_clear_difference():
@@ -266,8 +250,9 @@ def test_a_cell_stands_with_the_seeds_of_the_protocol_once_all_planned_ones_have
     assert [row["seed"] for row in standing(pdqn="100-101", hyar="100-101")] == [100, 101, 3]
     assert [row["seed"] for row in standing(hyar="100-101")] == [0, 3], "seeds that nothing plans"
     table = domains.table(standing(pdqn="100-101"), [], [])
-    assert "| 0.700 ± 0.141 (2) |" in table
-    assert "| 0.700 (1†) |" in table
+    assert "| 0.700 ± 0.141 (2) |" in table and "| 0.700 (1†) |" in table
+    (tmp_path / "cells.csv").unlink()
+    assert [row["seed"] for row in standing_rows(csv_file)] == [0, 100, 101, 3], "without a plan all stand"
 
 
 def _row(learner, seed):
@@ -279,11 +264,6 @@ def _cell(learner, seeds):
     return {"domain": "goal", "learner": learner, "seeds": seeds}
 
 
-def test_a_file_of_runs_without_a_plan_beside_it_stands_as_it_is(tmp_path):
-    write_tables(tmp_path, {"results": [_row("pdqn", 0), _row("pdqn", 100)]})
-    assert [row["seed"] for row in standing_rows(tmp_path / "results.csv")] == [0, 100]
-
-
 @pytest.mark.parametrize("plan", sorted(EXPERIMENTS.glob("*/cells.csv")), ids=lambda plan: plan.parent.name)
 def test_every_stored_run_of_the_protocol_is_planned(plan):
     """Tables would leave it out without a word."""
@@ -293,19 +273,14 @@ def test_every_stored_run_of_the_protocol_is_planned(plan):
             assert row["seed"] in planned.get(tuple(row[name] for name in names), ()), row
 
 
-def test_a_run_of_another_length_does_not_replace_a_stored_one(tmp_path):
-    write_tables(tmp_path, {"results": [{**_row("pdqn", 2), "frames": 800_000}]})
-    with pytest.raises(SystemExit, match=r"the given run has 2,000 steps .* results.csv 800,000; nothing"):
-        add_to_tables(tmp_path, {"results": [{**_row("pdqn", 2), "frames": 2_000}]}, ("domain", "learner", "seed"))
-    assert read_csv(tmp_path / "results.csv")[0]["frames"] == 800_000
-
-
-def test_a_shorter_run_with_a_new_seed_does_not_join_a_cell(tmp_path):
+def test_a_run_of_another_length_neither_replaces_a_stored_one_nor_joins_a_cell(tmp_path):
     names = ("domain", "learner", "seed")
     write_tables(tmp_path, {"results": [{**_row("pdqn", 2), "frames": 800_000}]})
+    with pytest.raises(SystemExit, match=r"the given run has 2,000 steps .* results.csv 800,000; nothing"):
+        add_to_tables(tmp_path, {"results": [{**_row("pdqn", 2), "frames": 2_000}]}, names)
     with pytest.raises(SystemExit, match=r"goal, pdqn: has runs of 2,000 and 800,000 steps; nothing was written"):
         add_to_tables(tmp_path, {"results": [{**_row("pdqn", 3), "frames": 2_000}]}, names)
-    assert len(read_csv(tmp_path / "results.csv")) == 1
+    assert [row["frames"] for row in read_csv(tmp_path / "results.csv")] == [800_000]
     add_to_tables(tmp_path, {"results": [{**_row("pdqn", 3), "frames": 2_000}]}, names, lengths_differ=True)
     assert len(read_csv(tmp_path / "results.csv")) == 2
 
@@ -420,11 +395,8 @@ def test_options_refuses_cells_of_runs_with_different_settings():
         options.standing([*rows, rows[0]], options.PAIR)
 
 
-GATHERING = [
-    file.parent.name
-    for file in sorted(EXPERIMENTS.glob("*/study.py"))
-    if "gathered(" in file.read_text(encoding="utf-8")
-]
+STUDIES = sorted(EXPERIMENTS.glob("*/study.py"))
+GATHERING = [file.parent.name for file in STUDIES if "gathered(" in file.read_text(encoding="utf-8")]
 
 
 @pytest.mark.parametrize("name", GATHERING)
