@@ -487,21 +487,11 @@ def test_a_seed_beyond_32_bits_has_episodes_of_its_own_however_it_is_given(way):
 
 
 @pytest.mark.parametrize(
-    "env_id",
-    [
-        "hpamdp/BoatDock-v0",
-        "hpamdp/Platform-v0",
-        "hpamdp/Office-v0",
-        "hpamdp/CatchPoint-v0",
-        "hpamdp/HardMove4-v0",
-        "hpamdp/Sliding-v0",
-        "hpamdp/PinballHard-v0",
-        "hpamdp/Goal-v0",
-        "hpamdp/CircuitToffoli-v0",
-    ],
+    "name",
+    ["BoatDock", "Platform", "Office", "CatchPoint", "HardMove4", "Sliding", "PinballHard", "Goal", "CircuitToffoli"],
 )
-def test_a_picture_shows_the_progress_of_the_episode(env_id):
-    adapter = gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True)
+def test_a_picture_shows_the_progress_of_the_episode(name):
+    adapter = gymnasium.make(f"hpamdp/{name}-v0", render_mode="rgb_array", disable_env_checker=True)
     adapter.action_space.seed(3)
     adapter.reset(seed=0)
     before = adapter.render()

@@ -163,16 +163,9 @@ def test_a_policy_file_is_scored_like_the_run_that_it_is_of(trained, tmp_path):
 @pytest.fixture(scope="module")
 def scaled(tmp_path_factory):
     """A policy that reads observations scaled by running statistics."""
-    agent = hpamdp.train(
-        "CartPole-v1",
-        high="none",
-        low="hppo",
-        total_frames=64,
-        num_envs=2,
-        steps_per_batch=32,
-        observation_scaling="running",
-        **{"low.minibatch_size": 32, "low.hidden_dims": [8], "eval.layouts": 1},
-    )
+    settings = {"total_frames": 64, "num_envs": 2, "steps_per_batch": 32, "eval.layouts": 1}
+    settings |= {"observation_scaling": "running", "low.minibatch_size": 32, "low.hidden_dims": [8]}
+    agent = hpamdp.train("CartPole-v1", high="none", low="hppo", **settings)
     file = tmp_path_factory.mktemp("scaled") / "policy.safetensors"
     agent.save(file)
     return file

@@ -21,20 +21,10 @@ def write_evaluation(folder, num=6, without=(), **changed):
     path[:, 0], path[:, 1] = start, goal
     option = rng.integers(0, 2, num)
     outcome = rng.integers(1, 6, num)
-    arrays = {
-        "start": start,
-        "goal": goal,
-        "option": option,
-        "controller": option,
-        "outcome": outcome,
-        "fuel": rng.uniform(0, 1, num),
-        "score": np.where(outcome == 1, rng.uniform(0, 4, num), -1.0),
-        "steps": np.ones(num, dtype=int),
-        "path": path,
-        "optimum": rng.uniform(2, 4, (num, 2)),
-        "bearing_offset": rng.uniform(0, 60, num),
-        **changed,
-    }
+    arrays = {"start": start, "goal": goal, "option": option, "controller": option, "outcome": outcome, "path": path}
+    arrays |= {"fuel": rng.uniform(0, 1, num), "score": np.where(outcome == 1, rng.uniform(0, 4, num), -1.0)}
+    arrays |= {"steps": np.ones(num, dtype=int), "optimum": rng.uniform(2, 4, (num, 2))}
+    arrays |= {"bearing_offset": rng.uniform(0, 60, num), **changed}
     np.savez(folder / "evaluation.npz", **{name: array for name, array in arrays.items() if name not in without})
 
 

@@ -23,42 +23,22 @@ CPU = torch.device("cpu")
 GAMMA = 0.5
 REPLAY = ["low.warmup_steps=0", "low.updates_per_step=0.15", "low.batch_size=32", "low.critic_lr=0.02"]
 SMALL = ["low.hidden_dims=[16]", f"low.gamma={GAMMA}"]
-MODEL = [
-    "low.warmup_steps=1",
-    "low.updates_per_step=0.15",
-    "low.batch_size=32",
-    "low.horizon=1",
-    "low.end_values=true",
-    "low.end_value_lr=0.02",
-    "low.end_value_tau=0.3",
-]
+MODEL = ["low.warmup_steps=1", "low.updates_per_step=0.15", "low.batch_size=32", "low.horizon=1"]
+MODEL += ["low.end_values=true", "low.end_value_lr=0.02", "low.end_value_tau=0.3"]
+SMALL_PETS = ["low.transition_dims=[16]", "low.outcome_dims=[16]", "low.num_members=2", "low.num_samples=4"]
+# Soft values that are nearly those of the best actions.
+COLD = ["low.discrete_temperature=1e-4", "low.parameter_temperature=1e-4"]
+COLD += ["low.tune_discrete_temperature=false", "low.tune_parameter_temperature=false"]
 LEARNERS = {
     "hppo": [*SMALL, "low.critic_hidden_dims=[16]", "low.minibatch_size=64", "low.lr=0.02", "low.lr_final=0.02"],
     "pdqn": [*SMALL, *REPLAY, "low.critic_tau=0.3"],
     "paddpg": [*SMALL, *REPLAY, "low.tau=0.3"],
-    "hsac": [
-        *SMALL,
-        *REPLAY,
-        "low.tau=0.3",
-        "low.discrete_temperature=1e-4",
-        "low.parameter_temperature=1e-4",
-        "low.tune_discrete_temperature=false",
-        "low.tune_parameter_temperature=false",
-    ],
+    "hsac": [*SMALL, *REPLAY, "low.tau=0.3", *COLD],
     "hyar": [*SMALL, *REPLAY, "low.warmup_steps=64", "low.tau=0.3", "low.codec_pretrain_updates=2"],
     "iql": [*SMALL, *REPLAY, "low.tau=0.3"],
     "td3_bc": [*SMALL, *REPLAY, "low.tau=0.3"],
     "dlpa": [*SMALL, *MODEL, "low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"],
-    "pets": [
-        f"low.gamma={GAMMA}",
-        *MODEL,
-        "low.transition_dims=[16]",
-        "low.outcome_dims=[16]",
-        "low.num_members=2",
-        "low.num_samples=4",
-        "low.greedy_samples=4",
-        "low.num_iterations=1",
-    ],
+    "pets": [f"low.gamma={GAMMA}", *MODEL, *SMALL_PETS, "low.greedy_samples=4", "low.num_iterations=1"],
     "qpamdp": [f"low.gamma={GAMMA}", "low.features=null", "low.warmup_steps=1", "low.phi_order=1", "low.psi_order=1"],
 }
 

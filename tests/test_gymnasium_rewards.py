@@ -39,15 +39,8 @@ def test_rewards_are_divided_by_the_deviation_of_the_discounted_returns_so_far()
 
 
 def test_returns_in_training_have_the_unit_of_those_in_evaluations():
-    sizes = {
-        "total_frames": 64,
-        "num_envs": 2,
-        "steps_per_batch": 8,
-        "eval.layouts": 2,
-        "max_steps": 3,
-        "staggered": False,
-        "low.minibatch_size": 16,
-    }
+    sizes = {"total_frames": 64, "num_envs": 2, "steps_per_batch": 8, "eval.layouts": 2}
+    sizes |= {"max_steps": 3, "staggered": False, "low.minibatch_size": 16}
 
     class Shown(hpamdp.Callback):
         def on_end(self, trainer):

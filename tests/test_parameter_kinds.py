@@ -36,11 +36,7 @@ PLANS = {"warmup_steps": 16, "updates_per_step": 0.25, "horizon": 1, "num_iterat
 LEARNERS = {
     Random: {},
     HPPO: {"minibatch_size": 8, "hidden_dims": (8,), "epochs": 1},
-    PDQN: REPLAY,
-    HSAC: REPLAY,
-    PADDPG: REPLAY,
-    IQL: REPLAY,
-    TD3BC: REPLAY,
+    **dict.fromkeys((PDQN, HSAC, PADDPG, IQL, TD3BC), REPLAY),
     HyAR: REPLAY | {"codec_pretrain_updates": 1},
     QPAMDP: {},
     DLPA: PLANS | {"num_samples": 8, "batch_size": 8, "hidden_dims": (8,)},

@@ -256,6 +256,10 @@ def test_a_picture_too_small_for_nature_is_refused_in_one_line():
         CNN(ObservationEntry("camera", 0, (20, 16), is_picture=True), net="nature")
 
 
+FEW_STEPS = {"progress": False, "total_frames": 64, "num_envs": 4, "steps_per_batch": 8}
+FEW_STEPS |= {"eval.layouts": 2, "env.max_steps": 5}
+
+
 class Means(Encoder):
     """Mean colours of 4 x 4 areas, then a linear layer."""
 
@@ -273,11 +277,7 @@ def test_ones_own_encoder_is_trained_with_its_settings():
         Camera,
         low={"name": "hppo", "minibatch_size": 16, "epochs": 2},
         encoder={"name": Means, "num_features": 3},
-        progress=False,
-        total_frames=64,
-        num_envs=4,
-        steps_per_batch=8,
-        **{"eval.layouts": 2, "env.max_steps": 5},
+        **FEW_STEPS,
     )
     (encoder,) = agent.policy.policies[0].perception.encoder.encoders.values()
     assert isinstance(encoder, Means) and encoder.linear.out_features == 3
@@ -288,10 +288,6 @@ def test_ones_own_encoder_is_trained_with_its_settings():
 # Learners.
 
 
-def losses_of(learner, batch) -> None:
-    learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
-
-
 @pytest.mark.parametrize("name", list(LEARNERS))
 def test_the_encoder_is_trained_by_every_learner_that_takes_pictures(name):
     env = GymnasiumEnv(8, make=Mixed, max_steps=5)
@@ -300,7 +296,7 @@ def test_the_encoder_is_trained_by_every_learner_that_takes_pictures(name):
     learner = LEARNERS[name](specs, hidden_dims=(16,), **settings)
     before = [weight.clone() for weight in learner.perception.parameters()]
     batch = with_decisions(env).rollout(8, learner.policy, break_when_any_done=False, auto_reset=True)
-    losses_of(learner, batch)
+    learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
     after = list(learner.perception.parameters())
     assert before and any(not torch.equal(one, other) for one, other in zip(before, after, strict=True))
     env.close()
@@ -336,11 +332,7 @@ def test_learned_selectors_see_pictures(high):
         high={"name": high, **settings},
         low={"name": "hppo", "minibatch_size": 8},
         encoder={"name": "cnn", "channels": [4, 4, 4], "num_features": 8},
-        progress=False,
-        total_frames=160,
-        num_envs=4,
-        steps_per_batch=8,
-        **{"eval.layouts": 2, "env.max_steps": 5},
+        **{**FEW_STEPS, "total_frames": 160},
     )
     assert not agent._agent.without_update()
 

@@ -26,15 +26,8 @@ from hpamdp.env.hard_move.environment import HardMoveEnv
 
 REPLAY = Path(__file__).resolve().parent.parent / "experiments" / "domains" / "replay.py"
 FOLDER = Path(os.environ.get("HPAMDP_TRACES", "nowhere")) / "domains"
-NAMES = [
-    "platform",
-    "goal",
-    "hard_goal",
-    "catch_point",
-    *(f"hard_move_{n}" for n in (4, 6, 8, 10)),
-    "moving",
-    "sliding",
-]
+NAMES = ["platform", "goal", "hard_goal", "catch_point", "moving", "sliding"]
+NAMES += [f"hard_move_{n}" for n in (4, 6, 8, 10)]
 
 
 def place(env: BatchedEnv, **columns: float) -> None:

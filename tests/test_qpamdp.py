@@ -91,19 +91,10 @@ def test_features_are_cosines_of_the_varying_entries_scaled_to_their_ranges():
 
 def sarsa_rows(phi, next_phi, discrete, reward, terminated, done) -> TensorDict:
     shape = (2, len(discrete[0]))
-    return TensorDict(
-        {
-            "phi": torch.tensor(phi),
-            "next_phi": torch.tensor(next_phi),
-            "discrete": torch.tensor(discrete),
-            "reward": torch.tensor(reward),
-            "terminated": torch.tensor(terminated),
-            "done": torch.tensor(done),
-            "mask": torch.ones(shape, dtype=torch.bool),
-            "is_first": torch.zeros(shape, dtype=torch.bool),
-        },
-        shape,
-    )
+    given = {"phi": phi, "next_phi": next_phi, "discrete": discrete, "reward": reward, "terminated": terminated}
+    rows = {name: torch.tensor(values) for name, values in {**given, "done": done}.items()}
+    rows |= {"mask": torch.ones(shape, dtype=torch.bool), "is_first": torch.zeros(shape, dtype=torch.bool)}
+    return TensorDict(rows, shape)
 
 
 def test_sarsa_matches_a_computation_by_hand():
@@ -194,19 +185,10 @@ def test_a_non_increasing_bound_stays_at_the_smallest_so_far_and_heeds_only_upda
 
 def test_updates_of_groups_of_environments_follow_one_another():
     torch.manual_seed(0)
-    rows = TensorDict(
-        {
-            "phi": torch.randn(5, 3, 4),
-            "next_phi": torch.randn(5, 3, 4),
-            "discrete": torch.randint(2, (5, 3)),
-            "reward": torch.randn(5, 3),
-            "terminated": torch.rand(5, 3) < 0.2,
-            "done": torch.rand(5, 3) < 0.4,
-            "mask": torch.rand(5, 3) < 0.8,
-            "is_first": torch.zeros(5, 3, dtype=torch.bool),
-        },
-        [5, 3],
-    )
+    drawn = {"phi": torch.randn(5, 3, 4), "next_phi": torch.randn(5, 3, 4), "discrete": torch.randint(2, (5, 3))}
+    drawn |= {"reward": torch.randn(5, 3), "terminated": torch.rand(5, 3) < 0.2, "done": torch.rand(5, 3) < 0.4}
+    drawn |= {"mask": torch.rand(5, 3) < 0.8, "is_first": torch.zeros(5, 3, dtype=torch.bool)}
+    rows = TensorDict(drawn, [5, 3])
     rows["done"] |= rows["terminated"]
     features = torch.ones(4)
     grouped = make_sarsa(gamma=0.9, step_size=0.1, envs_per_update=2)

@@ -21,19 +21,9 @@ needs_simulator = pytest.mark.skipif(find_spec("pyRDDLGym") is None, reason="nee
 SHIPS = {"bounds": {"ship": [0, 20], "ship___w1": [5, 9]}}
 # A domain of each kind: real numbers, whole ones, booleans beside real ones, one of many, two of many, enumerated,
 # of which one is an integer, with masks, without bounds of its own, with observations that hide the state.
-DOMAINS = {
-    "Reservoir_ippc2023": {},
-    "UAV_Mixed": {},
-    "Epidemic": {},
-    "SysAdmin_MDP_ippc2011": {},
-    "Elevators": {},
-    "Intruders_Discrete": {},
-    "Sudoku_arcade": {},
-    "BinPacking_or": {},
-    "SupplyChain_or": SHIPS,
-    "CrossingTraffic_POMDP_ippc2014": {},
-    "EarthObservation_ippc2018": {},
-}
+NAMES = "Reservoir_ippc2023 UAV_Mixed Epidemic SysAdmin_MDP_ippc2011 Elevators Intruders_Discrete Sudoku_arcade"
+NAMES += " BinPacking_or SupplyChain_or CrossingTraffic_POMDP_ippc2014 EarthObservation_ippc2018"
+DOMAINS = {name: {} for name in NAMES.split()} | {"SupplyChain_or": SHIPS}
 
 
 def grounded(env: RDDLProblem, action) -> dict:

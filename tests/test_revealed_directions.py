@@ -282,15 +282,8 @@ def test_a_run_that_remembers_directions_resumes_to_the_last_bit(words, tmp_path
     stop_and_resume([*RUN, *words], tmp_path, signal.SIGINT)
 
 
-QUIET = {
-    "env.trips": 2,
-    "total_frames": 128,
-    "num_envs": 8,
-    "steps_per_batch": 4,
-    "eval.every": 0,
-    "eval.layouts": 2,
-    "progress": False,
-}
+QUIET = {"env.trips": 2, "total_frames": 128, "num_envs": 8, "steps_per_batch": 4}
+QUIET |= {"eval.every": 0, "eval.layouts": 2, "progress": False}
 QUICK = {"low.updates_per_step": 0.5, "low.num_iterations": 1, "low.horizon": 1, "low.greedy_samples": 8}
 
 

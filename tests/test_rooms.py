@@ -96,16 +96,8 @@ def test_an_unknown_option_is_refused_in_one_line():
 
 
 def test_an_evaluation_knows_the_ceiling():
-    words = [
-        "env=rooms",
-        "high=uniform",
-        "low=random",
-        "agent.termination=steps",
-        "agent.option_length=1",
-        "num_envs=4",
-        "eval.layouts=50",
-    ]
-    parts = assemble(make_config(words))
+    words = "env=rooms high=uniform low=random agent.termination=steps agent.option_length=1 num_envs=4 eval.layouts=50"
+    parts = assemble(make_config(words.split()))
     means = parts.evaluation.measure(parts.evaluation.run(parts.agent.policy))
     assert 0.8 < means["ceiling"] < 0.9 and means["score"] < means["ceiling"]
 
