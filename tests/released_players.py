@@ -91,8 +91,12 @@ def end(td: TensorDict) -> tuple[int, float, bool, bool]:
     return td[keys.OUTCOME].item(), td[keys.REWARD].item(), td[keys.TERMINATED].item(), td[keys.TRUNCATED].item()
 
 
+class InFloat64(ReleasedBoatDockEnv):
+    float_type = torch.float64
+
+
 def one(**arguments) -> ReleasedBoatDockEnv:
-    return ReleasedBoatDockEnv(dtype="float64", **arguments)
+    return InFloat64(**arguments)
 
 
 def restart(env: ReleasedBoatDockEnv, td: TensorDict, mask: list[bool]) -> TensorDict:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from released_players import FUEL, IDLE, X, Y, one, press
+from released_players import FUEL, IDLE, InFloat64, X, Y, one, press
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
@@ -15,10 +15,11 @@ from hpamdp.env.boatdock_released.rules import OUT_OF_FUEL, SUCCESS, TIME_LIMIT,
 
 
 @pytest.mark.parametrize(
-    ("controller", "observation", "dtype"), [("congruent", "pixels", "float32"), ("incongruent", "scaled", "float64")]
+    ("kind", "controller", "observation"),
+    [(ReleasedBoatDockEnv, "congruent", "pixels"), (InFloat64, "incongruent", "scaled")],
 )
-def test_all_tensors_are_as_the_specs_say(controller, observation, dtype):
-    check_env_specs(ReleasedBoatDockEnv(5, controller=controller, observation=observation, dtype=dtype))
+def test_all_tensors_are_as_the_specs_say(kind, controller, observation):
+    check_env_specs(kind(5, controller=controller, observation=observation))
 
 
 def test_the_action_spec_has_durations_from_minus_one_to_one():

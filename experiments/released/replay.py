@@ -27,6 +27,15 @@ CONTROLLERS = ("incongruent", "congruent")  # as they are numbered in the files
 TOLERANCE = {"float64": 1e-9, "float32": 1e-3}  # relative for numbers beyond 1
 
 
+class InFloat64(ReleasedBoatDockEnv):
+    """The released environment, computed in float64."""
+
+    float_type = torch.float64
+
+
+_ENVIRONMENTS = {"float64": InFloat64, "float32": ReleasedBoatDockEnv}
+
+
 def replay(episodes: list[dict[str, Any]], dtype: str = "float64") -> tuple[int, float]:
     """Return the number of compared steps and the largest difference, which is infinite if a flag differs."""
     steps = 0
@@ -41,7 +50,7 @@ def replay(episodes: list[dict[str, Any]], dtype: str = "float64") -> tuple[int,
 
 def _replay_boat(controller: str, episodes: list[dict[str, Any]], dtype: str) -> float:
     """Replay episodes of one boat side by side, and return the largest difference."""
-    env = ReleasedBoatDockEnv(len(episodes), controller=controller, dtype=dtype)
+    env = _ENVIRONMENTS[dtype](len(episodes), controller=controller)
     layout = {"start": _column(episodes, "start"), "goal": _column(episodes, "goal")}
     if controller == "incongruent":
         layout["keymap"] = _column(episodes, "keymap").long()

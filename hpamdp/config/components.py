@@ -24,7 +24,7 @@ from hpamdp.settings import SettingError, Settings
 
 # Arguments that the run supplies to the constructor of a group's class. All others are settings.
 SUPPLIED_ARGUMENTS: dict[str, tuple[str, ...]] = {
-    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "human", "make", "flatten_pictures"),
+    "env": ("num_envs", "device", "seed", "first_env", "oracle", "human", "make", "flatten_pictures"),
     "high": ("specs", "device"),
     "low": ("specs", "device"),
     "encoder": ("entry",),

@@ -30,6 +30,7 @@ from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.kernel_rows import Advance, KernelRows, Results, invalid_choice
 from hpamdp.env.kernels import OUTCOME_ROW
+from hpamdp.env.planning_oracle import PlanningOracle
 from hpamdp.env.state_columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.settings import SettingError, Settings
 
@@ -87,28 +88,6 @@ class Action(NamedTuple):
     option: Tensor | None
 
 
-class PlanningOracle(Protocol):
-    """What knows the best actions of N environments by plans that it makes when episodes begin.
-
-    A problem whose best actions follow from the state alone defines `BatchedEnv.scripted_action` instead.
-    """
-
-    def spec(self) -> Composite:
-        """Return the spec of what `read` returns."""
-
-    def plan(self, state: Any, rows: Tensor) -> None:
-        """Plan for the environments of `rows`, bool `[N]`, from their states."""
-
-    def read(self, state: Any) -> TensorDict:
-        """Return the next action of each plan, and what else is known."""
-
-    def plans(self) -> dict[str, Tensor]:
-        """Return the plans for a checkpoint, first dimension `N`."""
-
-    def set_plans(self, plans: Mapping[str, Tensor]) -> None:
-        """Restore the result of `plans`."""
-
-
 class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     """`num_envs` copies of a problem in one batch dimension.
 
@@ -130,6 +109,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         first_env: number of the first environment, if other processes have those before it.
         oracle: whether to write the action of the problem's scripted player under `oracle`: `discrete` and
             `parameters`, `[N, P]`.
+        human: whether to write what people would choose under `human`, if the problem knows it.
+        flatten_pictures: whether pictures are float32 numbers in [0, 1], a vector like any other.
         settings: single settings by name, in place of those in `options`.
 
     Raises:
@@ -164,6 +145,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         seed: int = 0,
         first_env: int = 0,
         oracle: bool = False,
+        human: bool = False,
+        flatten_pictures: bool = False,
         **settings: Any,
     ) -> None:
         self.options = self.Options.of(options, settings)
@@ -174,7 +157,9 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         facts = self.facts(self.options)
         if oracle and not facts.has_oracle:
             raise SettingError(f"oracle={oracle}: {self.title} has no planner to ask")
-        self._has_oracle = oracle
+        if human and not facts.has_human:
+            raise SettingError(f"human={human}: {self.title} does not know what people choose")
+        self._has_oracle, self._has_human, self._flattens = oracle, human, flatten_pictures
         self._chooses = facts.has_choice
         self.option_names = facts.option_names
         self.can_change_option = facts.can_change_option

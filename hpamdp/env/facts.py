@@ -27,7 +27,7 @@ class ProblemFacts:
         default_options: options to begin with, as for `PAMDPEnv.group_actions`; empty if the problem suggests none.
         has_oracle: whether the problem knows its best actions, for `oracle`; the constructor may still refuse some
             settings.
-        has_human: whether the constructor takes `human`, which the selector of that name needs.
+        has_human: whether the problem knows what people choose, which the selector `human` needs.
         has_pictures: whether an entry of the observation is a picture, unless pictures are flattened.
     """
 

@@ -106,23 +106,6 @@ class BoatDockEnv(KernelEnv[BoatState]):
         Metric("option_congruent", "Congruent controller chosen", "share"),
     )
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        options: BoatDockOptions | None = None,
-        oracle: bool = False,
-        human: bool = False,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-        **settings: Any,
-    ) -> None:
-        self._has_human = human
-        super().__init__(
-            num_envs, options=options, device=device, seed=seed, first_env=first_env, oracle=oracle, **settings
-        )
-
     def _prepare(self) -> None:
         options = self.options
         if self._has_human and not options.are_peoples:

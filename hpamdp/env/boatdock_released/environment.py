@@ -12,7 +12,6 @@ Differs from the source:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -28,7 +27,6 @@ from hpamdp.env.boatdock_released.options import CARDS, ReleasedBoatDockOptions
 from hpamdp.env.boatdock_released.rules import ReleasedState
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.state_columns import check_range, where
-from hpamdp.settings import SettingError
 
 
 class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
@@ -51,14 +49,8 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
 
     An environment always keeps its controller, so no selector can be used with it.
 
-    Args:
-        num_envs: number of environments.
-        options: the settings; None for the defaults.
-        dtype: `float32` or `float64`, of the computation and its results. Durations are always rounded in float32.
-        device: device of the tensors.
-        seed: seed of layouts and key maps. The global generators are not used.
-        first_env: number of the first environment. It is above 0 if other processes hold earlier ones.
-        settings: single settings by name, which replace those in `options`.
+    `float_type` is the type of the computation and its results. Durations are always rounded in float32. For the
+    constructor's arguments see `BatchedEnv`.
 
     `reset` also takes layouts, which the environments keep: a tensordict with `start` and `goal` `[N, 2]` in screen px
     and, for the incongruent controller, optionally `keymap` int `[N]`.
@@ -77,22 +69,6 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
     start_keys = frozenset({"start", "goal", "keymap"})
     action_names = ("key", "durations")
     position = None  # evaluations keep no paths
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        options: ReleasedBoatDockOptions | None = None,
-        dtype: Literal["float32", "float64"] = "float32",
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-        **settings: Any,
-    ) -> None:
-        if dtype not in ("float32", "float64"):
-            raise SettingError(f"ReleasedBoatDockEnv: {dtype=}, but must be float32 or float64")
-        self.float_type = getattr(torch, dtype)
-        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
 
     def _prepare(self) -> None:
         self._is_congruent = self.options.controller == "congruent"

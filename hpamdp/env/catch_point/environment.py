@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -37,8 +37,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     The reward is minus the squared distance after each step, plus 20 for a catch within 0.2 of the target, which ends
     the episode. A catch elsewhere is a miss.
 
-    Only the start is random. If `flatten_pictures` is true, a picture is float32 with numbers in [0, 1], a vector like
-    any other. For the constructor's other arguments and errors see `BatchedEnv`.
+    Only the start is random. For the constructor's arguments and errors see `BatchedEnv`.
     """
 
     Options = CatchPointOptions
@@ -53,23 +52,6 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     state_type = CatchPointState
     num_columns = (6, 4)
     target_radius = point_agent.HIT_RADIUS
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        options: CatchPointOptions | None = None,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-        oracle: bool = False,
-        flatten_pictures: bool = False,
-        **settings: Any,
-    ) -> None:
-        self._flattens = flatten_pictures
-        super().__init__(
-            num_envs, options=options, device=device, seed=seed, first_env=first_env, oracle=oracle, **settings
-        )
 
     def _prepare(self) -> None:
         self.observation_names = point_agent.OBSERVATION_NAMES + (rules.PROGRESS_NAMES if self.options.progress else ())

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite
 
 from hpamdp.env.circuit import compiler, rules
 from hpamdp.env.circuit.gates import PHASE, matrices, published
 from hpamdp.env.circuit.known_circuits import CIRCUITS
 from hpamdp.env.circuit.rules import TASK_OF, CircuitState, Design
+from hpamdp.env.planning_oracle import PlanningOracle
 
 
 def beginnings(task: str) -> tuple[Tensor, Tensor]:
@@ -51,8 +49,8 @@ def _compiled(state: CircuitState, design: Design) -> list[compiler.Plans]:
     return [compiler.best(states, gate_set) for gate_set in design.gate_sets]
 
 
-class CircuitOracle:
-    """Keep the best circuit of every option, found at the start of an episode.
+class CircuitOracle(PlanningOracle):
+    """Keep the best circuit of every option, found at the start of an episode, with the stop at its end.
 
     Args:
         num_envs: number of environments.
@@ -60,39 +58,25 @@ class CircuitOracle:
         task: name of the task.
         device: of the tensors.
 
-    Attributes:
-        option: the best gate set, int64 `[N]`.
-        gates, angles: the circuits with the stop at their ends, `[N, S, L]`.
     """
 
+    saved_names = ("gates", "angles")
+
     def __init__(self, num_envs: int, design: Design, task: str, device: torch.device | None) -> None:
-        self.design = design
-        self.option = torch.zeros(num_envs, dtype=torch.long, device=device)
-        stop = len(design.gate_sets[0]) - 1
         if design.is_native:
             length = max(len(form) for gate_set in design.gate_sets for form in compiler.forms(gate_set))
         else:
             length = len(CIRCUITS[task])
-        shape = (num_envs, len(design.gate_sets), length + 1)
-        self.gates = torch.full(shape, stop, dtype=torch.long, device=device)
-        self.angles = torch.zeros(shape, dtype=torch.float32, device=device)
+        num_gates, num_sets = len(design.gate_sets[0]), len(design.gate_sets)
+        num_options = num_sets if num_sets > 1 else 0
+        super().__init__((num_envs, num_sets, length + 1), num_gates, (-math.pi, math.pi), num_options, device)
+        self.design = design
+        self.discrete.fill_(num_gates - 1)
         if not design.is_native:
             names = [gate.name for gate in design.gate_sets[0]]
             for place, (name, angle) in enumerate(CIRCUITS[task]):
-                self.gates[..., place], self.angles[..., place] = names.index(name), angle
-        self._known_gates, self._known_angles = self.gates[0, 0].clone(), self.angles[0, 0].clone()
-
-    def spec(self) -> Composite:
-        """Return the spec of the entries that `read` returns."""
-        num, num_sets, _ = self.gates.shape
-        device = self.gates.device
-        entries = {
-            "discrete": Categorical(len(self.design.gate_sets[0]), shape=(num, num_sets), device=device),
-            "parameters": Bounded(-math.pi, math.pi, shape=(num, num_sets), device=device, dtype=torch.float32),
-        }
-        if num_sets > 1:
-            entries["option"] = Categorical(num_sets, shape=(num,), device=device)
-        return Composite(entries, shape=(num,))
+                self.discrete[..., place], self.parameters[..., place] = names.index(name), angle
+        self._known_gates, self._known_angles = self.discrete[0, 0].clone(), self.parameters[0, 0].clone()
 
     def plan(self, state: CircuitState, rows: Tensor) -> None:
         """Find the circuits for the environments of `rows`, bool `[N]`, which begin."""
@@ -103,12 +87,12 @@ class CircuitOracle:
         if not self.design.is_native:
             return
         plans = _compiled(type(state)(*(column[rows] for column in state)), self.design)
-        device = self.gates.device
+        device = self.option.device
         self.option[rows] = torch.from_numpy(np.stack([each.score for each in plans], -1).argmax(-1)).to(device)
         for number, each in enumerate(plans):
             used = each.gates.shape[-1]
-            self.gates[rows, number, :used] = torch.from_numpy(each.gates).to(device)
-            self.angles[rows, number, :used] = torch.from_numpy(each.angles).float().to(device)
+            self.discrete[rows, number, :used] = torch.from_numpy(each.gates).to(device)
+            self.parameters[rows, number, :used] = torch.from_numpy(each.angles).float().to(device)
 
     def _leave_out_begun(self, state: CircuitState, rows: Tensor, beginnings: Tensor) -> None:
         """Keep of the known circuit what follows the gates that are there: one of its beginnings `[L, R, C]`."""
@@ -119,26 +103,5 @@ class CircuitOracle:
         there = torch.where(least < 0.1, there, num - 1)  # of the whole circuit, or of another one, the stop is left
         place = torch.arange(num, device=begun.device) + there - state.steps[rows].unsqueeze(-1)
         place = place.clamp(0, num - 1)  # `read` adds the steps
-        self.gates[rows] = self._known_gates[place].unsqueeze(1)
-        self.angles[rows] = self._known_angles[place].unsqueeze(1)
-
-    def read(self, state: CircuitState) -> TensorDict:
-        """Return the next gate of each circuit, `discrete` and `parameters` `[N, S]`, and the best `option` `[N]`."""
-        place = state.steps.long().clamp(max=self.gates.shape[-1] - 1).view(-1, 1, 1)
-        place = place.expand(-1, self.gates.shape[1], 1)
-        known = {
-            "discrete": self.gates.gather(-1, place).squeeze(-1),
-            "parameters": self.angles.gather(-1, place).squeeze(-1),
-        }
-        if self.gates.shape[1] > 1:
-            known["option"] = self.option.clone()
-        return TensorDict(known, batch_size=place.shape[:1], device=self.gates.device)
-
-    def plans(self) -> dict[str, Tensor]:
-        """Return the circuits for a checkpoint. They are found only at the start of an episode."""
-        return {"option": self.option, "gates": self.gates, "angles": self.angles}
-
-    def set_plans(self, plans: Mapping[str, Tensor]) -> None:
-        """Restore the result of `plans`."""
-        for name, plan in plans.items():
-            getattr(self, name).copy_(plan)
+        self.discrete[rows] = self._known_gates[place].unsqueeze(1)
+        self.parameters[rows] = self._known_angles[place].unsqueeze(1)
