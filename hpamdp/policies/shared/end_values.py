@@ -17,13 +17,11 @@ import copy
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from hpamdp.policies.shared.gradients import adam, expectile_loss
-from hpamdp.policies.shared.networks import mlp, polyak_update
+from hpamdp.policies.shared.networks import mlp
 from hpamdp.policies.shared.options import EndValueOptions
-from hpamdp.policies.shared.replay import ReplayLearner
 
 
 class EndValues(nn.Module):
@@ -74,20 +72,3 @@ class EndValues(nn.Module):
     def optimizer(self) -> torch.optim.Optimizer:
         """Return the optimizer of the learned networks, which is the learner's optimizer `end_values`."""
         return adam(self.options.end_value_lr, self.own, self.end)
-
-    def update(
-        self, learner: ReplayLearner, rows: TensorDictBase, state: Tensor, next_state: Tensor
-    ) -> dict[str, Tensor]:
-        """Take a step of the learner's optimizer `end_values`, then move the target network; return what to log.
-
-        Args:
-            learner: whose steps they are.
-            rows: stored steps `[B]`, see `ReplayLearner.transitions`.
-            state, next_state: of these steps, as the networks see them, `[B, observation_dim]`.
-        """
-        with torch.no_grad():
-            next_value = learner.next_value(rows)
-        inputs = state, next_state, rows["reward"], rows["discount"], next_value
-        scalars = learner.gradient_step("end_values", self.loss, *inputs)
-        polyak_update(self.target_own, self.own, self.options.end_value_tau)
-        return scalars

@@ -65,17 +65,14 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.acting import is_greedy
-from hpamdp.policies.base import Bonus, States, known_ends
+from hpamdp.policies.base import Bonus, known_ends
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
 from hpamdp.policies.low_level.dlpa.options import CARDS, DLPAOptions
 from hpamdp.policies.low_level.dlpa.planner import Planner
-from hpamdp.policies.shared.end_values import EndValues
-from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.memory import Stack
-from hpamdp.policies.shared.networks import polyak_update
 from hpamdp.policies.shared.perception import Perception
-from hpamdp.policies.shared.planning_policy import PlanningPolicy, plan_ends
-from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.planning_learner import PlanningLearner
+from hpamdp.policies.shared.planning_policy import PlanningPolicy
 from hpamdp.policies.shared.sequences import HistoryLinks, past_of
 from hpamdp.specs import PAMDPSpecs
 
@@ -113,7 +110,7 @@ class DLPAPolicy(PlanningPolicy):
         return discrete, unit_parameters.clamp(-1.0, 1.0)
 
 
-class DLPA(ReplayLearner):
+class DLPA(PlanningLearner):
     """A PAMDPModel trained on windows from a replay buffer, and a Planner that acts in it.
 
     Windows never leave their trajectory, which is an unbroken sequence of this learner's steps within one environment,
@@ -123,9 +120,6 @@ class DLPA(ReplayLearner):
     Options = DLPAOptions
     card = CARDS["DLPA"]
     added_later = ("order.last_rows",)  # checkpoints of 0.3 lack it
-    catches_up = True
-    export_refusal = "plans at every step"
-
     options: DLPAOptions
     policy: DLPAPolicy
 
@@ -137,23 +131,9 @@ class DLPA(ReplayLearner):
         context_dim = seen.observation_dim - specs.observation_dim
         self.order = HistoryLinks()
         self.model = PAMDPModel(seen, options.form, dims, options.num_members, context_dim)
-        self.end_values = EndValues(seen.observation_dim, dims, options) if options.end_values else None
+        self.end_values = self.make_end_values(dims)
         planner = Planner(self.model, specs, options, self.end_values, self.perception.imagined)
         self.policy = DLPAPolicy(planner, specs, options.epsilon, self.perception)
-
-    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Return the optimizers of the model and of the values, if these are learned."""
-        model = {"model": adam(self.options.lr, self.model, self.perception)}
-        return model if self.end_values is None else {**model, "end_values": self.end_values.optimizer()}
-
-    def take_bonus(self, bonus: Bonus) -> None:
-        """Add a bonus to the rewards of exploring plans, scaled as these are."""
-        super().take_bonus(bonus)
-        self.policy.bonus = bonus.scaled(self.options.reward_scale)
-
-    def start(self) -> None:
-        """Let the policy plan, also in the model of a data set."""
-        self.on_progress(0)
 
     def stored_losses(self) -> dict[str, Tensor]:
         """Return the H-step loss on the windows that start at all stored steps, and its parts."""
@@ -168,14 +148,7 @@ class DLPA(ReplayLearner):
             first.update(past_of(self.buffer, first["place"], self.num_past))
         windows = sample.select(*_STORED, "terminated", "valid")
         scalars = self.gradient_step("model", self.loss, windows, first.select("state", *_REMEMBERED, strict=False))
-        if self.end_values is not None:
-            with torch.no_grad():
-                memory = self.memory_of(first, self.perception)
-                state = self.perception(first["state"], memory, has_seen=True)
-                next_state = self.perception(first["next_state"], memory)
-            scalars |= self.end_values.update(self, first, state, next_state)
-            polyak_update(self.target_perception, self.perception, self.options.end_value_tau)
-        return scalars
+        return scalars | self.update_end_values(first)
 
     def loss(self, windows: Tensors, first: Tensors) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the weighted sum of the parts of the H-step loss, and the parts.
@@ -218,28 +191,10 @@ class DLPA(ReplayLearner):
                 parts[name] = parts[name] + self.options.rho**h * (error * step["valid"]).mean()
         return parts
 
-    def value(self, states: States, *, is_target: bool = False) -> Tensor:
-        """Return the values `[N]` of states that `end_values` has learned, whatever is allowed.
-
-        Raises:
-            NotImplementedError: there are none.
-        """
-        if self.end_values is None:
-            return super().value(states)
-        return self.end_values.of_own(self.target_perception.of_states(states))
-
     def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return the model's inputs and targets in a batch `[*B, T]`, and those of the values, if they are learned.
-
-        A step that ends a trip counts as one that terminates.
-        """
+        """Return the model's inputs and targets in a batch `[*B, T]`, and those of the values, if they are learned."""
         rows = super().transitions(batch)
-        ends = plan_ends(batch)
-        if self.end_values is None:
-            rows = rows.select(*_STORED, "memory", strict=False)
-        else:
-            rows.set("discount", torch.where(ends, 0.0, rows["discount"]))
-        return rows.set("terminated", ends)
+        return rows if self.end_values is not None else rows.select(*_STORED, "terminated", "memory", strict=False)
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Add the transitions in `mask` of a batch `[*B, T]`, and link the steps before them to these.

@@ -71,13 +71,9 @@ from hpamdp.policies.base import Bonus, States
 from hpamdp.policies.low_level.pets.model import PETSModel
 from hpamdp.policies.low_level.pets.options import CARDS, PETSOptions
 from hpamdp.policies.low_level.pets.policy import PETSPolicy
-from hpamdp.policies.shared.end_values import EndValues
-from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.known_directions import KnownDirections
 from hpamdp.policies.shared.memory import Stack
-from hpamdp.policies.shared.networks import polyak_update
-from hpamdp.policies.shared.planning_policy import plan_ends
-from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.planning_learner import PlanningLearner
 from hpamdp.policies.shared.sequences import past_of, sample_with_past, states_of_past
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
@@ -85,14 +81,12 @@ from hpamdp.specs import PAMDPSpecs
 _MAX_COPIES = 16  # of a stored step under the problem's symmetries
 
 
-class PETS(ReplayLearner):
+class PETS(PlanningLearner):
     """A PETSModel trained on all steps so far, and a SequenceSearch that plans in it."""
 
     Options = PETSOptions
     card = CARDS["PETS"]
     stores_own_parameters = True
-    catches_up = True
-    export_refusal = "plans at every step"
 
     options: PETSOptions
     policy: PETSPolicy
@@ -110,6 +104,7 @@ class PETS(ReplayLearner):
     def make_networks(self, specs: PAMDPSpecs) -> None:
         """Make the model and the policy that plans in it."""
         options = self.options
+        self.weight_decay = options.weight_decay
         self.set_perception(options, knows_directions=self.is_revealed)
         features_dim = self.perception.specs.observation_dim
         predicted = specs.with_telling_entries() if self.is_revealed else specs
@@ -117,13 +112,8 @@ class PETS(ReplayLearner):
             predicted = _without_directions(specs)
         context_dim = features_dim - predicted.observation_dim
         self.model = PETSModel(predicted, options, context_dim, is_revealed=self.is_revealed)
-        self.end_values = EndValues(features_dim, options.outcome_dims, options) if options.end_values else None
+        self.end_values = self.make_end_values(options.outcome_dims)
         self.policy = PETSPolicy(self.model, specs, self.entries, options, self.perception, self.end_values)
-
-    def make_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Return the optimizers of the model and of the values, if these are learned."""
-        model = {"model": adam(self.options.lr, self.model, self.perception, weight_decay=self.options.weight_decay)}
-        return model if self.end_values is None else {**model, "end_values": self.end_values.optimizer()}
 
     def take_bonus(self, bonus: Bonus) -> None:
         """Add a bonus, scaled as rewards are, to the rewards of exploring plans, which all members then make together.
@@ -137,12 +127,7 @@ class PETS(ReplayLearner):
                 "low.augment=false, or exploration=novelty exploration.in_plans=disagreement"
             )
         super().take_bonus(bonus)
-        self.policy.bonus = bonus.scaled(self.options.reward_scale)
         self.policy.samples_posterior = False
-
-    def start(self) -> None:
-        """Let the policy plan, if the rewards or terminations of a data set differ."""
-        self.on_progress(0)
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update every member from its own minibatch of a sample `[num_members, batch_size]`.
@@ -150,17 +135,11 @@ class PETS(ReplayLearner):
         Then update the values, if they are learned, from as many steps, mapped by no symmetry.
         """
         scalars = self.gradient_step("model", self.loss, sample)
-        if self.end_values is not None:
-            num = sample.numel()
-            rows = self.buffer.sample(num) if self.links is None else sample_with_past(self.buffer, num, self.num_past)
-            with torch.no_grad():
-                memory = self.memory_of(rows, self.perception)
-                state = self.perception(rows["state"], memory, has_seen=True)
-                next_state = self.perception(rows["next_state"], memory)
-            rows.set("next_state", rows["next_observation"])
-            scalars |= self.end_values.update(self, rows, state, next_state)
-            polyak_update(self.target_perception, self.perception, self.options.end_value_tau)
-        return scalars
+        if self.end_values is None:
+            return scalars
+        num = sample.numel()
+        rows = self.buffer.sample(num) if self.links is None else sample_with_past(self.buffer, num, self.num_past)
+        return scalars | self.update_end_values(rows)
 
     def loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the members' losses, and the mean of each part of it."""
@@ -207,8 +186,7 @@ class PETS(ReplayLearner):
         """
         if self.end_values is None:
             return self.policy.value(states)
-        seen = states._replace(observation=states.observation[..., self.entries])
-        return self.end_values.of_own(self.target_perception.of_states(seen))
+        return super().value(states._replace(observation=states.observation[..., self.entries]))
 
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Yield samples `[num_members, batch_size]` of all stored steps, each with all its mirror images or maps."""
@@ -305,15 +283,13 @@ class PETS(ReplayLearner):
         entries of the next state.
         """
         rows = super().transitions(batch)
-        ends = plan_ends(batch)
-        rows.set("discount", torch.where(ends, 0.0, rows["discount"]))
         if self.end_values is None:
             rows = rows.exclude("discount", "action_mask", "next_action_mask")
         else:
             rows.set("next_observation", rows["next_state"])
         for name in ("state", "next_state"):
             rows.set(name, rows[name][..., self.entries])
-        return rows.set("terminated", ends)
+        return rows
 
 
 def _without_directions(specs: PAMDPSpecs) -> PAMDPSpecs:
