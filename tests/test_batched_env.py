@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import random
-import re
 import warnings
 from functools import partial
 
@@ -17,7 +16,7 @@ from batched_players import action, is_unchanged, play, random_player, restart, 
 from conftest import global_generators_unmoved
 from gymnasium.utils.env_checker import check_env
 from tensor_rules import boat_rules
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 import hpamdp
@@ -454,16 +453,6 @@ def test_a_wrong_number_given_to_a_constructor_is_refused_in_one_line(make, argu
     with pytest.raises(SettingError) as raised:
         MAKERS[make](**arguments)
     assert str(raised.value) == f"{make}: {line}"
-
-
-@pytest.mark.parametrize("make", MAKERS)
-def test_a_step_and_a_reset_without_the_batch_size_are_refused_in_one_line(make):
-    env = MAKERS[make](2)
-    for given, shown in ((TensorDict(), "[]"), (TensorDict(batch_size=[3]), "[3]"), ({}, "a dict")):
-        line = f"{re.escape(env.title)}: must get a TensorDict with batch size \\[2\\], but got {re.escape(shown)}$"
-        for take in (env.step, env.reset):
-            with pytest.raises(ValueError, match=line):
-                take(given)
 
 
 @pytest.mark.parametrize("way", ["constructor", "set_seed", "seed_evaluation", "reset", "reset of a vector", "copies"])

@@ -199,11 +199,11 @@ def test_replay_buffer_is_complete(people_file, data):
     [
         (dict(best_people=0), "best_people=0, but must be 1 to 3"),
         (dict(controller="congruen"), "controller='congruen', but must be one of incongruent, congruent"),
-        (dict(reward="dense"), "reward='dense', but must be one of paper, sparse"),
+        (dict(reward="dense"), "reward='dense': must be 'paper' or 'sparse'"),
     ],
 )
 def test_a_wrong_argument_of_the_replay_buffer_is_refused_in_one_line(people_file, given, said):
-    with pytest.raises(DataError, match=f"^{re.escape(said)}$"):
+    with pytest.raises(ValueError, match=f"^{re.escape(said)}$"):
         HumanExperienceReplay(4, path=people_file, checksum=None, **given)
 
 

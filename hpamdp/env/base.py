@@ -508,14 +508,6 @@ class PAMDPEnv(EnvBase):
         tensordict.pop("_reset", None)
         return tensordict.update(tensordict_reset)
 
-    def _assert_tensordict_shape(self, tensordict: Any) -> None:  # TorchRL's name
-        is_tensordict = isinstance(tensordict, TensorDictBase)
-        if is_tensordict and tensordict.batch_size == self.batch_size:
-            return
-        given = list(tensordict.batch_size) if is_tensordict else f"a {type(tensordict).__name__}"
-        size = list(self.batch_size)
-        raise ValueError(f"{self.title}: must get a TensorDict with batch size {size}, but got {given}")
-
     def check_action(self, tensordict: TensorDictBase) -> None:
         """Check the action leaves' shapes and types; their values are the subclass's to check.
 

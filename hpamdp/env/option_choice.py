@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.utils import ExplorationType
 
 from hpamdp import keys
 from hpamdp.acting import acting
 from hpamdp.env.base import PAMDPEnv
+
+# Methods of the wrapped environment, which has the episodes.
+_OF_THE_EPISODES = (
+    *("fixed_episodes", "seed_evaluation", "warn_if_seed_is_ignored", "results", "file_checksums"),
+    *("env_state", "check_env_state", "set_env_state"),
+    *("statistics", "set_statistics", "take_new_statistics", "add_statistics"),
+)
 
 
 class OptionChoiceEnv(PAMDPEnv):
@@ -37,6 +41,8 @@ class OptionChoiceEnv(PAMDPEnv):
         super().__init__(device=env.device, batch_size=env.batch_size)
         # In a tuple: as attributes, the modules' parameters would be registered as the environment's own.
         self._wrapped = (low_policy, env)
+        for name in _OF_THE_EPISODES:
+            setattr(self, name, getattr(env, name))
         self.gamma = gamma
         self.option_names = env.option_names
         self.parameter_dims = env.parameter_dims
@@ -62,58 +68,10 @@ class OptionChoiceEnv(PAMDPEnv):
             self.inner_env.close()
         super().close(raise_if_closed=raise_if_closed)
 
-    def fixed_episodes(self, seed: int) -> TensorDict | None:
-        """Return the fixed episodes of the wrapped environment."""
-        return self.inner_env.fixed_episodes(seed)
-
-    def seed_evaluation(self, seed: int) -> None:
-        """Seed the evaluation episodes of the wrapped environment."""
-        self.inner_env.seed_evaluation(seed)
-
-    def warn_if_seed_is_ignored(self, seed: int) -> None:
-        """Warn if the wrapped environment ignores seeds."""
-        self.inner_env.warn_if_seed_is_ignored(seed)
-
-    def results(self, last: TensorDictBase) -> dict[str, Tensor]:
-        """Return the results of the wrapped environment."""
-        return self.inner_env.results(last)
-
     @property
     def keeps_episodes(self) -> bool:
         """Whether the environment's `env_state` holds its episodes."""
         return self.inner_env.keeps_episodes
-
-    def env_state(self) -> dict[str, Tensor]:
-        """Return the state of the wrapped environment."""
-        return self.inner_env.env_state()
-
-    def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Check the state of the wrapped environment."""
-        self.inner_env.check_env_state(columns)
-
-    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Set the state of the wrapped environment."""
-        self.inner_env.set_env_state(columns)
-
-    def statistics(self) -> dict[str, Tensor]:
-        """Return the statistics of the wrapped environment."""
-        return self.inner_env.statistics()
-
-    def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
-        """Set the statistics of the wrapped environment."""
-        self.inner_env.set_statistics(columns)
-
-    def take_new_statistics(self) -> dict[str, Tensor]:
-        """Return the new statistics of the wrapped environment."""
-        return self.inner_env.take_new_statistics()
-
-    def add_statistics(self, columns: Mapping[str, Tensor]) -> None:
-        """Add statistics to the wrapped environment."""
-        self.inner_env.add_statistics(columns)
-
-    def file_checksums(self) -> dict[str, Tensor]:
-        """Return the checksums of the wrapped environment."""
-        return self.inner_env.file_checksums()
 
     def _set_seed(self, seed: int | None) -> None:
         self.inner_env.set_seed(seed)

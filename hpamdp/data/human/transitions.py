@@ -29,8 +29,6 @@ from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.task import FAILURE_REWARD, SUCCESS_REWARD, BoatState, ObservationForm, RewardForm
 
 NO_PRESS = "the episodes have no logged press"
-_REWARDS = ("paper", "sparse")
-_OBSERVATIONS = ("scaled", "pixels")
 _CENTRE = torch.tensor(harbour.CENTRE, dtype=torch.float32)
 
 
@@ -55,7 +53,8 @@ def transitions(
             show it, and there is no `option`.
 
     Raises:
-        DataError: the reward or the observation is unknown, the harbours have different centres, or there is no press.
+        SettingError: the reward or the observation is unknown.
+        DataError: the harbours have different centres, or there is no press.
     """
     _check(data, reward, observation)
     if not len(data.presses):
@@ -136,15 +135,9 @@ def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: Obs
 
 def _check(data: HumanData, reward: str, observation: str) -> None:
     """Check the arguments of `transitions` and `decisions`."""
-    _check_one_of("reward", reward, _REWARDS)
-    _check_one_of("observation", observation, _OBSERVATIONS)
+    BoatDockOptions.of(None, {"reward": reward, "observation": observation})
     if not (data.episodes["centre"] == _CENTRE).all():
         raise DataError("the harbours have different centres; read the file with one_frame=True")
-
-
-def _check_one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise DataError(f"{name}={value!r}, but must be one of {', '.join(allowed)}")
 
 
 def _states(presses: TensorDict, episodes: TensorDict, has_choice: bool) -> tuple[BoatState, BoatState]:

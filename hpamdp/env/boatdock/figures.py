@@ -140,70 +140,49 @@ def _choices(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -
     return figure
 
 
-class _Bins:
-    """Episodes sorted by a value into bins. Bins without an episode are left out.
-
-    Args:
-        values: values of the episodes, `[N]`.
-        edges: edges of the bins.
-
-    Attributes:
-        all_centres: centres of all bins.
-        centres: centres of the bins with episodes.
-        num: number of episodes in each of these bins.
-    """
-
-    def __init__(self, values: np.ndarray, edges: np.ndarray) -> None:
-        self.edges = edges
-        self.all_centres = (edges[:-1] + edges[1:]) / 2.0
-        self._bin = np.clip(np.digitize(values, edges) - 1, 0, len(self.all_centres) - 1)
-        num = np.bincount(self._bin, minlength=len(self.all_centres))
-        self._filled = num > 0
-        self.centres = self.all_centres[self._filled]
-        self.num = num[self._filled]
-
-    def sums(self, weights: np.ndarray) -> np.ndarray:
-        """Return the sum of the episodes' weights `[N]` in each bin that has episodes."""
-        return np.bincount(self._bin, weights=weights, minlength=len(self.all_centres))[self._filled]
+def _in_bins(values: np.ndarray, edges: np.ndarray, *weights: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the centres of the bins with episodes, how many they have, and the sums of the weights `[N]` in them."""
+    num = np.histogram(values, edges)[0]
+    sums = [np.histogram(values, edges, weights=each.astype(float))[0] for each in weights]
+    return tuple(column[num > 0] for column in ((edges[:-1] + edges[1:]) / 2.0, num, *sums))
 
 
 def _draw_choices(
     axes: Axes, evaluation: Mapping[str, np.ndarray], practised: Mapping[str, float], *, has_people: bool
 ) -> None:
-    bins = _Bins(evaluation["bearing_offset"], np.array(OFFSET_EDGES, dtype=float))
-    labels = []
+    edges, labels = np.array(OFFSET_EDGES, dtype=float), []
     optimum = evaluation.get("optimum", np.full((len(evaluation["option"]), 2), np.nan))
     congruent = evaluation["option"] == CONGRUENT
     title = "Congruent boat chosen"
     is_known = np.isfinite(optimum).all(1)
     if is_known.any():
         better = optimum[is_known, CONGRUENT] > optimum[is_known, INCONGRUENT]
-        known = _Bins(evaluation["bearing_offset"][is_known], bins.edges)
-        oracle = known.sums(better) / known.num
-        axes.plot(known.centres, oracle, color=INK, linewidth=1.1, marker="s", markersize=4)
+        centres, num, chosen = _in_bins(evaluation["bearing_offset"][is_known], edges, better)
+        oracle = chosen / num
+        axes.plot(centres, oracle, color=INK, linewidth=1.1, marker="s", markersize=4)
         labels.append((oracle[-1], "oracle", INK))
         title += f" (better boat in {(better == congruent[is_known]).mean():.0%})"
     if has_people:
         label, colour, dashes = REFERENCES["human"]
-        axes.plot(bins.all_centres, HUMAN_CONGRUENT_BY_OFFSET, color=colour, linestyle=dashes, marker="D", markersize=4)
+        middles = (edges[:-1] + edges[1:]) / 2.0
+        axes.plot(middles, HUMAN_CONGRUENT_BY_OFFSET, color=colour, linestyle=dashes, marker="D", markersize=4)
         labels.append((HUMAN_CONGRUENT_BY_OFFSET[-1], label, colour))
-    chosen = bins.sums(congruent)
-    fraction = chosen / bins.num
+    centres, num, chosen = _in_bins(evaluation["bearing_offset"], edges, congruent)
+    fraction = chosen / num
     intervals = [
-        binomtest(int(k), int(n)).proportion_ci(0.95, method="wilson")
-        for k, n in zip(chosen.round(), bins.num, strict=True)
+        binomtest(int(k), int(n)).proportion_ci(0.95, method="wilson") for k, n in zip(chosen.round(), num, strict=True)
     ]
     errors = np.maximum([fraction - [i.low for i in intervals], [i.high for i in intervals] - fraction], 0.0)
-    axes.errorbar(bins.centres, fraction, errors, color=AGENT, linewidth=2.0, marker="o", markersize=5, capsize=3)
+    axes.errorbar(centres, fraction, errors, color=AGENT, linewidth=2.0, marker="o", markersize=5, capsize=3)
     labels.append((fraction[-1], "this agent", AGENT))
     if "congruent" in practised:
         axes.axhline(practised["congruent"], color=AGENT, linewidth=1.0, linestyle=":")
         labels.append((practised["congruent"], "its practice", AGENT))
-    axes.set(xlim=(0, 60), ylim=(-0.03, 1.03), xticks=bins.edges)
+    axes.set(xlim=(0, 60), ylim=(-0.03, 1.03), xticks=edges)
     axes.set_xlabel("degrees between the goal's bearing and the congruent boat's nearest key")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_title(title)
-    label_ends(axes, labels, ends=bins.centres[-1] / bins.edges[-1])
+    label_ends(axes, labels, ends=centres[-1] / edges[-1])
 
 
 def _draw_boats(axes: Axes, evaluation: Mapping[str, np.ndarray], names: Sequence[str]) -> None:
@@ -218,17 +197,16 @@ def _draw_boats(axes: Axes, evaluation: Mapping[str, np.ndarray], names: Sequenc
     optimum, option = evaluation["optimum"][is_known], evaluation["option"].astype(int)
     is_best = optimum == optimum.max(1, keepdims=True)
     edges = np.arange(0.0, 361.0, 30.0)
-    bins, known = _Bins(bearing, edges), _Bins(bearing[is_known], edges)
     title = "Boat chosen"
     for boat, name in enumerate(names):
-        chosen = bins.sums(option == boat) / bins.num
-        axes.plot(bins.centres, chosen, color=f"C{boat}", label=name, linewidth=2.0, marker="o", markersize=5)
+        centres, num, chosen = _in_bins(bearing, edges, option == boat)
+        axes.plot(centres, chosen / num, color=f"C{boat}", label=name, linewidth=2.0, marker="o", markersize=5)
         if is_known.any():
-            planned = known.sums(is_best[:, boat] / is_best.sum(1)) / known.num
-            axes.plot(known.centres, planned, color=f"C{boat}", linewidth=1.1, linestyle="--")
+            centres, num, planned = _in_bins(bearing[is_known], edges, is_best[:, boat] / is_best.sum(1))
+            axes.plot(centres, planned / num, color=f"C{boat}", linewidth=1.1, linestyle="--")
     if is_known.any():
         title += f" (best one in {is_best[np.arange(len(is_best)), option[is_known]].mean():.0%})"
-    axes.set(xlim=(0, 360), ylim=(-0.03, 1.2), xticks=bins.edges[::2], yticks=np.linspace(0.0, 1.0, 6))
+    axes.set(xlim=(0, 360), ylim=(-0.03, 1.2), xticks=edges[::2], yticks=np.linspace(0.0, 1.0, 6))
     dashed = "; dashed: oracle" if is_known.any() else ""
     axes.set_xlabel(f"the goal's bearing, degrees (0 to the right, 90 down){dashed}")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))

@@ -42,12 +42,11 @@ from torchrl.objectives import RNDLoss
 
 from hpamdp import keys
 from hpamdp.devices import Device, checked_device
-from hpamdp.messages import warn
 from hpamdp.policies.base import Bonus, Learner
 from hpamdp.policies.encoders.base import JoinedEncoders
 from hpamdp.policies.exploration.base import Explored
 from hpamdp.policies.exploration.new_states import NoveltyPolicy, RewardsNewStates
-from hpamdp.policies.exploration.options import CARDS, NoveltyOptions, _OfNetworks
+from hpamdp.policies.exploration.options import CARDS, NoveltyOptions
 from hpamdp.policies.shared.gradients import descend
 from hpamdp.policies.shared.hybrid_actor import hidden_layers
 from hpamdp.policies.shared.networks import OutputLinear
@@ -136,14 +135,7 @@ class Novelty(RewardsNewStates):
         """
         if self.options.in_plans == "disagreement" and not learner.card.knows_disagreement:
             raise SettingError(f"in_plans=disagreement: {type(learner).__name__} has no ensemble that predicts states")
-        asks_ensemble = learner.card.knows_disagreement and self.options.in_plans != "distillation"
-        if asks_ensemble:  # no error, since the learner of another option may have the networks
-            for name, setting in NoveltyOptions.model_fields.items():
-                value = getattr(self.options, name)
-                if _OfNetworks in setting.metadata and value != setting.default:
-                    bonus = f"{type(learner).__name__}, whose bonus is the disagreement of its ensemble"
-                    warn(f"exploration.{name}={value}: has no effect on {bonus}; in_plans=distillation has networks")
-        return asks_ensemble
+        return learner.card.knows_disagreement and self.options.in_plans != "distillation"
 
     def acting_policy(self, learner: Learner) -> TensorDictModuleBase:
         """Return the learner's policy, with the network if its plans need it."""
