@@ -17,7 +17,7 @@ from hpamdp.env.boatdock import harbour, physics, planner
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.gymnasium_adapter import BoatDock, BoatDockVector
 from hpamdp.env.boatdock.options import BoatDockOptions
-from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, BoatState, Rules
+from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, BoatState
 from hpamdp.env.state_columns import where
 from hpamdp.run.assemble import assemble
 
@@ -25,9 +25,9 @@ THREE = ["congruent", "incongruent1", "incongruent2"]
 SIDEWAYS = {"sideways": [0.0, 90.0, 180.0]}
 
 
-def made(boats=None, switch_cost=None, controllers=None) -> Rules:
+def made(boats=None, switch_cost=None, controllers=None) -> BoatDockOptions:
     controllers = CONTROLLER_DEGREES if controllers is None else controllers
-    return BoatDockOptions(boats=boats, switch_cost=switch_cost, controllers=controllers).rules
+    return BoatDockOptions(boats=boats, switch_cost=switch_cost, controllers=controllers)
 
 
 def layouts(num) -> tuple[harbour.Layout, torch.Tensor]:

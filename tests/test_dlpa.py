@@ -12,7 +12,8 @@ from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import physics, task
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.task import BoatState, Rules
+from hpamdp.env.boatdock.options import BoatDockOptions
+from hpamdp.env.boatdock.task import BoatState
 from hpamdp.env.state_columns import where
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
@@ -50,7 +51,7 @@ def boats(seen: torch.Tensor) -> BoatState:
 
 def true_model(state: torch.Tensor, discrete: torch.Tensor, unit: torch.Tensor) -> Prediction:
     """Predict a step of the boat task with its own rules."""
-    rules, row = Rules("congruent"), torch.arange(len(state)).int()
+    rules, row = BoatDockOptions(controller="congruent"), torch.arange(len(state)).int()
     rng = counter_rng.rng_key(counter_rng.seed_tensor(0), counter_rng.NOISE, row, torch.zeros_like(row))
     before = boats(state)
     duration = (unit + 1.0).clamp(0.0, physics.MAX_DURATION).gather(1, discrete.unsqueeze(1)).squeeze(1)

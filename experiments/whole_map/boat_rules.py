@@ -15,6 +15,7 @@ from hpamdp.env import counter_rng
 from hpamdp.env.batched_env import Action
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.task import (
     CENTRE,
     DOCK_RADIUS,
@@ -37,7 +38,6 @@ from hpamdp.env.boatdock.task import (
     TANK,
     TIME_LIMIT,
     BoatState,
-    Rules,
 )
 from hpamdp.env.counter_rng import RngKey
 
@@ -64,15 +64,16 @@ class TensorBoats(BoatDockEnv):
         return (state.fuel / TANK,)
 
 
-def direction_of(rules: Rules, controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
+def direction_of(rules: BoatDockOptions, controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
     """Return the unit direction (x, y) of a key with the boats of these rules, each `[*B]` float32.
 
     The other arguments are those of `harbour.direction`.
     """
-    if rules.boats is None:
+    own = rules.own_boats
+    if own is None:
         return harbour.direction(controller, keymap, key)
     row = controller * NUM_KEYS + key
-    every = [each for keys in rules.boats.directions for each in keys]
+    every = [each for keys in own.directions for each in keys]
     x, y = (torch.full(row.shape, each, device=row.device, dtype=torch.float32) for each in every[0])
     # As in `harbour.direction`, there is no gather.
     for number, (key_x, key_y) in enumerate(every[1:], start=1):
@@ -80,7 +81,7 @@ def direction_of(rules: Rules, controller: Tensor, keymap: Tensor, key: Tensor) 
     return x, y
 
 
-def start(episode: Tensor, rng: counter_rng.RngKey, rules: Rules) -> BoatState:
+def start(episode: Tensor, rng: counter_rng.RngKey, rules: BoatDockOptions) -> BoatState:
     """Return the boats at the start of episodes.
 
     Args:
@@ -121,7 +122,12 @@ def start(episode: Tensor, rng: counter_rng.RngKey, rules: Rules) -> BoatState:
 
 
 def act(
-    state: BoatState, option: Tensor | None, key: Tensor, duration: Tensor, rng: counter_rng.RngKey, rules: Rules
+    state: BoatState,
+    option: Tensor | None,
+    key: Tensor,
+    duration: Tensor,
+    rng: counter_rng.RngKey,
+    rules: BoatDockOptions,
 ) -> tuple[BoatState, Tensor]:
     """Return the boats after a press, as if no episode were over, and the rewards `[N]`.
 
@@ -148,9 +154,9 @@ def act(
             controller = option
         else:
             controller = torch.where(controller == NOT_CHOSEN, option, controller)
-    if max(rules.motor_noise) > 0.0:
-        deviation = torch.full(controller.shape, rules.motor_noise[0], device=controller.device, dtype=torch.float32)
-        for boat, noise in enumerate(rules.motor_noise[1:], start=1):
+    if max(rules.noises) > 0.0:
+        deviation = torch.full(controller.shape, rules.noises[0], device=controller.device, dtype=torch.float32)
+        for boat, noise in enumerate(rules.noises[1:], start=1):
             deviation = torch.where(controller == boat, noise, deviation)
         duration = duration * (deviation * counter_rng.normal(rng, first // 2 + MOTOR)).exp()
         duration = duration.clamp(max=MAX_DURATION)
@@ -176,7 +182,7 @@ def after_press(
     )
 
 
-def reward_of(before: BoatState, after: BoatState, rules: Rules) -> Tensor:
+def reward_of(before: BoatState, after: BoatState, rules: BoatDockOptions) -> Tensor:
     """Return the rewards of a step between two states, `[N]`."""
     is_success = after.outcome == SUCCESS
     final = torch.where(is_success, SUCCESS_REWARD * after.fuel / TANK, 0.0)
@@ -195,7 +201,7 @@ def _layout(state: BoatState) -> harbour.Layout:
     return harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
 
 
-def observe(state: BoatState, rng: counter_rng.RngKey | None, rules: Rules) -> Tensor:
+def observe(state: BoatState, rng: counter_rng.RngKey | None, rules: BoatDockOptions) -> Tensor:
     """Return the observations: `[N, 16]` with the entries SCALED_NAMES, or `[N, 14]` with OBSERVATION_NAMES.
 
     Args:

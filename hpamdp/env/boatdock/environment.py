@@ -113,7 +113,7 @@ class BoatDockEnv(KernelEnv[BoatState]):
                 f"{options.unlike_peoples()}: people kept one of their two controllers, so what they chose says "
                 "nothing here; leave it out"
             )
-        self.rules = options.rules
+        self.rules = options
         self.observation_names = task.observation_names(self.rules.observation)
         self._played = None if options.recording is None else _figures_of(options.recording, options.controller)
         if self._has_oracle:
@@ -169,7 +169,7 @@ class BoatDockEnv(KernelEnv[BoatState]):
         """
         same = tuple(range(num_controllers))
         orders = list(itertools.permutations(same)) if num_controllers <= _MOST_SWAPPED else [same]
-        noise = self.rules.motor_noise
+        noise = self.rules.noises
         return [order for order in orders if num_controllers == 1 or [noise[number] for number in order] == list(noise)]
 
     @property
@@ -200,7 +200,7 @@ class BoatDockEnv(KernelEnv[BoatState]):
 
     def _directions(self) -> list[list[Tensor]]:
         """Return the possible tables of the keys' directions for each controller, float64 `[3, 2]`."""
-        boats = self.rules.boats
+        boats = self.rules.own_boats
         if boats is not None:
             of_each = [[table] for table in torch.tensor(boats.directions, dtype=torch.float64)]
             is_fixed = self.rules.controller in boats.names
@@ -294,7 +294,7 @@ class BoatDockEnv(KernelEnv[BoatState]):
         """Return the pictures of one episode, in which the boat moves as it does in the task."""
         from hpamdp.env.boatdock import film  # only films need it
 
-        return film.film(track, fps, size, self.rules)
+        return film.film(track, fps, size, self.rules.own_boats, self.rules.switch_cost)
 
     def page(self, seed: int) -> BoatPage:
         """Return the page on which people dock boats.

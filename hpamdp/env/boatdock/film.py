@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics, rendering
 from hpamdp.env.boatdock.rendering import Leg, Scene
-from hpamdp.env.boatdock.task import MAX_PRESSES, Boats, BoatState, Rules
+from hpamdp.env.boatdock.task import MAX_PRESSES, Boats, BoatState
 
 
 class Engine(NamedTuple):
@@ -28,7 +28,8 @@ def film(
     track: Sequence[Mapping[str, Tensor]],
     fps: float,
     size: int,
-    rules: Rules | None = None,
+    boats: Boats | None = None,
+    switch_cost: float | None = None,
     engine: Engine | None = None,
 ) -> Iterator[np.ndarray]:
     """Yield the pictures of one episode, uint8 `[size, size, 3]` each, from its start to its end.
@@ -37,19 +38,19 @@ def film(
         track: the states at the start and after every press, columns `[1]`. Columns outside `BoatState` are ignored.
         fps: pictures per second.
         size: width and height of a picture, px.
-        rules: rules of the environment. If None, the default ones.
+        boats: boats of the environment. If None, people's two.
+        switch_cost: fuel (s) of a change of boats. If None, there is none.
         engine: how the boat moves. If None, as people's boats.
     """
-    rules = Rules() if rules is None else rules
     engine = Engine() if engine is None else engine
     states = [BoatState(*(columns[name].double() for name in BoatState._fields)) for columns in track]
-    scene = _scene(states[0], states[min(1, len(states) - 1)], rules.boats)
+    scene = _scene(states[0], states[min(1, len(states) - 1)], boats)
     yield rendering.draw(scene, size)
     late = 0.0  # seconds from the end of the last press to the next picture
     for before, after in itertools.pairwise(states):
         if before.outcome.item() != physics.SAILING:
             break
-        before = before._replace(fuel=rendering.fuel_at_press(before, after, rules.switch_cost))
+        before = before._replace(fuel=rendering.fuel_at_press(before, after, switch_cost))
         length = math.hypot((after.x - before.x).item(), (after.y - before.y).item())
         burnt = (before.fuel - after.fuel).clamp(min=0.0)  # how long the key was down
         seconds = physics.time_at(burnt, burnt.new_tensor([length]), *engine).item()

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock.numpy_boats import action_space, observation_space
-from hpamdp.env.boatdock.task import Rules
+from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.gymnasium_form import VectorForm
 
 
@@ -21,7 +21,7 @@ class BoatForm(VectorForm):
         rules: their rules.
     """
 
-    def __init__(self, env: PAMDPEnv, rules: Rules) -> None:
+    def __init__(self, env: PAMDPEnv, rules: BoatDockOptions) -> None:
         super().__init__(env)
         self._has_choice = rules.controller == "choose"
         self.observation_space = observation_space(rules)

@@ -45,9 +45,8 @@ class BoatDock(GymnasiumAdapter):
         render_mode: Literal["rgb_array"] | None = None,
         **settings: Any,
     ) -> None:
-        rules = BoatDockOptions.of(options, settings).rules
-        super().__init__(NumpyBoats(rules, (), action_format), render_mode)
-        self._rules = rules
+        self._rules: BoatDockOptions = BoatDockOptions.of(options, settings)
+        super().__init__(NumpyBoats(self._rules, (), action_format), render_mode)
         self.own_time_limit = task.MAX_PRESSES
 
     def _draw(self) -> np.ndarray:
@@ -62,7 +61,7 @@ class BoatDock(GymnasiumAdapter):
                 heading=(state.velocity_x.item(), state.velocity_y.item()),
                 legs=tuple(rendering.leg(*pair, self._rules.switch_cost) for pair in itertools.pairwise(self._track)),
                 keymap=state.keymap.item(),
-                boats=self._rules.boats,
+                boats=self._rules.own_boats,
                 **self._problem.info(),
             )
         )
@@ -97,5 +96,5 @@ class BoatDockVector(GymnasiumVectorAdapter):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **settings: Any,
     ) -> None:
-        rules = BoatDockOptions.of(options, settings).rules
+        rules = BoatDockOptions.of(options, settings)
         super().__init__(NumpyBoats(rules, (num_envs,), action_format), num_envs, autoreset_mode)

@@ -27,7 +27,6 @@ from hpamdp.env.boatdock.task import (
     SUCCESS,
     SUCCESS_REWARD,
     TANK,
-    Rules,
     unit_directions,
 )
 

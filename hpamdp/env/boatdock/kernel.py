@@ -17,7 +17,7 @@ import numpy as np
 from numba import int32
 
 from hpamdp.env.boatdock import task
-from hpamdp.env.boatdock.task import Rules
+from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.kernels import (
     ACT_OR_RESTART,
     EPISODE_STREAM,
@@ -522,14 +522,15 @@ def advance(
     return -1
 
 
-def settings_of(rules: Rules) -> list[float]:
+def settings_of(rules: BoatDockOptions) -> list[float]:
     """Return the boats' own settings for the kernel."""
     special = {"choose": task.NOT_CHOSEN, "random": RANDOM}
     chosen = rules.controller
     boats: np.ndarray = np.zeros((len(rules.names), NUM_BOAT_SETTINGS))
-    boats[:, 0] = rules.motor_noise
-    if rules.boats is not None:
-        boats[:, 1:] = np.array(rules.boats.directions).reshape(len(rules.names), -1)
+    boats[:, 0] = rules.noises
+    own = rules.own_boats
+    if own is not None:
+        boats[:, 1:] = np.array(own.directions).reshape(len(rules.names), -1)
     return [
         special[chosen] if chosen in special else rules.names.index(chosen),
         RANDOM if rules.keymap == "random" else rules.keymap,

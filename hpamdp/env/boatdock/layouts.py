@@ -6,10 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hpamdp.env.boatdock.task import CENTRE, DOCK_RADIUS, HARBOUR_RADIUS, Rules
+from hpamdp.env.boatdock.options import BoatDockOptions
+from hpamdp.env.boatdock.task import CENTRE, DOCK_RADIUS, HARBOUR_RADIUS
 
 
-def layout_columns(given: Mapping[str, np.ndarray], num_envs: int, rules: Rules) -> dict[str, np.ndarray]:
+def layout_columns(given: Mapping[str, np.ndarray], num_envs: int, rules: BoatDockOptions) -> dict[str, np.ndarray]:
     """Check a layout and return the columns `[N]` of the state that it sets.
 
     Args:

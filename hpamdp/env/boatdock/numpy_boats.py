@@ -22,7 +22,8 @@ from gymnasium import spaces
 
 from hpamdp.env.boatdock import kernel, task
 from hpamdp.env.boatdock.layouts import layout_columns
-from hpamdp.env.boatdock.task import BoatState, Rules
+from hpamdp.env.boatdock.options import BoatDockOptions
+from hpamdp.env.boatdock.task import BoatState
 from hpamdp.env.gymnasium_adapter import NumpyRows
 from hpamdp.env.gymnasium_checks import as_array, describe, reset_options
 from hpamdp.env.kernel_rows import KernelRows, invalid_choice
@@ -36,7 +37,7 @@ _OPTION_SHAPES = {"start": (2,), "goal": (2,), "controller": (), "keymap": ()}
 _LARGEST_NORMAL = 6.0
 
 
-def action_space(rules: Rules, action_format: ActionFormat) -> spaces.Dict | spaces.Tuple:
+def action_space(rules: BoatDockOptions, action_format: ActionFormat) -> spaces.Dict | spaces.Tuple:
     """Return the action space of one boat. The module's docstring explains the formats."""
     has_choice = rules.controller == "choose"
     option = spaces.Discrete(len(rules.names))
@@ -51,7 +52,7 @@ def action_space(rules: Rules, action_format: ActionFormat) -> spaces.Dict | spa
     return spaces.Tuple((option, key, durations) if has_choice else (key, durations))
 
 
-def observation_space(rules: Rules) -> spaces.Box:
+def observation_space(rules: BoatDockOptions) -> spaces.Box:
     """Return the observation space of one boat, float32, with the bounds that layouts, motion and noise can reach."""
     is_pixels = rules.observation == "pixels"
     unit = 1.0 if is_pixels else 1.0 / task.HARBOUR_RADIUS
@@ -74,7 +75,7 @@ def observation_space(rules: Rules) -> spaces.Box:
     return spaces.Box(low, high, dtype=np.float32)
 
 
-def boat_rows(num_boats: int, rules: Rules) -> KernelRows:
+def boat_rows(num_boats: int, rules: BoatDockOptions) -> KernelRows:
     """Return the rows of boats, moved by the kernel."""
     has_choice = rules.controller == "choose"
     return KernelRows(
@@ -99,7 +100,7 @@ class NumpyBoats(NumpyRows):
 
     final_infos = ("score",)
 
-    def __init__(self, rules: Rules, batch: tuple[int, ...], action_format: ActionFormat) -> None:
+    def __init__(self, rules: BoatDockOptions, batch: tuple[int, ...], action_format: ActionFormat) -> None:
         if action_format not in ("dict", "tuple"):
             raise ValueError(f"BoatDock: action_format={action_format!r}, but must be dict or tuple")
         num_boats = batch[0] if batch else 1

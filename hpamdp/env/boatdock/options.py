@@ -17,7 +17,6 @@ from hpamdp.env.boatdock.task import (
     Boats,
     ObservationForm,
     RewardForm,
-    Rules,
 )
 from hpamdp.env.facts import ProblemFacts, ProblemOptions
 from hpamdp.settings import Fraction, FromList
@@ -73,24 +72,17 @@ class BoatDockOptions(ProblemOptions):
         return self.boats is None and self.switch_cost is None
 
     @property
-    def rules(self) -> Rules:
-        """The settings as the boats' rules take them."""
-        boats = None
-        if self.boats is not None:
-            known = CONTROLLER_DEGREES | self.controllers
-            boats = Boats(self.boats, tuple(known[name] for name in self.boats))
-        noise = self.motor_noise if isinstance(self.motor_noise, tuple) else (self.motor_noise,) * len(self.names)
-        return Rules(
-            controller=self.controller,
-            keymap=self.keymap,
-            reward=self.reward,
-            observation=self.observation,
-            motor_noise=noise,
-            sensor_noise=self.sensor_noise,
-            slip=self.slip,
-            boats=boats,
-            switch_cost=self.switch_cost,
-        )
+    def own_boats(self) -> Boats | None:
+        """The controllers with their directions; None: people's."""
+        if self.boats is None:
+            return None
+        known = CONTROLLER_DEGREES | self.controllers
+        return Boats(self.boats, tuple(known[name] for name in self.boats))
+
+    @property
+    def noises(self) -> tuple[float, ...]:
+        """The `motor_noise` of each controller."""
+        return self.motor_noise if isinstance(self.motor_noise, tuple) else (self.motor_noise,) * len(self.names)
 
     def facts(self, title: str) -> ProblemFacts:
         """Return what these settings tell of the problem, which errors call `title`."""

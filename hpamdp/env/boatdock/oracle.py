@@ -7,7 +7,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics, planner
-from hpamdp.env.boatdock.task import BoatState, Rules
+from hpamdp.env.boatdock.options import BoatDockOptions
+from hpamdp.env.boatdock.task import BoatState
 from hpamdp.env.planning_oracle import PlanningOracle
 
 
@@ -25,7 +26,7 @@ class BoatDockOracle(PlanningOracle):
 
     saved_names = ("keys", "durations")
 
-    def __init__(self, num_envs: int, rules: Rules, device: torch.device) -> None:
+    def __init__(self, num_envs: int, rules: BoatDockOptions, device: torch.device) -> None:
         num_controllers = len(rules.names)
         shape = (num_envs, num_controllers if rules.controller == "choose" else 1, planner.MAX_PRESSES)
         super().__init__(shape, harbour.NUM_KEYS, (0.0, physics.MAX_DURATION), num_controllers, device)
@@ -44,6 +45,6 @@ class BoatDockOracle(PlanningOracle):
         """Return the best controller and the next press of each plan."""
         # Plan again if noise may have moved the boat, or if a change of controllers takes fuel, which alters the other
         # controllers' plans.
-        if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0 or self.rules.switch_cost is not None:
+        if max(self.rules.noises) > 0.0 or self.rules.slip > 0.0 or self.rules.switch_cost is not None:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))
         return super().read(state)

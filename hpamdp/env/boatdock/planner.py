@@ -39,6 +39,7 @@ from hpamdp.env.boatdock.harbour import (
     fuel_fraction,
     score_of,
 )
+from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.physics import (
     DOCK_RADIUS,
     HARBOUR_RADIUS,
@@ -48,7 +49,7 @@ from hpamdp.env.boatdock.physics import (
     press_for,
     total_distance,
 )
-from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Boats, BoatState, Rules
+from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Boats, BoatState
 from hpamdp.env.kernels import sources
 from hpamdp.files import kept_in_cache
 
@@ -360,7 +361,7 @@ def best_plans(layout: Layout, keymap: Tensor) -> Plan:
     return Plan(*(field.unflatten(0, (len(keymap), num_options)) for field in plan))
 
 
-def plans_of_options(rules: Rules, state: BoatState) -> Plan:
+def plans_of_options(rules: BoatDockOptions, state: BoatState) -> Plan:
     """Return the best plan of each option from the boats' current places of rest, fields `[N, num_options, ...]`.
 
     A plan may begin with a press of 0 s: the option then does nothing with its own controller. This happens with a
@@ -383,7 +384,7 @@ def plans_of_options(rules: Rules, state: BoatState) -> Plan:
     return Plan(*(torch.stack(fields, 1) for fields in zip(*found, strict=True)))
 
 
-def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
+def best_scores(rules: BoatDockOptions, layout: Layout, keymap: Tensor) -> Tensor:
     """Return the best score with each controller, from the start with a full tank, `[N, num_controllers]`.
 
     With a `switch_cost`, it is the best score of a plan that begins with that controller.
@@ -402,7 +403,7 @@ def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
     return torch.from_numpy(scores).to(keymap.device)
 
 
-def _best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
+def _best_scores(rules: BoatDockOptions, layout: Layout, keymap: Tensor) -> Tensor:
     if rules.are_peoples:
         return best_plans(layout, keymap).score
     fuel = torch.full_like(layout.start_x, TANK)
@@ -429,7 +430,14 @@ _FEWER = 1e-4  # seconds by which a plan with more presses must be better
 
 
 def _plans_with_boats(
-    rules: Rules, x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, fuel: Tensor, held: Tensor, keymap: Tensor
+    rules: BoatDockOptions,
+    x: Tensor,
+    y: Tensor,
+    goal_x: Tensor,
+    goal_y: Tensor,
+    fuel: Tensor,
+    held: Tensor,
+    keymap: Tensor,
 ) -> Plan:
     """Return the best plan that begins with each controller, for any number of controllers and with changes at a cost.
 
@@ -441,7 +449,7 @@ def _plans_with_boats(
         held: current controllers, or NOT_CHOSEN, `[N]`.
     """
     peoples = Boats(CONTROLLERS, (CONTROLLER_DEGREES["incongruent1"], CONTROLLER_DEGREES["congruent"]))
-    directions = (peoples if rules.boats is None else rules.boats).directions
+    directions = (rules.own_boats or peoples).directions
     sets = [tuple(sorted(each)) for each in directions]
     kinds = list(dict.fromkeys(sets))
     kind_of = [kinds.index(each) for each in sets]

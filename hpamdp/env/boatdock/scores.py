@@ -6,12 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.physics import OUTCOMES, SAILING
 from hpamdp.env.boatdock.reference import human_normalised
-from hpamdp.env.boatdock.task import FAILURE_REWARD, Rules
+from hpamdp.env.boatdock.task import FAILURE_REWARD
 
 
-def measure_boats(played: Mapping[str, np.ndarray], controller: str, rules: Rules) -> dict[str, float]:
+def measure_boats(played: Mapping[str, np.ndarray], controller: str, rules: BoatDockOptions) -> dict[str, float]:
     """Return the fractions of outcomes, the ceiling and the figures of the choice.
 
     For every evaluation:

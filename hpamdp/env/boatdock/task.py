@@ -142,30 +142,6 @@ class Boats(NamedTuple):
         return tuple(unit_directions(each) for each in self.degrees)
 
 
-class Rules(NamedTuple):
-    """The rules of an environment. The settings of BoatDockEnv explain them."""
-
-    controller: str = "choose"
-    keymap: Literal[1, 2, "random"] = 1
-    reward: RewardForm = "paper"
-    observation: ObservationForm = "scaled"
-    motor_noise: tuple[float, ...] = (0.0, 0.0)  # one value per boat
-    sensor_noise: float = 0.0
-    slip: float = 0.0
-    boats: Boats | None = None  # if None, people's two
-    switch_cost: float | None = None  # seconds of fuel; if None, a boat is kept for the episode
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the boats, in the order of their numbers."""
-        return CONTROLLERS if self.boats is None else self.boats.names
-
-    @property
-    def are_peoples(self) -> bool:
-        """Whether the boats are people's two and the chosen one is kept for the episode."""
-        return self.boats is None and self.switch_cost is None
-
-
 class BoatState(NamedTuple):
     """The state of N boats, columns `[N]`: positions in px from the harbour's centre, fuel in seconds, int32 integers.
 

@@ -48,12 +48,12 @@ def _trip(states: Sequence[SessionState], fps: float, size: int, options: Unseen
     degrees = torch.rad2deg(torch.atan2(own.directions[0, :, 1], own.directions[0, :, 0])).tolist()
     name = f"trip {int(states[0].trip) + 1} of {options.trips}"
     name += f", boat {boat + 1}" if options.boats > 1 else ""
-    shown = task.Rules(boats=task.Boats((name,), (tuple(degrees),)))
+    shown = task.Boats((name,), (tuple(degrees),))
     track = [_as_boat(states[0])]
     for after in states[1:]:
         track.append(_pressed(track[-1], after, own))
     columns = [{key: column.double() for key, column in state._asdict().items()} for state in track]
-    yield from boat_film.film(columns, fps, size, shown, Engine(own.strength.item(), own.glide.item()))
+    yield from boat_film.film(columns, fps, size, shown, engine=Engine(own.strength.item(), own.glide.item()))
 
 
 def _as_boat(state: SessionState) -> task.BoatState:

@@ -10,6 +10,7 @@ import torch
 
 from hpamdp import __version__
 from hpamdp.env.boatdock import harbour, physics, planner
+from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.reference import (
     BEST_PERSON,
@@ -18,7 +19,7 @@ from hpamdp.env.boatdock.reference import (
     HUMAN_SUCCESS_BY_BLOCK,
     OFFSET_EDGES,
 )
-from hpamdp.env.boatdock.task import MAX_PRESSES, Boats, Outcome, Rules
+from hpamdp.env.boatdock.task import MAX_PRESSES, Outcome
 from hpamdp.env.play_page import EpisodeError
 
 BLOCK, NUM_BLOCKS = 60, 6  # as in the recording of people
@@ -71,8 +72,8 @@ class BoatPage:
     }
     shows_agents = True
 
-    def __init__(self, seed: int, rules: Rules | None = None) -> None:
-        other = other_setting({} if rules is None else rules._asdict(), _OF_PEOPLE)
+    def __init__(self, seed: int, rules: BoatDockOptions | None = None) -> None:
+        other = other_setting({} if rules is None else dict(rules), _OF_PEOPLE)
         if other is not None:
             raise ValueError(f"BoatDockEnv: {other}")
         self.seed = seed
@@ -179,6 +180,6 @@ def other_setting(settings: Mapping[str, Any], of_page: Mapping[str, Any]) -> st
     for name, value in of_page.items():
         given = settings.get(name, value)
         if given != value and given != [value, value] and given != (value, value):
-            named = list(given.names) if isinstance(given, Boats) else given
+            named = list(given) if isinstance(given, tuple) else given
             return f"{name}={named}, but the page has {'none' if value is None else value}"
     return None
