@@ -66,6 +66,16 @@ def random_discrete(
     return torch.stack(drawn, -1)
 
 
+def random_action(specs: PAMDPSpecs, td: TensorDictBase) -> TensorDictBase:
+    """Write a uniformly random allowed action: discrete `[*B]` and parameters `[*B, num_parameters]`."""
+    device = td.get(keys.OBSERVATION).device
+    unit_parameters = 2.0 * torch.rand(*td.batch_size, specs.num_parameters, device=device, dtype=torch.float32) - 1.0
+    allowed = specs.allowed(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
+    discrete = random_discrete(specs, td.batch_size, allowed, device, td.get(keys.PAIR_MASK, None))
+    parameters = specs.from_unit(unit_parameters, td)
+    return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
+
+
 def zero_fixed(values: Tensor, is_fixed: Tensor | None) -> Tensor:
     """Return values `[*B, num_parameters]`, set to 0 where the state leaves a parameter a single value.
 

@@ -25,7 +25,7 @@ from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.task import BoatState
 from hpamdp.env.gymnasium_adapter import NumpyRows
-from hpamdp.env.gymnasium_checks import as_array, describe, reset_options
+from hpamdp.env.gymnasium_checks import as_array, describe, parameter_arrays, reset_options
 from hpamdp.env.kernel_rows import KernelRows, invalid_choice
 
 ActionFormat = Literal["dict", "tuple"]
@@ -188,13 +188,8 @@ class NumpyBoats(NumpyRows):
             names = ", ".join(self._leaf_names)
             raise ValueError(f"step: the action must be a tuple ({names}), but is {describe(action)}")
         named = dict(zip(self._leaf_names, action, strict=True))
-        durations = named["duration"]
-        if not isinstance(durations, (tuple, list)) or len(durations) != task.NUM_KEYS:
-            allowed = f"a tuple of length {task.NUM_KEYS}"
-            raise ValueError(f"step: duration must be {allowed}, but is {describe(durations)}")
-        named["duration"] = np.concatenate(
-            [as_array("step: duration", d, (*self._batch, 1)) for d in durations], axis=-1
-        )
+        durations = parameter_arrays(named["duration"], (1,) * task.NUM_KEYS, self._batch)
+        named["duration"] = np.concatenate(durations, axis=-1)
         return named
 
     def _integers(self, name: str, value: Any) -> np.ndarray:

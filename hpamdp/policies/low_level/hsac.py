@@ -46,11 +46,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from hpamdp import keys
 from hpamdp.acting import is_greedy
 from hpamdp.policies.base import States
 from hpamdp.policies.low_level.hsac_options import CARDS, HSACOptions
-from hpamdp.policies.masks import masked_logits, random_discrete, zero_fixed
+from hpamdp.policies.masks import masked_logits, random_action, zero_fixed
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.hybrid_actor import DistributionActor, HybridActor, HybridPolicy
@@ -119,14 +118,8 @@ class HSACPolicy(HybridPolicy):
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         if is_greedy() or not self.is_random:
             return super().forward(td)
-        observation = td.get(keys.OBSERVATION)
-        shape, device = observation.shape[:-1], observation.device
         self.perception.see(td)
-        unit_parameters = 2.0 * torch.rand(*shape, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
-        allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
-        discrete = random_discrete(self.specs, shape, allowed, device)
-        parameters = self.specs.from_unit(unit_parameters, td)
-        return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
+        return random_action(self.specs, td)
 
 
 class HSAC(ReplayLearner):
@@ -186,12 +179,6 @@ class HSAC(ReplayLearner):
         polyak_update(self.target_critics, self.critics, self.options.tau)
         polyak_update(self.target_perception, self.perception, self.options.tau)
         return scalars
-
-    def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the squared distance from r + discount V'(s'), and scalars."""
-        q = self.critics.of_discrete(self.features(sample), sample["discrete"], sample["unit"])
-        loss = (q - self.target(sample)).square().mean(-1).sum()
-        return loss, {"critic": loss, "q": q.mean()}
 
     def actor_loss(
         self, state: Tensor, allowed: Tensor | None, is_fixed: Tensor | None = None, *stored: Tensor

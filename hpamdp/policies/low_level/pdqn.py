@@ -267,17 +267,6 @@ class PDQN(ReplayLearner):
             polyak_update(self.target_perception, self.perception, self.options.critic_tau)
         return scalars
 
-    def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the squared TD error, summed over the critics.
-
-        The target is r + discount * V(s'), where V is `value`. A subclass may override `target`, which returns
-        it as `[B]`, given a sample with `state`, `discrete`, `unit` (the executed parameters in [-1, 1]), `reward`,
-        `next_state` and `discount`. `sample` also has the masks if the problem has any, and the options.
-        """
-        q = self.critics.of_discrete(self.features(sample), sample["discrete"], sample["unit"])
-        loss = (q - self.target(sample)).square().mean(-1).sum()  # q is [num_critics, B]
-        return loss, {"critic": loss, "q": q.mean()}
-
     @torch.no_grad()
     def value(self, states: States, *, is_target: bool = False) -> Tensor:
         """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`; the sum over the components.

@@ -72,6 +72,7 @@ class ReplayLearner(Learner):
     perception: Perception
     target_perception: Perception
     links: HistoryLinks | None
+    critics: Any
 
     def __init__(self, specs: PAMDPSpecs, *, device: Device = "cpu", options: Any = None, **settings: Any) -> None:
         super().__init__(specs)
@@ -184,6 +185,17 @@ class ReplayLearner(Learner):
         `max_grad_norm`. See `Descent.step`.
         """
         return self.descent.step(self.optimizers[name], loss_of, *inputs, max_grad_norm=self.max_grad_norm)
+
+    def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the squared TD error, summed over the critics, and scalars.
+
+        The target is r + discount * V(s'), where V is `value`. A subclass may override `target`, which returns
+        it as `[B]`, given a sample with `state`, `discrete`, `unit` (the executed parameters in [-1, 1]), `reward`,
+        `next_state` and `discount`. `sample` also has the masks if the problem has any, and the options.
+        """
+        q = self.critics.of_discrete(self.features(sample), sample["discrete"], sample["unit"])
+        loss = (q - self.target(sample)).square().mean(-1).sum()  # q is [num_critics, B]
+        return loss, {"critic": loss, "q": q.mean()}
 
     def compile_updates(self) -> None:
         """Compile the gradients of each loss, at the first gradient step that needs it.
