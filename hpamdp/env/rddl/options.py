@@ -42,10 +42,6 @@ class RDDLOptions(SimulatorOptions, RDDLRules):
     observation_scaling: Literal["running", "none"] = "running"
     """`running`: to mean 0 and standard deviation 1; `none`: not."""
     reward_scaling: PositiveFraction | None = 0.99
-    """Divide rewards in training by the running standard deviation of the return with this discount.
-
-    If null, rewards are not scaled.
-    """
     staggered: bool = False
     """Truncate the first episode of each copy in training after another number of steps.
 

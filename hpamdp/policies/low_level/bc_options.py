@@ -20,7 +20,6 @@ class BCOptions(HeadOptions, ScaleOptions, BufferOptions):
     buffer_size: PositiveInt = 200_000
     """Largest number of transitions that are kept."""
     batch_size: PositiveInt = 512
-    """Transitions in an update."""
     lr: LearningRate = 1e-3
     """Learning rate of AdamW."""
     weight_decay: NonNegativeFloat = 1e-2

@@ -25,7 +25,6 @@ class HSACOptions(HeadOptions, ReplayMemoryOptions, ActorCriticOptions, TargetRa
     """Settings of `HSAC`."""
 
     batch_size: PositiveInt = 256
-    """Transitions in an update."""
     initial_parameters: InitialParameters = "none"
     """Initial means: `domain` takes the problem's own initial parameters, if it has any; `none` takes mid-range."""
     min_scale: PositiveFloat = 0.005

@@ -62,7 +62,6 @@ class HyAROptions(TargetRateOptions, SearchingActorOptions):
     lr_final_fraction: PositiveFraction = 0.1
     """Fraction of the three learning rates that is left after `lr_steps`; 1 keeps them constant."""
     epsilon_steps: Annotated[NonNegativeInt, Schedule()] = 15_000
-    """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
     embedding_dim: PositiveInt = 6
     """Dimension of a discrete action's embedding e."""
     latent_dim: PositiveInt | None = None

@@ -26,7 +26,6 @@ class IQLOptions(HeadOptions, ActorCriticOptions, ScaleOptions):
     warmup_steps: Annotated[NonNegativeInt, OwnSteps()] = 1000
     """Steps before the first update; the policy explores by its own standard deviation."""
     batch_size: PositiveInt = 256
-    """Transitions in an update."""
     expectile: Expectile = 0.8
     """Expectile of the actions' values that V estimates: 0.5 is their mean, 1 their maximum."""
     temperature: PositiveFloat = 10.0

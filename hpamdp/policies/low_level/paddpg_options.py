@@ -32,7 +32,6 @@ class PADDPGOptions(ActorCriticOptions, TargetRateOptions, EpsilonOptions):
     initial_parameters: InitialParameters = "domain"
     """`domain` adds the problem's own initial parameters, if it has any, by a frozen layer; `none` adds nothing."""
     actor_lr: LearningRate = 1e-4
-    """Learning rate of the actor."""
     max_grad_norm: PositiveFloat | None = 10.0
     """Largest gradient norm. If null, no limit."""
     parameter_noise: NonNegativeFloat = 0.1

@@ -41,7 +41,6 @@ class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
     on from episode to episode.
     """
     epsilon_steps: Annotated[NonNegativeInt, OnlyWith("epsilon_episodes", None), OwnSteps(), Schedule()] = 40_000
-    """The learner's own steps, after its warm-up, within which the probability of a random action falls."""
     epsilon_episodes: Annotated[PositiveInt | None, OwnSteps()] = None
     """Episodes that end with the learner's own steps, within which the probability of a random action falls.
 

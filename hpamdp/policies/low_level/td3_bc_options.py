@@ -42,7 +42,6 @@ class TD3BCOptions(ActorCriticOptions):
     warmup_steps: Annotated[NonNegativeInt, OwnSteps()] = 1000
     """Steps before the first update."""
     batch_size: PositiveInt = 256
-    """Transitions in an update."""
 
 
 CARDS = {

@@ -36,7 +36,6 @@ class DLPAOptions(ReplayMemoryOptions, PlanningOptions):
     rho: PositiveFraction = 0.5
     """Step h of a training window has weight rho^h."""
     buffer_size: PositiveInt = 100_000
-    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
     batch_size: PositiveInt = 256
     """Windows in an update."""
     updates_per_step: Annotated[PositiveFloat, OwnSteps()] = 1.0

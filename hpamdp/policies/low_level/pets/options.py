@@ -33,7 +33,6 @@ class PETSOptions(SequenceSearchOptions, PlanningOptions, ReplayMemoryOptions):
     batch_size: PositiveInt = 64
     """Steps in a member's minibatch."""
     buffer_size: PositiveInt = 50_000
-    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
     augment: Literal["auto"] | bool = "auto"
     """Use the symmetry and the geometry that the problem declares: `auto` if there are any; true requires them."""
     num_members: PositiveInt = 5
