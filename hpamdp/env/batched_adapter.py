@@ -33,7 +33,7 @@ from hpamdp.env.gymnasium_adapter import (
     NumpyRows,
     RenderMode,
 )
-from hpamdp.env.gymnasium_checks import as_array, describe, parameter_arrays
+from hpamdp.env.gymnasium_checks import describe, parameter_arrays
 from hpamdp.env.gymnasium_form import VectorForm
 from hpamdp.env.kernel_rows import KernelRows, Results
 from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW
@@ -203,8 +203,8 @@ class NumpyBatchedEnv(NumpyRows):
             observations = self._env.shown(torch.from_numpy(observations)).numpy()
         return observations.reshape(-1, *self._picture)
 
-    def _invalid(self, row: int, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> ValueError:
-        return self._env.invalid_action(row, option, discrete, parameters)
+    def _invalid(self, row: int, leaves: tuple[Any, Any, Any]) -> ValueError:
+        return self._env.invalid_action(row, leaves)
 
     def infos(self) -> dict[str, np.ndarray]:
         """Return the infos, `[N]` each."""
@@ -235,13 +235,11 @@ class NumpyBatchedEnv(NumpyRows):
             raise ValueError(f"step: the action must be a tuple ({', '.join(names)}), but is {describe(action)}")
         *options, discrete, parameters = action
         dims = self._env.parameter_dims
-        given = as_array("step: discrete", discrete, self._batch, is_integer=True).astype(np.int64)
         arrays = parameter_arrays(parameters, dims, self._batch)
         joined = np.empty((self._env.num_envs, sum(dims)), np.float32)
         np.concatenate(arrays, axis=-1, out=joined if self._batch else joined[0], casting="same_kind")
-        chosen = [as_array("step: option", each, self._batch, is_integer=True).astype(np.int64) for each in options]
-        option = chosen[0].reshape(self._env.num_envs) if chosen else None
-        return option, given.reshape(self._env.num_envs), joined
+        option = self._integers("option", options[0]) if options else None
+        return option, self._integers("discrete", discrete), joined
 
 
 def _refuse_seed(settings: Mapping[str, Any]) -> None:

@@ -538,7 +538,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             is_idle = is_idle | ~mask
         after, reward, is_valid = self.advance(before, *leaves, is_idle)
         if not is_valid.all():
-            raise self.invalid_action(int((~is_valid).nonzero()[0]), *leaves)
+            raise self.invalid_action(int((~is_valid).nonzero()[0]), leaves)
         self._state = after
         return self.read().set(keys.REWARD, reward.unsqueeze(-1))
 
@@ -601,20 +601,12 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             restarts=restarts,
         )
         if isinstance(results, int):
-            raise self.invalid_action(results, *leaves)
+            raise self.invalid_action(results, leaves)
         return results
 
-    def invalid_action(self, row: int, option: Any, discrete: Any, parameters: Any) -> ValueError:
-        """Return the error for the action of a row, given tensors or arrays of all rows."""
-        return invalid_choice(
-            row,
-            option=None if option is None else option[row].item(),
-            discrete=discrete[row].item(),
-            parameters=parameters[row].tolist(),
-            parameter_dims=self.parameter_dims,
-            num_options=len(self.option_names),
-            names=self.action_names,
-        )
+    def invalid_action(self, row: int, leaves: tuple[Any, Any, Any]) -> ValueError:
+        """Return the error for the action of a row, given the tensors or arrays of all rows."""
+        return invalid_choice(row, leaves, self.parameter_dims, len(self.option_names), self.action_names)
 
     def read(self) -> TensorDict:
         """Return what is seen of the states, without a reward."""

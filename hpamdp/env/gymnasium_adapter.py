@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from hpamdp.env.gymnasium_checks import check_render_mode, reset_options
+from hpamdp.env.gymnasium_checks import as_array, check_render_mode, reset_options
 from hpamdp.env.kernel_rows import KernelRows
 from hpamdp.env.kernels import OUTCOME_ROW
 
@@ -70,7 +70,7 @@ class NumpyRows:
         leaves = self._leaves(action)
         results = self.rows.act_or_restart(*leaves) if restarts else self.rows.act(*leaves)
         if isinstance(results, int):
-            raise self._invalid(results, *leaves)
+            raise self._invalid(results, leaves)
         return After(results.observations[0], results.rewards, results.flags[0, 1], results.flags[0, 2])
 
     @property
@@ -100,8 +100,15 @@ class NumpyRows:
         """Check an action's structure, types and shapes; return options, discrete actions and parameters."""
         raise NotImplementedError
 
-    def _invalid(self, row: int, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> ValueError:
-        """Return the error for the action of a row."""
+    def _integers(self, name: str, value: Any) -> np.ndarray:
+        """Return a leaf of integers, int64 `[N]`."""
+        array = as_array(f"step: {name}", value, self._batch, is_integer=True)
+        if array.dtype != np.int64 or not array.flags.c_contiguous:
+            array = np.ascontiguousarray(array, np.int64)
+        return array if self._batch else array.reshape(1)
+
+    def _invalid(self, row: int, leaves: tuple[Any, Any, Any]) -> ValueError:
+        """Return the error for the action of a row, given the leaves of all rows."""
         raise NotImplementedError
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -172,10 +172,7 @@ class KernelRows:
 
 def invalid_choice(
     row: int,
-    *,
-    option: int | None,
-    discrete: int,
-    parameters: Sequence[float],
+    leaves: tuple[Any, Any, Any],
     parameter_dims: Sequence[int],
     num_options: int,
     names: tuple[str, str],
@@ -184,17 +181,19 @@ def invalid_choice(
 
     Args:
         row: number of the row.
-        option, discrete, parameters: the action, with the parameters of all discrete actions.
+        leaves: option or None, discrete actions, and parameters of all discrete actions; tensors or arrays of all rows.
         parameter_dims: number of parameters of each discrete action.
         num_options: number of options.
         names: names of `discrete` and `parameters` in the message.
     """
+    of_row: list[Any] = [None if leaf is None else leaf[row].tolist() for leaf in leaves]
+    option, discrete, parameters = of_row
     values: dict[str, tuple[object, str]] = {}
     if option is not None:
         values["option"] = option, f"allowed 0 to {num_options - 1}"
     values[names[0]] = discrete, f"allowed 0 to {len(parameter_dims) - 1}"
     if 0 <= discrete < len(parameter_dims):
         first = sum(parameter_dims[:discrete])
-        own = list(parameters[first : first + parameter_dims[discrete]])
+        own = parameters[first : first + parameter_dims[discrete]]
         values[names[1]] = own, "those of the chosen action must be finite"
     return invalid_action(row, values)

@@ -120,16 +120,8 @@ class NumpyBoats(NumpyRows):
         """A copy of the boats' state."""
         return BoatState(*self.rows.floats.copy(), *self.rows.integers.copy())
 
-    def _invalid(self, row: int, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> ValueError:
-        return invalid_choice(
-            row,
-            option=None if option is None else option[row].item(),
-            discrete=discrete[row].item(),
-            parameters=parameters[row].tolist(),
-            parameter_dims=(1,) * task.NUM_KEYS,
-            num_options=len(self._rules.names),
-            names=("key", "durations"),
-        )
+    def _invalid(self, row: int, leaves: tuple[Any, Any, Any]) -> ValueError:
+        return invalid_choice(row, leaves, (1,) * task.NUM_KEYS, len(self._rules.names), ("key", "durations"))
 
     def infos(self) -> dict[str, np.ndarray]:
         """Return the infos, `[N]` each. `score` has a meaning only if the episode is over."""
@@ -191,9 +183,3 @@ class NumpyBoats(NumpyRows):
         durations = parameter_arrays(named["duration"], (1,) * task.NUM_KEYS, self._batch)
         named["duration"] = np.concatenate(durations, axis=-1)
         return named
-
-    def _integers(self, name: str, value: Any) -> np.ndarray:
-        array = as_array(f"step: {name}", value, self._batch, is_integer=True)
-        if array.dtype != np.int64 or not array.flags.c_contiguous:
-            array = np.ascontiguousarray(array, np.int64)
-        return array if self._batch else array.reshape(1)
