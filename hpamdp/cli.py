@@ -17,7 +17,7 @@ from typing import NoReturn
 import hydra
 import yaml
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -26,7 +26,7 @@ from hpamdp.children import protect_children, unprotect_children
 from hpamdp.config.command_line import CommandLine, completed, parse, saved_run
 from hpamdp.config.compose import conf_dir, job_overrides
 from hpamdp.config.errors import ConfigError, problems_explained
-from hpamdp.config.hydra_errors import explained, not_understood
+from hpamdp.config.hydra_errors import explained
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.imports import collector_paused
@@ -87,8 +87,6 @@ def _main() -> None:
             say(help_page(line, conf))
             return
         _run_hydra(line, conf)
-    except OverrideParseException as error:
-        _exit_with(not_understood(error.override))
     except ConfigError as error:
         _exit_with(str(error))
     except EnvironmentFaultError as error:  # of the user's own code: its lines of the traceback help, ours do not

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -119,8 +119,7 @@ def parse(argv: Sequence[str], conf: Path) -> CommandLine:
         conf: the folder of the yaml files.
 
     Raises:
-        ConfigError: a flag or a setting that does not exist.
-        OverrideParseException: a word is not in Hydra's grammar.
+        ConfigError: a flag or a setting does not exist, or a word is not in Hydra's grammar.
     """
     arguments = vars(_parser().parse_args(argv))
     words = arguments.pop("overrides")
@@ -192,9 +191,15 @@ def parsed_words(words: Sequence[str]) -> tuple[Override, ...]:
     """Return words as Hydra's grammar reads them.
 
     Raises:
-        OverrideParseException: a word is not in the grammar.
+        ConfigError: a word is not in the grammar. If its value is a text, the message gives the right form.
     """
-    return tuple(OverridesParser.create().parse_overrides(list(words)))
+    try:
+        return tuple(OverridesParser.create().parse_overrides(list(words)))
+    except OverrideParseException as error:
+        word = error.override
+        is_text = re.match(r"[+~]*[A-Za-z_@][\w.@/]*=.", word)
+        form = f", and a text with special characters as {as_text(word)}" if is_text else ""
+        raise ConfigError(f"{word}: {GRAMMAR}{form}") from error
 
 
 def _check_groups(line: CommandLine, conf: Path) -> None:

@@ -12,11 +12,11 @@ from typing import Any, TypeGuard
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.complaints import as_json, no_such
+from hpamdp.config.command_line import parsed_words
 from hpamdp.config.components import CALLBACK, GROUPS, TARGET, file_of
 from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.schema import Config, RunConfig, check_run, checked_config
@@ -357,8 +357,8 @@ def setting_of(word: str) -> str:
 def settings_in(word: str) -> list[str]:
     """Return the names of all settings that a word gives: `eval={every:5}` gives `eval` and `eval.every`."""
     try:
-        override = OverridesParser.create().parse_override(word)
-    except (hydra.errors.HydraException, RecursionError, ValueError):  # reported when the config is composed
+        (override,) = parsed_words([word])
+    except (RecursionError, ValueError):  # reported when the config is composed
         return [setting_of(word)]
     return _names_in(setting_of(word), None if override.is_sweep_override() else override.value())
 

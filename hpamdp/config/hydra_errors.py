@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import itertools
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import hydra
 import yaml
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.complaints import close_names, no_such
-from hpamdp.config.command_line import GRAMMAR, SEARCH, CommandLine, as_text, choices_in, written_out
+from hpamdp.config.command_line import SEARCH, CommandLine, as_text, choices_in, written_out
 from hpamdp.config.components import GROUPS, TARGET
 from hpamdp.config.compose import NESTED, beginning_of
 from hpamdp.config.schema import RUN_FILE
@@ -30,8 +29,6 @@ _EXTRAS = {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slu
 
 def explained(error: Exception, line: CommandLine, conf: Path) -> str:
     """Return the mistake in the command line or the yaml files in one line, given Hydra's error."""
-    if isinstance(error, OverrideParseException):
-        return not_understood(error.override)
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         return _missing_choice(error.missing_cfg_file, error.options, conf)
     if not isinstance(error, HydraException | OmegaConfBaseException):
@@ -41,13 +38,6 @@ def explained(error: Exception, line: CommandLine, conf: Path) -> str:
             several = f"{override.input_line}: several values; add --multirun to run them all, or put a list in [ ]"
             return f"{several}; for one text write {as_text(override.input_line or '')}"
     return _wrong_setting(line, conf) or _first_lines(error, line.words)
-
-
-def not_understood(word: str) -> str:
-    """Return a message that a word is not in Hydra's grammar, with the right form if its value is a text."""
-    if re.match(r"[+~]*[A-Za-z_@][\w.@/]*=.", word):
-        return f"{word}: {GRAMMAR}, and a text with special characters as {as_text(word)}"
-    return f"{word}: {GRAMMAR}"
 
 
 def _missing_choice(file: str, there: Sequence[str], conf: Path) -> str:

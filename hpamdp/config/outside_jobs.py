@@ -13,13 +13,13 @@ import yaml
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.complaints import as_json
-from hpamdp.config.command_line import CommandLine, folder_path, parse, search_word
+from hpamdp.config.command_line import folder_path, parse, search_word
 from hpamdp.config.components import (
     SUPPLIED_ARGUMENTS,
     TARGET,
@@ -31,7 +31,7 @@ from hpamdp.config.components import (
 )
 from hpamdp.config.compose import conf_dir, is_name, setting_of
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.hydra_errors import explained, missing_setting, not_understood
+from hpamdp.config.hydra_errors import explained, missing_setting
 from hpamdp.messages import as_code, first_line
 from hpamdp.shell import escaped
 
@@ -95,7 +95,7 @@ def own_hydra() -> Iterator[None]:
 
 
 def _compose(words: Sequence[str], conf: Path) -> DictConfig:
-    line = _parsed(words, conf)
+    line = parse(words, conf)
     try:
         with hydra.initialize_config_dir(str(conf), version_base="1.3"):
             return hydra.compose("config", line.words, return_hydra_config=True)
@@ -103,13 +103,6 @@ def _compose(words: Sequence[str], conf: Path) -> DictConfig:
         raise
     except (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError) as error:
         raise ConfigError(explained(error, line, conf)) from error
-
-
-def _parsed(words: Sequence[str], conf: Path) -> CommandLine:
-    try:
-        return parse(words, conf)
-    except OverrideParseException as error:
-        raise ConfigError(not_understood(error.override)) from error
 
 
 def _change(cfg: DictConfig, settings: Iterable[tuple[str, Any]], conf: Path) -> None:

@@ -8,13 +8,11 @@ from typing import Any
 
 import yaml
 from hydra.core.override_parser.types import Override, QuotedString
-from hydra.errors import OverrideParseException
 
 from hpamdp.complaints import no_such
 from hpamdp.config.command_line import SEARCH, choices_in, parsed_words
 from hpamdp.config.compose import conf_dir
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.hydra_errors import not_understood
 
 
 @dataclass(frozen=True)
@@ -72,10 +70,7 @@ def split_words(words: Sequence[str]) -> tuple[dict[str, Any], Space]:
 
 
 def _parsed(words: Sequence[str]) -> tuple[Override, ...]:
-    try:
-        overrides = parsed_words(words)
-    except OverrideParseException as error:
-        raise ConfigError(not_understood(error.override)) from error
+    overrides = parsed_words(words)
     deleted = next((each for each in overrides if each.is_delete()), None)
     if deleted is not None:
         raise ConfigError(f"{deleted.input_line}: a search gives settings values; leave it out")
