@@ -25,11 +25,23 @@ CURVES_NAME = "learning_curves.png"
 FIGURES_NAME = ".figures"
 # The files of saved agents of version 0.3, which are no longer read.
 OLD_NAMES = ("checkpoint.zip", "policy.pt", "best.pt")
-# All other files that a run writes.
 DIVERGED_NAME = "checkpoint.diverged.safetensors"
 EVALUATION_NAME = "evaluation.npz"
 FILM_NAME = "episodes.gif"
 ERROR_NAME = "error.txt"
+# The results of a run, and all other files that it writes.
+RESULTS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME, BEST_NAME, *OLD_NAMES)
+OTHERS = (
+    METRICS_NAME,
+    f"{METRICS_NAME}.previous",
+    DIVERGED_NAME,
+    EVALUATION_NAME,
+    CURVES_NAME,
+    FILM_NAME,
+    ERROR_NAME,
+    FIGURES_NAME,
+    CONFIG_NAME,
+)
 # The entry of a saved agent's metadata that holds its JSON.
 METADATA_KEY = "hpamdp"
 # The largest config or summary that is read.

@@ -16,19 +16,12 @@ from filelock import FileLock, Timeout
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.run_files import (
-    BEST_NAME,
     CHECKPOINT_NAME,
-    CONFIG_NAME,
-    CURVES_NAME,
-    DIVERGED_NAME,
     ERROR_NAME,
-    EVALUATION_NAME,
-    FIGURES_NAME,
-    FILM_NAME,
     MAX_TEXT_BYTES,
     METRICS_NAME,
-    OLD_NAMES,
-    POLICY_NAME,
+    OTHERS,
+    RESULTS,
     SUMMARY_NAME,
     TENSORBOARD_NAME,
     WANDB_NAME,
@@ -40,17 +33,6 @@ from hpamdp.run_files import (
 )
 from hpamdp.shell import path_setting
 
-# The results of a run.
-_MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME, BEST_NAME, *OLD_NAMES)
-_OTHERS = (
-    METRICS_NAME,
-    f"{METRICS_NAME}.previous",
-    DIVERGED_NAME,
-    EVALUATION_NAME,
-    CURVES_NAME,
-    FILM_NAME,
-    ERROR_NAME,
-)
 # Folders of loggers, named after these.
 _OF_LOGGERS = (TENSORBOARD_NAME, WANDB_NAME)
 # In the first line of each `error.txt` that is written here.
@@ -101,7 +83,7 @@ def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
                 f"{folder}: holds {', '.join(foreign)}, which no run has written and a run would replace; take another "
                 "hydra.run.dir"
             )
-    elif not may_overwrite and any((folder / name).exists() for name in _MARKS):
+    elif not may_overwrite and any((folder / name).exists() for name in RESULTS):
         raise ConfigError(
             f"{folder}: holds the results of a run; continue it with {path_setting('resume', folder)}, "
             "take another folder (hydra.run.dir), or set overwrite=true"
@@ -126,7 +108,7 @@ def check_no_training(folder: Path) -> None:
     Raises:
         ConfigError: the folder holds a training run.
     """
-    names = (CHECKPOINT_NAME, POLICY_NAME, BEST_NAME, METRICS_NAME)
+    names = {*RESULTS, METRICS_NAME} - {SUMMARY_NAME}
     if any((folder / name).exists() for name in names) or saved_config(folder).get("mode", "eval") != "eval":
         raise ConfigError(
             f"{folder}: holds the record of a training, which an evaluation never changes; take another hydra.run.dir"
@@ -229,8 +211,7 @@ def written_by_a_run(folder: Path) -> list[Path]:
     choices = saved_config(folder).get("choices")
     logger = choices.get("logger") if isinstance(choices, dict) else None
     of_logger = [name for name in _OF_LOGGERS if logger in (None, name)]
-    names = [*_MARKS, *_OTHERS, *of_logger, *listed_figures(folder), FIGURES_NAME, CONFIG_NAME]
-    paths = [folder / name for name in names]
+    paths = [folder / name for name in (*RESULTS, *of_logger, *listed_figures(folder), *OTHERS)]
     found = [path for path in dict.fromkeys(paths) if path.exists() or path.is_symlink()]
     return [path for path in found if path.name != ERROR_NAME or not has_foreign_error(folder)]
 
