@@ -189,8 +189,8 @@ def test_a_wrong_metric_of_a_callback_from_yaml_ends_the_run_in_one_line_that_sa
 @pytest.mark.parametrize(
     ("state", "complaint"),
     [
-        ({"last": "x"}, "Stateful.state.last is of type str, but must be a real number, a dense tensor or a mapping"),
-        ({"of": torch.zeros(2, device="meta")}, "Stateful.state.of is of type Tensor, but must be a real number"),
+        ({"last": {1}}, "Stateful: state/last is of type set, which a file cannot hold"),
+        ({"of": torch.zeros(2, device="meta")}, "Stateful: Cannot copy out of meta tensor"),
     ],
 )
 def test_a_state_that_no_checkpoint_can_hold_is_refused_before_the_run_starts(state, complaint, tmp_path):

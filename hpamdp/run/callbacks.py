@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import numbers
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from hpamdp.cards import CallbackCard
@@ -21,7 +19,7 @@ from hpamdp.files import replacing
 from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run.callbacks_options import CARDS, PatienceOptions, TimeLimitOptions
 from hpamdp.run.checkpoint import progress_of
-from hpamdp.run.state_checks import check_like
+from hpamdp.run.state_file import check_savable
 from hpamdp.run_files import BEST_NAME
 from hpamdp.settings import SettingError
 
@@ -71,14 +69,15 @@ class Callback:
         return {}
 
     def state(self) -> dict[str, Any]:
-        """Return what a checkpoint has to hold: real numbers, dense tensors of them and mappings of these.
-
-        Names and types must always be the same. NaN may stand for a value that is not known yet.
-        """
+        """Return what a checkpoint has to hold: numbers, texts, dense tensors, and lists and mappings of these."""
         return {}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`, whose names and types have been checked."""
+        """Continue from a `state`.
+
+        Raises:
+            KeyError, TypeError, ValueError: the state is of another callback.
+        """
 
 
 class BestAgent(Callback):
@@ -161,27 +160,30 @@ class BestAgent(Callback):
 
     def state(self) -> dict[str, Any]:
         """Return the best score. The agent itself is in `best.safetensors`."""
-        return {"best_score": -math.inf if self.best_score is None else self.best_score}
+        return {"best_score": self.best_score}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state`."""
-        self.best_score = None if state["best_score"] == -math.inf else state["best_score"]
+        self.best_score = state["best_score"]
 
 
 class Patience(Callback):
     """End training after some evaluations without an improvement of the score.
 
     Args:
-        options: the settings, or the number of evaluations, as in `Patience(3)`.
+        evaluations: the setting of this name, as in `Patience(3)`.
+        options: the settings.
         settings: single settings.
     """
 
     Options = PatienceOptions
     card = CARDS["Patience"]
 
-    def __init__(self, options: PatienceOptions | int | None = None, **settings: Any) -> None:
-        if isinstance(options, int):
-            settings, options = _with_first(self, "evaluations", options, settings), None
+    def __init__(
+        self, evaluations: int | None = None, *, options: PatienceOptions | None = None, **settings: Any
+    ) -> None:
+        if evaluations is not None:
+            settings["evaluations"] = evaluations
         self.options: PatienceOptions = PatienceOptions.of(options, settings)
         self._best = -math.inf
         self._evaluations = 0  # since the last improvement
@@ -218,16 +220,19 @@ class TimeLimit(Callback):
     """End training after some minutes of wall time.
 
     Args:
-        options: the settings, or the minutes, as in `TimeLimit(60)`.
+        minutes: the setting of this name, as in `TimeLimit(60)`.
+        options: the settings.
         settings: single settings.
     """
 
     Options = TimeLimitOptions
     card = CARDS["TimeLimit"]
 
-    def __init__(self, options: TimeLimitOptions | float | None = None, **settings: Any) -> None:
-        if isinstance(options, int | float):
-            settings, options = _with_first(self, "minutes", options, settings), None
+    def __init__(
+        self, minutes: float | None = None, *, options: TimeLimitOptions | None = None, **settings: Any
+    ) -> None:
+        if minutes is not None:
+            settings["minutes"] = minutes
         self.options: TimeLimitOptions = TimeLimitOptions.of(options, settings)
 
     def on_start(self, trainer: Trainer) -> None:
@@ -238,19 +243,6 @@ class TimeLimit(Callback):
         """End training if its time is over."""
         if trainer.wall_s >= 60.0 * self.options.minutes:
             trainer.stop(f"{self.options.minutes:g} minutes are over")
-
-
-def _with_first(callback: Callback, name: str, value: float, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings by name together with the first one, which was given by position.
-
-    Raises:
-        TypeError: the first one is among the others, too.
-    """
-    if name in settings:
-        raise TypeError(
-            f"{type(callback).__name__}: {name} is given twice, as {as_code(value)} and as {as_code(settings[name])}"
-        )
-    return {name: value, **settings}
 
 
 class OwnMetrics(Callback):
@@ -330,47 +322,18 @@ def _finite_number(where: str, value: Any) -> float:
     return number
 
 
-def states_of(
-    callbacks: Mapping[str, Callback], before: Mapping[str, dict[str, Any]] | None = None
-) -> dict[str, dict[str, Any]]:
-    """Return copies of the states of all callbacks, with Python's own numbers.
-
-    Args:
-        callbacks: by name.
-        before: their states when the run began; None if it begins now.
+def states_of(callbacks: Mapping[str, Callback]) -> dict[str, dict[str, Any]]:
+    """Return the states of all callbacks, given by name.
 
     Raises:
-        CallbackError: a checkpoint cannot hold a state, or a resumed run would refuse it beside the one from before.
+        CallbackError: a checkpoint cannot hold a state.
     """
     states = {}
     for name, callback in callbacks.items():
         with mistakes_explained(name):
-            state = callback.state()
-        states[name] = _savable(f"{name}.state", state)
+            states[name] = callback.state()
         try:
-            check_like(f"{name}.state", states[name], (before or states)[name], loosely=True)
-        except ValueError as error:
-            raise CallbackError(f"{error}, as when the run began") from error
+            check_savable("state", states[name])
+        except (TypeError, NotImplementedError) as error:  # torch raises the latter for a tensor without numbers
+            raise CallbackError(f"{name}: {first_line(error)}") from error
     return states
-
-
-def _is_plain(value: Tensor) -> bool:
-    has_numbers = value.layout == torch.strided and not value.is_meta
-    return has_numbers and not value.is_complex() and not value.is_quantized
-
-
-def _savable(where: str, value: Any) -> Any:
-    if isinstance(value, Mapping):
-        wrong = [name for name in value if not isinstance(name, str)]
-        if wrong:
-            raise CallbackError(f"{where}: {wrong[0]!r:.60} must be a text, as the name of a value")
-        return {name: _savable(f"{where}.{name}", inner) for name, inner in value.items()}
-    if isinstance(value, Tensor) and _is_plain(value):
-        return value.detach().clone()
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, numbers.Real):
-        return int(value) if isinstance(value, numbers.Integral) else float(value)
-    raise CallbackError(
-        f"{where} is of type {type(value).__name__}, but must be a real number, a dense tensor or a mapping of them"
-    )

@@ -40,27 +40,24 @@ def _form(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
 
 
-def check_like(where: str, saved: Any, own: Any, *, loosely: bool = False) -> None:
+def check_like(where: str, saved: Any, own: Any) -> None:
     """Refuse nested values whose names, types, dtypes or shapes differ from `own`.
 
     Args:
         where: name of the values in the error.
         saved: the values.
         own: the values of the run.
-        loosely: whether sizes of tensors may differ, and any number may stand for another one.
 
     Raises:
         ValueError: the values differ; the message names the first difference.
     """
     if isinstance(own, Tensor):
-        check_form(where, saved, own, any_size=loosely)
+        check_form(where, saved, own)
     elif isinstance(own, Mapping):
         for name, value in check_names(saved, own, where).items():
-            check_like(f"{where}.{name}", value, own[name], loosely=loosely)
-    elif not (isinstance(saved, int | float) if loosely else type(saved) is type(own)):
-        raise ValueError(
-            f"{where} is {type(saved).__name__}, but must be {'a number' if loosely else type(own).__name__}"
-        )
+            check_like(f"{where}.{name}", value, own[name])
+    elif type(saved) is not type(own):
+        raise ValueError(f"{where} is {type(saved).__name__}, but must be {type(own).__name__}")
 
 
 def check_names(saved: object, own: Mapping[str, Any], where: str = "a state dict") -> Mapping[str, Any]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import math
+import numbers
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -47,6 +48,16 @@ def write(path: Path, state: Mapping[str, Any]) -> None:
         partial.write_bytes(data)
 
 
+def check_savable(name: str, value: Any) -> None:
+    """Check that `write` can write a value.
+
+    Raises:
+        TypeError: a value in it is of another type; `name` is its name.
+        NotImplementedError: a tensor has no numbers.
+    """
+    _Packer().packed(name, value)
+
+
 class _Packer:
     """Turn nested values into JSON values, and collect their tensors by name."""
 
@@ -66,6 +77,8 @@ class _Packer:
         if isinstance(value, list | tuple):
             items = [self.packed(f"{name}/{i}", part) for i, part in enumerate(value)]
             return items if isinstance(value, list) else {"$tuple": items}
+        if isinstance(value, numbers.Real) and not isinstance(value, bool | int | float):  # a number of NumPy
+            value = int(value) if isinstance(value, numbers.Integral) else float(value)
         if isinstance(value, float) and not math.isfinite(value):
             return {"$float": str(float(value))}
         if value is None or isinstance(value, bool | int | float | str):

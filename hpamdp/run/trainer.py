@@ -27,7 +27,6 @@ from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, metrics_of,
 from hpamdp.run.collection.base import Collection
 from hpamdp.run.folder import mark_unfinished, moved_aside
 from hpamdp.run.recorder import Recorder
-from hpamdp.run.state_checks import check_like
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
 from hpamdp.run.summary import KEPT_FRAMES, KEPT_SCORE
 from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME
@@ -120,7 +119,7 @@ class Trainer:
         try:
             self.recorder.set_state(saved.states["recorder"])
             self._restore_callbacks(saved.states["callbacks"])
-        except ValueError as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise ConfigError(f"{source}: does not fit this run ({first_line(error)})") from error
         self._saved = saved
 
@@ -128,11 +127,10 @@ class Trainer:
         """Set the saved states of callbacks. A callback without a saved state begins as in a new run.
 
         Raises:
-            ValueError: a state is of another callback, or holds invalid numbers.
+            KeyError, TypeError, ValueError: a state is of another callback.
         """
         for name, callback in self.callbacks.items():
             if name in states:
-                check_like(name, states[name], self._states_of_callbacks[name], loosely=True)
                 callback.set_state(states[name])
         dropped = [name for name, state in states.items() if state and name not in self.callbacks]
         if dropped:
@@ -394,7 +392,7 @@ class Trainer:
         if self.output_dir is None:
             return
         try:
-            self._states_of_callbacks = states_of(self.callbacks, self._states_of_callbacks)
+            self._states_of_callbacks = states_of(self.callbacks)
         finally:  # an error in a callback's code costs no training
             self._write_checkpoint(self.output_dir, collection)
 
