@@ -21,9 +21,9 @@ from hpamdp.config.saved import read_saved
 from hpamdp.config.schema import Config
 from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, OwnMetrics, Patience, TimeLimit
-from hpamdp.run.continuation import rest_of
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.players import load_agent
+from hpamdp.run.resume import rest_of
 from hpamdp.run.train import begin, run
 from hpamdp.run.trainer import Trainer
 

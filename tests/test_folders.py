@@ -16,10 +16,10 @@ from test_metrics import without_login  # noqa: F401  (a fixture)
 from hpamdp.config.errors import ConfigError
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
-from hpamdp.run.continuation import rest_of
 from hpamdp.run.folder import locked, moved_aside
 from hpamdp.run.loggers import TensorboardLogger, WandbLogger
 from hpamdp.run.recorder import Recorder
+from hpamdp.run.resume import rest_of
 from hpamdp.run.train import run
 from hpamdp.run.trainer import Trainer
 from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, differing_settings, flat_settings

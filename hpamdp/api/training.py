@@ -21,12 +21,10 @@ from hpamdp.config.schema import RESUME_AUTO, Config
 from hpamdp.messages import as_code, reason_of, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import Callback
-from hpamdp.run.capacity import memory_errors_explained
-from hpamdp.run.continuation import Rest, refuse_another, rest_of
 from hpamdp.run.folder import locked
-from hpamdp.run.resume import resolve, saved_words
+from hpamdp.run.resume import Rest, refuse_another, resolve, rest_of, saved_words
 from hpamdp.run.stopping import exits_explained
-from hpamdp.run.train import begin, check_callbacks
+from hpamdp.run.train import begin, check_callbacks, memory_errors_explained
 
 # Values of the run that are of use only if the run writes files.
 _OF_FILES = ("checkpoint_every", "checkpoint_minutes", "film")

@@ -17,8 +17,8 @@ from hpamdp.cards import CallbackCard
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import replacing
 from hpamdp.messages import as_code, first_line, warn
-from hpamdp.run.callbacks_options import CARDS, PatienceOptions, TimeLimitOptions
 from hpamdp.run.checkpoint import progress_of
+from hpamdp.run.options import CARDS, PatienceOptions, TimeLimitOptions
 from hpamdp.run.state_file import check_savable
 from hpamdp.run_files import BEST_NAME
 from hpamdp.settings import SettingError

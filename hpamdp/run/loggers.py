@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from hpamdp.messages import first_line, warn
 from hpamdp.metrics_file import FRAMES, WALL_SECONDS
-from hpamdp.run.loggers_options import CARDS, WandbOptions
+from hpamdp.run.options import CARDS, WandbOptions
 from hpamdp.run_files import TENSORBOARD_NAME, WANDB_NAME
 from hpamdp.settings import SettingError
 

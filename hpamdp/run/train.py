@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
 
 from hpamdp.cards import CallbackCard, outside_card
+from hpamdp.complaints import as_json
 from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.saved import needs_trust
 from hpamdp.config.schema import Config, RunConfig
+from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.imports import collector_paused
-from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, say, warn
+from hpamdp.limits import is_about_memory
+from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError
-from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import CollectionError
 from hpamdp.run.compatibility import need_of_evaluations, settings_without_effect
-from hpamdp.run.continuation import rest_of
 from hpamdp.run.folder import check_no_training, check_unused, remove_error
-from hpamdp.run.resume import check_saved_options, resolve
+from hpamdp.run.resume import check_saved_options, resolve, rest_of
 from hpamdp.run.stopping import ProgramExitError, exits_explained
 from hpamdp.run.trainer import DivergedError, Trainer
 from hpamdp.shell import path_setting, program
@@ -100,6 +102,28 @@ def go_on(
         say(f"Going on from {source}")
     code = run(cfg, output_dir, overrides, source or start, config=config, may_overwrite=True, tell=tell)
     return None, source is not None, code
+
+
+@contextmanager
+def memory_errors_explained(config: Config) -> Iterator[None]:
+    """Turn an error about memory into one line that names the sizes to reduce.
+
+    Raises:
+        ConfigError: memory did not suffice.
+    """
+    try:
+        yield
+    except Exception as error:
+        # If the environment's own code lacks memory, the line of its fault says so.
+        if isinstance(error, ConfigError | EnvironmentFaultError) or not is_about_memory(error):
+            raise
+        run = config.run
+        sizes = f"num_envs={run.num_envs}, steps_per_batch={run.steps_per_batch}, eval.layouts={run.eval.layouts}"
+        for part in (config.low, config.high):
+            given = {name: part.settings.get(name) for name in ("buffer_size", "hidden_dims")}
+            sizes += "".join(f", {part.group}.{name}={as_json(value)}" for name, value in given.items() if value)
+        reason = f" ({first_line(error):.160})" if str(error) else ""
+        raise ConfigError(f"{sizes}: the run takes more memory than there is{reason}") from error
 
 
 @collector_paused()

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
 from hpamdp.cards import CollectorCard
-from hpamdp.run.state_checks import check_like
+from hpamdp.run.checkpoint import check_like
 
 
 def check_state(state: Mapping[str, Any], env: TransformedEnv) -> None:
