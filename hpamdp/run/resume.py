@@ -26,9 +26,7 @@ from hpamdp.messages import warn
 from hpamdp.run import checkpoint, compatibility
 from hpamdp.run.assemble import choose_selector
 from hpamdp.run_files import (
-    ENV_WITHOUT_INFLUENCE,
     SUMMARY_NAME,
-    are_same,
     differing_settings,
     flat_settings,
     saved_config,
@@ -102,26 +100,19 @@ def _check_same_run(saved: Mapping[str, Any], resolved: Config, file: Path, word
     Raises:
         ConfigError: a word changes one of them.
     """
-    seed = saved.get("seed")
-    if seed is not None and resolved.run.seed != seed:
-        raise ConfigError(
-            f"seed={resolved.run.seed}: the run in {file} has seed={seed}; leave seed out when you resume"
-        )
-    given = [word for word in words if setting_of(word).partition(".")[0] == "env"]
-    before, now = upgraded(saved), resolved.to_dict()
-    elsewhere = f"leave it out when you resume, or start a run with {setting('low.checkpoint', str(file.parent))}"
-    if given and before["choices"]["env"] != now["choices"]["env"]:
-        raise ConfigError(f"{given[0]}: the run in {file} has env={before['choices']['env']}; {elsewhere}")
-    if not given:
-        return
-    earlier = before["env"]
-    for name, value in now["env"].items():
-        has_moved = isinstance(value, str) and resolved.env.is_guarded(name, value)
-        if name not in earlier or are_same(value, earlier[name]) or name in ENV_WITHOUT_INFLUENCE or has_moved:
-            continue
-        raise ConfigError(
-            f"env.{name}={as_json(value)}: the run in {file} has env.{name}={as_json(earlier[name])}; {elsewhere}"
-        )
+    before, now = flat_settings(upgraded(saved)), flat_settings(resolved.to_dict())
+    given = {setting_of(word).partition(".")[0] for word in words} & {"seed", "env"}
+    for name in sorted(differing_settings(before, now), key=_rank):
+        group, _, own = name.removeprefix(_CHOSEN).partition(".")
+        value, earlier = now.get(name), before.get(name)
+        is_later = bool(own) and own.partition(".")[0] not in saved["env"]
+        has_moved = isinstance(value, str) and resolved.env.is_guarded(own, value)
+        if group in given and not is_later and not has_moved:
+            shown, show = name.removeprefix(_CHOSEN), str if name.startswith(_CHOSEN) else as_json
+            raise ConfigError(
+                f"{shown}={show(value)}: the run in {file} has {shown}={show(earlier)}; leave it out when you "
+                f"resume, or start a run with {setting('low.checkpoint', str(file.parent))}"
+            )
 
 
 def _warn_of_ended_schedules(saved: Mapping[str, Any], resolved: Config, source: str) -> None:
