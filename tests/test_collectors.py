@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing, suppress
+from dataclasses import replace
 
 import pytest
 import torch
@@ -33,7 +34,6 @@ from hpamdp.run.collection.worker import (
     EnvShard,
     PolicyCopy,
     RemoteError,
-    RemoteShard,
     ShardCollector,
     WorkingDir,
     pack_state,
@@ -431,15 +431,15 @@ def test_a_limit_of_the_machine_is_reported_with_its_cure(error, words, tmp_path
 def test_a_shard_elsewhere_finds_the_users_classes_after_all_packages(tmp_path, monkeypatch):
     monkeypatch.chdir("/")
     monkeypatch.setattr(sys, "path", [*sys.path])
-    sent = pickle.dumps(RemoteShard(WorkingDir(str(tmp_path)), share(tmp_path)).make_env)
+    sent = pickle.dumps(replace(share(tmp_path), working_dir=WorkingDir(str(tmp_path))).make_env)
     assert pickle.loads(sent)().batch_size == (8,)
     assert sys.path[-1] == str(tmp_path) == os.getcwd()
     (tmp_path / "own_problem.py").write_text("class Own: pass")
     own = importlib.import_module("own_problem").Own()
-    sent = pickle.dumps(RemoteShard(WorkingDir(str(tmp_path)), own))
+    sent = pickle.dumps(replace(share(tmp_path), working_dir=WorkingDir(str(tmp_path)), config=own))
     sys.path.remove(str(tmp_path))
     del sys.modules["own_problem"]
-    assert type(pickle.loads(sent).shard).__name__ == "Own"
+    assert type(pickle.loads(sent).config).__name__ == "Own"
 
 
 def test_a_worker_that_is_killed_is_replaced(workers, quick_workers):

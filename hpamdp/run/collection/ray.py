@@ -18,7 +18,7 @@ from hpamdp.messages import first_line, one_line, warn
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import CollectionError
 from hpamdp.run.collection.options import CARDS, RayOptions
-from hpamdp.run.collection.worker import EnvShard, RemoteShard, ShardCollector, WorkingDir
+from hpamdp.run.collection.worker import EnvShard, ShardCollector
 from hpamdp.run.collection.workers import WorkerCollection
 from hpamdp.run.stopping import STOP_SIGNALS
 
@@ -40,10 +40,9 @@ class RayCollection(WorkerCollection):
         super().__init__(config, parts, frames, options)
 
     def _start(self, shard: EnvShard) -> RayCollector:
-        remote = RemoteShard(WorkingDir(os.getcwd()), shard)
         return RayCollector(
-            [remote.make_env],
-            policy_factory=[remote.make_policy],
+            [shard.make_env],
+            policy_factory=[shard.make_policy],
             frames_per_batch=shard.num_envs * self._config.run.steps_per_batch,
             total_frames=sys.maxsize,  # RayCollector cannot collect without an end
             device="cpu",

@@ -10,7 +10,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from tensordict import TensorDictBase
@@ -155,11 +155,35 @@ class SharedMemoryCollector(ShardCollector):
         return replace(collected, batch=collected.batch.share_memory_())
 
 
+class WorkingDir:
+    """A working directory, which a process enters by unpickling this object.
+
+    Like the run's process, it then finds the user's own classes there, after all installed packages. The directory may
+    be missing on another machine.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[[str], WorkingDir], tuple[str]]:
+        return _entered, (self.path,)
+
+
+def _entered(path: str) -> WorkingDir:
+    if os.path.isdir(path):
+        os.chdir(path)
+    if path not in sys.path:
+        sys.path.append(path)
+    return WorkingDir(path)
+
+
 @dataclass(frozen=True)
 class EnvShard:
     """The environments of one worker, with everything needed to build them in its process.
 
     Attributes:
+        working_dir: working directory of the run. It comes first, so that a process elsewhere enters it before it
+            imports the classes of the other parts.
         config: config of the run.
         specs: specs of the problem.
         first_env: number of the shard's first environment in the run.
@@ -169,6 +193,7 @@ class EnvShard:
         low: the packed low level of a run with `low.freeze`, whose environments play whole episodes with it.
     """
 
+    working_dir: WorkingDir = field(default_factory=lambda: WorkingDir(os.getcwd()), kw_only=True)
     config: Config
     specs: PAMDPSpecs
     first_env: int
@@ -196,50 +221,6 @@ class EnvShard:
 
     def _make_agent(self) -> HierarchicalAgent:
         return make_agent(self.config, self.specs, _CPU)
-
-
-class WorkingDir:
-    """A working directory, which a process enters by unpickling this object.
-
-    Like the run's process, it then finds the user's own classes there, after all installed packages. The directory may
-    be missing on another machine.
-    """
-
-    def __init__(self, path: str) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Callable[[str], WorkingDir], tuple[str]]:
-        return _entered, (self.path,)
-
-
-def _entered(path: str) -> WorkingDir:
-    if os.path.isdir(path):
-        os.chdir(path)
-    if path not in sys.path:
-        sys.path.append(path)
-    return WorkingDir(path)
-
-
-@dataclass(frozen=True)
-class RemoteShard:
-    """An `EnvShard` for a process with another working directory and search path.
-
-    Attributes:
-        working_dir: working directory of the run. It comes first, so that the process enters it before it imports the
-            classes of the shard.
-        shard: the environments.
-    """
-
-    working_dir: WorkingDir
-    shard: EnvShard
-
-    def make_env(self) -> TransformedEnv:
-        """Build the environments."""
-        return self.shard.make_env()
-
-    def make_policy(self) -> PolicyCopy:
-        """Build the policy."""
-        return self.shard.make_policy()
 
 
 def _end_with_parent() -> None:
