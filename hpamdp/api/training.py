@@ -18,7 +18,7 @@ from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.outside_jobs import check_no_sweep, composed, own_hydra, searching
 from hpamdp.config.schema import RESUME_AUTO, Config
-from hpamdp.messages import as_code, reason_of, say, warn
+from hpamdp.messages import reason_of, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import Callback
 from hpamdp.run.folder import locked
@@ -80,7 +80,8 @@ def train(
         raise ConfigError("mode=eval: use hpamdp.load(...).evaluate()")
     flag("progress", progress)
     output_dir = None if folder is None else path_argument("folder", folder).absolute()
-    callbacks = _checked_callbacks(callbacks)
+    callbacks = [callbacks] if isinstance(callbacks, Callback) else callbacks
+    check_callbacks(callbacks)
     problem = problem_of(env)
     goes_on = settings.get("resume") == RESUME_AUTO
     if goes_on:
@@ -159,19 +160,6 @@ def _check_guarded() -> None:
             "hpamdp.train: a worker process imports this script again; put what the script runs below "
             'if __name__ == "__main__":'
         )
-
-
-def _checked_callbacks(given: Any) -> list[Callback]:
-    """Return the callbacks as a list; a single one counts as a list of one.
-
-    Raises:
-        ConfigError: it is not a list or tuple of callbacks.
-    """
-    callbacks = [given] if isinstance(given, Callback) else given
-    if not isinstance(callbacks, list | tuple):
-        raise ConfigError(f"callbacks={as_code(given)}: must be a list of objects of subclasses of hpamdp.Callback")
-    check_callbacks(callbacks)
-    return [*callbacks]
 
 
 _running = threading.Lock()  # held while a training of this process runs

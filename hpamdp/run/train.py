@@ -17,7 +17,7 @@ from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.imports import collector_paused
 from hpamdp.limits import is_about_memory
-from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, first_line, say, warn
+from hpamdp.messages import DIVERGED, FAILED, INTERRUPTED, as_code, first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError
@@ -144,7 +144,7 @@ def begin(
         output_dir: folder of the run, created if it is missing. If None, the run writes nothing.
         overrides: the command line's words, which change a resumed run's config.
         may_overwrite: whether the results of a run in the folder may be overwritten, as with `overwrite=true`.
-        callbacks: called during training, after the callbacks that the config lists.
+        callbacks: called during training, after the callbacks that the config lists; see `check_callbacks`.
 
     Raises:
         ConfigError: a value or a path is wrong, or values do not go together.
@@ -179,9 +179,8 @@ def _all_callbacks(config: Config, given: Sequence[Callback]) -> list[Callback]:
     """Build the callbacks of a config, and return them before the given ones.
 
     Raises:
-        ConfigError: a given object is no callback, or needs evaluations that the run does not make.
+        ConfigError: a given object needs evaluations that the run does not make.
     """
-    check_callbacks(given)
     complaint = need_of_evaluations(config, [(type(each).__name__, each.card) for each in given])
     if complaint is not None:
         raise ConfigError(f"callbacks: {complaint}")
@@ -191,12 +190,14 @@ def _all_callbacks(config: Config, given: Sequence[Callback]) -> list[Callback]:
     return callbacks
 
 
-def check_callbacks(given: Sequence[object]) -> None:
-    """Refuse objects that are no callbacks.
+def check_callbacks(given: object) -> None:
+    """Refuse what is no list of callbacks.
 
     Raises:
-        ConfigError: the message says what one of them is.
+        ConfigError: the message says what was given.
     """
+    if not isinstance(given, list | tuple):
+        raise ConfigError(f"callbacks={as_code(given)}: must be a list of objects of subclasses of hpamdp.Callback")
     for each in given:
         if not isinstance(each, Callback):
             what = f"{each.__name__}, a class" if isinstance(each, type) else type(each).__name__
