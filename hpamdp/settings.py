@@ -29,7 +29,6 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -51,13 +50,7 @@ Expectile = Annotated[float, Field(ge=0.5, lt=1.0)]  # 0.5 is the mean
 ScheduleShape = Literal["linear", "cosine", "constant"]
 
 
-def _check_rate(rate: float) -> float:
-    if not 0.0 < rate <= 1.0:
-        raise ValueError("must be above 0 and at most 1")
-    return rate
-
-
-LearningRate = Annotated[float, AfterValidator(_check_rate)]
+LearningRate = PositiveFraction
 
 
 def _as_tuple(value: Any) -> Any:

@@ -35,7 +35,7 @@ REFUSED = [
     # More than there is memory for.
     ("num_envs=1000000000", "num_envs=1000000000: must be less than or equal to 10000000 (conf/config.yaml"),
     # Numbers out of all proportion.
-    ("low=hppo low.lr=1e30", "low.lr=1e+30: must be above 0 and at most 1 (HPPO)"),
+    ("low=hppo low.lr=1e30", "low.lr=1e+30: must be less than or equal to 1 (HPPO)"),
     ("exploration=held exploration.epsilon_final=0.5", "exploration: epsilon_final=0.5: must be at most epsilon=0.05"),
     ("env.motor_noise=[0,11]", "env: motor_noise=11.0: must lie between 0 and 10"),
     # Values that contradict one another.

@@ -201,8 +201,8 @@ def test_a_killed_run_loses_no_more_than_the_minutes_between_two_checkpoints(tmp
 @pytest.mark.parametrize(
     ("word", "line"),
     [
-        ("resume=", "resume: empty; give the output folder of a run"),
-        ("low.checkpoint=", "low.checkpoint: empty"),
+        ("resume=", 'resume="": must have at least 1 character'),
+        ("low.checkpoint=", 'low.checkpoint="": must have at least 1 character'),
         ("hydra.run.dir=", "hydra.run.dir: the working directory"),
         ("hydra.sweep.dir=", "hydra.sweep.dir: the working directory"),
     ],

@@ -50,7 +50,7 @@ def test_widths_are_a_list_or_a_tuple_and_never_a_set():
     [
         ({"hiden_dims": (8,)}, "hiden_dims: no such setting of HPPOOptions; did you mean hidden_dims? It has "),
         ({"learning_rate": 1e-3}, "learning_rate: no such setting of HPPOOptions; did you mean lr or critic_lr? It "),
-        ({"lr": -1.0, "epochs": 0.5}, "epochs=0.5: must be a valid integer; lr=-1.0: must be above 0 and at most 1"),
+        ({"lr": -1.0, "epochs": 0.5}, "epochs=0.5: must be a valid integer; lr=-1.0: must be greater than 0"),
         ({"lr": np.ones((9, 9))}, "lr=array([[1., 1., 1., 1., 1., 1., 1., 1., 1.], [1., "),
     ],
 )

@@ -32,6 +32,8 @@ def _check_device(name: Any) -> Any:
     return name
 
 
+# Empty would be the working directory.
+SavedRun = Annotated[str, Field(min_length=1)]
 Device = Annotated[str, BeforeValidator(_check_device)]
 
 
@@ -99,7 +101,7 @@ class EnvConfig(Settings):
 class LowConfig(Settings):
     """Settings that every learner has: what it starts with, whether it learns, and the learners of single options."""
 
-    checkpoint: str | None = None
+    checkpoint: SavedRun | None = None
     """Earlier run from which the learners' networks are loaded: its output folder, or the checkpoint in it."""
     freeze: bool = False
     """Keep the learners as they are and train only the selector. Frames are then decisions."""
@@ -163,9 +165,9 @@ class RunConfig(Settings):
     """Minutes between two checkpoints. A killed run loses at most these. If 0, time triggers no checkpoint."""
     checkpoint_replay: bool = True
     """Save the replay buffers in checkpoints. Without them, a resumed learner starts with an empty buffer."""
-    checkpoint: str | None = None
+    checkpoint: SavedRun | None = None
     """Agent to score with `mode=eval`: the output folder of a run, or the checkpoint in it."""
-    resume: str | None = None
+    resume: SavedRun | None = None
     """Run to continue: its output folder, or the checkpoint in it.
 
     `auto` continues the run in `hydra.run.dir` if it has the same config, or starts a new run if the folder holds none.

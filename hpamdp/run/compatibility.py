@@ -109,9 +109,6 @@ def check_saved_run(run: RunConfig) -> None:
     Raises:
         ConfigError: a name is missing or empty, or does not go with the mode.
     """
-    for name, value in (("resume", run.resume), ("checkpoint", run.checkpoint), ("low.checkpoint", run.low.checkpoint)):
-        if value == "":
-            raise ConfigError(f"{name}: empty; give the output folder of a run, or leave {name} out")
     if run.mode == "eval" and run.checkpoint is None:
         raise ConfigError("checkpoint: missing; mode=eval needs the output folder of a run")
     if run.mode != "eval" and run.checkpoint is not None:
@@ -481,8 +478,6 @@ def lack_of(need: str, config: Config) -> str | None:
 def _complaints_about_problem(config: Config, problem: ProblemFacts) -> Iterator[str]:
     """Yield what does not go with the problem."""
     grouping, env = config.run.env.grouping, config.env
-    if grouping == "default" and not problem.default_options:
-        yield f"env.grouping=default: {env} suggests none; name the actions of each option"
     for level in _levels(config):
         if grouping is not None and level.card.needs:
             yield f"env.grouping: {level} knows nothing of them; use another {level.group}"
