@@ -184,7 +184,7 @@ def progress_of(file: Path) -> dict[str, Any]:
     Raises:
         ConfigError: the file is damaged or not a checkpoint of this program.
     """
-    return _Opened(file).progress
+    return _opened(file)[1]
 
 
 def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) -> None:
@@ -195,10 +195,10 @@ def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) ->
     Raises:
         ConfigError: the checkpoint is damaged or of other learners.
     """
-    opened = _Opened(file)
+    opened, _ = _opened(file)
     states = []
     with _explained(f"low.checkpoint={file}: of another class or size than low"):
-        saved = _by_name(opened.part("agent", device))
+        saved = _by_name(opened.read("agent", device))
         saved_num = len({name.split(".")[1] for name in saved if name.startswith("learners.")})
         if saved_num not in (0, len(agent.learners)):
             held = "1 learner" if saved_num == 1 else f"{saved_num} learners"
@@ -235,20 +235,20 @@ def load(
     Raises:
         ConfigError: the checkpoint is damaged or of another agent.
     """
-    opened = _Opened(file)
-    if with_training and not opened.names - {"agent", "collection"}:
+    opened, progress = _opened(file)
+    if with_training and {*opened.names} <= {"format", "progress", "agent", "collection"}:
         raise ConfigError(f"{file}: {_NOT_RESUMED}; give a run's output folder or its {FILE_NAME}")
     stateful = agent.stateful() if with_training else {}
     buffers = {name for name, part in stateful.items() if isinstance(part, ReplayBuffer)}
-    missing = ({"agent", "rng", *STATES, *stateful} if with_training else {"agent"}) - buffers - opened.names
+    missing = ({"agent", "rng", *STATES, *stateful} if with_training else {"agent"}) - buffers - {*opened.names}
     if missing:
         raise ConfigError(f"{file}: does not fit this agent: it lacks {', '.join(sorted(missing))}")
     loaded = {}
     with _explained(f"{file}: does not fit this agent, whose sizes env sets"):
         may_lack = "" if with_training else FOR_TRAINING
-        networks = _state_for(agent, opened.part("agent", device), file, may_lack=may_lack)
-        for name in opened.names & stateful.keys():
-            saved = opened.part(name, device)
+        networks = _state_for(agent, opened.read("agent", device), file, may_lack=may_lack)
+        for name in stateful.keys() & {*opened.names}:
+            saved = opened.read(name, device)
             if name in buffers:
                 num = min(saved["write_count"], stateful[name]._storage.max_size)
                 loaded[name] = {"rows": TensorDict(saved["rows"], [num]), "write_count": saved["write_count"]}
@@ -256,8 +256,8 @@ def load(
                 loaded[name] = _state_for_other(name, stateful[name], saved)
     names = STATES if with_training else STATES[:1]
     with _explained(_damage_of(file)):
-        states = {name: _by_name(opened.part(name, device)) for name in names if name in opened.names}
-        generators = _by_name(opened.part("rng")) if with_training else {}
+        states = {name: _by_name(opened.read(name, device)) for name in names if name in opened.names}
+        generators = _by_name(opened.read("rng")) if with_training else {}
     agent.load_state_dict({**agent.state_dict(), **networks})
     for name, part in stateful.items():
         if name not in loaded:
@@ -266,7 +266,7 @@ def load(
             _fill(part, **loaded[name])
         else:
             part.load_state_dict(loaded[name])
-    return Saved(file, opened.progress, states, generators)
+    return Saved(file, progress, states, generators)
 
 
 @contextmanager
@@ -300,34 +300,18 @@ def _by_name(values: Any) -> dict[str, Any]:
     return values
 
 
-class _Opened:
-    """An open checkpoint or policy file.
-
-    Args:
-        file: the file.
-
-    Attributes:
-        names: names of the parts.
-        progress: progress of the run.
+def _opened(file: Path) -> tuple[state_file.StateFile, dict[str, Any]]:
+    """Open a checkpoint or policy file, and return it with the progress of its run.
 
     Raises:
         ConfigError: the file is damaged or not a checkpoint of this program.
     """
-
-    def __init__(self, file: Path) -> None:
-        self._damage = _damage_of(file)
-        with _explained(self._damage):
-            self._file = state_file.StateFile(file)
-            number = self._file.read("format")
-            if number != FORMAT:
-                raise ValueError(f"format {number}, but this version reads {FORMAT}")
-            self.progress = _by_name(self._file.read("progress"))
-        self.names = {*self._file.names} - {"format", "progress"}
-
-    def part(self, name: str, device: torch.device | None = None) -> Any:
-        """Return the contents of a part."""
-        with _explained(self._damage):
-            return self._file.read(name, device)
+    with _explained(_damage_of(file)):
+        opened = state_file.StateFile(file)
+        number = opened.read("format")
+        if number != FORMAT:
+            raise ValueError(f"format {number}, but this version reads {FORMAT}")
+        return opened, _by_name(opened.read("progress"))
 
 
 def _state_for(module: nn.Module, saved: Any, file: Path, *, may_lack: str = "") -> dict[str, Any]:
