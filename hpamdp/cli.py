@@ -15,18 +15,15 @@ from pathlib import Path
 from typing import NoReturn
 
 import hydra
-import yaml
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.children import protect_children, unprotect_children
 from hpamdp.config.command_line import CommandLine, completed, parse, saved_run
 from hpamdp.config.compose import conf_dir, job_overrides
 from hpamdp.config.errors import ConfigError, problems_explained
-from hpamdp.config.hydra_errors import explained
+from hpamdp.config.hydra_errors import BEFORE_A_JOB, explained
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.imports import collector_paused
@@ -53,8 +50,6 @@ _COMMANDS = {
     "judge": "hpamdp.commands.judge",
     "tune": "hpamdp.api.tuning",
 }
-# Errors that Hydra raises for a wrong command line or yaml file.
-_BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError)
 
 
 def main() -> None:
@@ -139,7 +134,7 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         if isinstance(error, RuntimeError) and "srun" in str(error):  # which submitit looks for
             raise ConfigError(f"hydra/launcher=submitit_slurm: {error}") from error
         # Once a job has started, such errors are not about the command line.
-        if not has_started and isinstance(error, _BEFORE_A_JOB) and not isinstance(error, ConfigError):
+        if not has_started and isinstance(error, BEFORE_A_JOB) and not isinstance(error, ConfigError):
             _exit_with(explained(error, line, conf))
         raise
     finally:

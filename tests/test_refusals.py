@@ -130,7 +130,10 @@ REFUSED = [
     (CHOSEN + "high=actor agent.option_lengths=[1,4,2]", "agent.option_lengths=[1, 4, 2]: must be increasing numbers"),
     (CHOSEN + "high=actor agent.option_lengths=[0,1]", "agent.option_lengths.0=0: must be greater than 0"),
     (CHOSEN + "high=actor agent.termination=steps agent.option_length=2", "agent.option_lengths=[1, 2, 4]: goes with"),
-    (CHOSEN + "high=actor compile_updates=true low=pdqn", "compile_updates=true: goes with agent.termination=episode "),
+    (
+        CHOSEN + "high=actor compile_updates=true low=pdqn",
+        "compile_updates=true: agent.termination=chosen, so ",
+    ),
     # Callbacks.
     ("callbacks=[patiense]", "callbacks.0=patiense: no such file in conf/callback; did you mean patience?"),
     ("callbacks=[{name:patience,evaluation:3}]", "callbacks.0.evaluation: no such setting of Patience; did you "),

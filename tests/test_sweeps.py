@@ -189,14 +189,14 @@ def test_with_overwrite_a_job_replaces_only_the_results_of_another_config(comman
 
 
 def test_a_sweep_that_breaks_off_tells_the_jobs_it_leaves(command, jobs, monkeypatch):
-    write = run_sweep.Records.write
+    write = run_sweep.write_job
 
-    def break_off(records, job):
+    def break_off(job, records):
         if job.number == 1:
             raise BrokenPipeError("a worker died")
-        write(records, job)
+        write(job, records)
 
-    monkeypatch.setattr(run_sweep.Records, "write", break_off)
+    monkeypatch.setattr(run_sweep, "write_job", break_off)
     code, out, err = command("-m", "seed=0,4", "hydra.sweep.dir=sweep")
     assert code == 1 and "The sweep broke off: BrokenPipeError: a worker died (sweep/error.txt)\n" in err
     assert "1 job: 1 finished\n" in out and "hydra.sweep.dir=sweep" in out

@@ -27,6 +27,10 @@ _LAUNCHER = "hydra/launcher"
 _EXTRAS = {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray-launcher"}
 
 
+# Errors that Hydra raises for a wrong command line or yaml file.
+BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError)
+
+
 def explained(error: Exception, line: CommandLine, conf: Path) -> str:
     """Return the mistake in the command line or the yaml files in one line, given Hydra's error."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:

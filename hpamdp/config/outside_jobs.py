@@ -13,7 +13,6 @@ import yaml
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -31,7 +30,7 @@ from hpamdp.config.components import (
 )
 from hpamdp.config.compose import conf_dir, is_name, setting_of
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.hydra_errors import explained, missing_setting
+from hpamdp.config.hydra_errors import BEFORE_A_JOB, explained, missing_setting
 from hpamdp.messages import as_code, first_line
 from hpamdp.shell import escaped
 
@@ -101,7 +100,7 @@ def _compose(words: Sequence[str], conf: Path) -> DictConfig:
             return hydra.compose("config", line.words, return_hydra_config=True)
     except ConfigError:
         raise
-    except (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError) as error:
+    except BEFORE_A_JOB as error:
         raise ConfigError(explained(error, line, conf)) from error
 
 

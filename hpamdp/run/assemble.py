@@ -277,10 +277,10 @@ def set_up_updates(config: Config, agent: HierarchicalAgent) -> None:
         _compile_if_it_pays(config, agent)
     elif run.compile_updates:
         given = "compile_updates=true"
-        if run.agent.termination != "episode":
-            raise ConfigError(f"{given}: goes with agent.termination=episode only, not with {run.agent.termination}")
         if _options_end_inside(config, agent):
-            raise ConfigError(f"{given}: {config.env} has trips, with which options end; use compile_updates=auto")
+            ending = run.agent.termination
+            why = f"{config.env} has trips" if ending == "episode" else f"agent.termination={ending}"
+            raise ConfigError(f"{given}: {why}, so options end inside their episodes; use compile_updates=auto")
         _ask_learners(config, agent, given, lambda learner: learner.compile_updates())
     if run.update_precision != "float32":
         given = f"update_precision={run.update_precision}"

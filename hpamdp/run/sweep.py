@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -80,37 +81,22 @@ class Job:
     reason: str = ""
 
 
-class Records:
-    """The states of a sweep's jobs, one file each, because jobs may run in other processes or on other machines.
+def write_job(job: Job, records: Path) -> None:
+    """Save the state of a job, in a file of its own, because jobs may run in other processes or on other machines."""
+    records.mkdir(parents=True, exist_ok=True)
+    with replacing(records / f"{job.number}.json") as partial:
+        partial.write_text(json.dumps(asdict(job)))
 
-    Args:
-        sweep_dir: the sweep's folder.
-        start: name of this start of the sweep.
-    """
 
-    def __init__(self, sweep_dir: Path, start: str) -> None:
-        self._folder = sweep_dir / ".sweep" / start
+def read_jobs(records: Path) -> list[Job]:
+    """Return the started jobs in their order."""
+    jobs = [Job(**json.loads(file.read_text())) for file in records.glob("[0-9]*.json")]
+    return sorted(jobs, key=lambda job: job.number)
 
-    def write(self, job: Job) -> None:
-        """Save the state of a job."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        with replacing(self._folder / f"{job.number}.json") as partial:
-            partial.write_text(json.dumps(asdict(job)))
 
-    def read(self) -> list[Job]:
-        """Return the started jobs in their order."""
-        if not os.path.isdir(self._folder):
-            return []
-        jobs = [Job(**json.loads(file.read_text())) for file in self._folder.glob("[0-9]*.json")]
-        return sorted(jobs, key=lambda job: job.number)
-
-    def remove(self) -> None:
-        """Remove the files, and their folder if no other start of the sweep uses it."""
-        for file in self._folder.glob("*"):
-            file.unlink(missing_ok=True)
-        with suppress(OSError):
-            self._folder.rmdir()
-            self._folder.parent.rmdir()
+def _records(sweep_dir: Path, start: str) -> Path:
+    """Return the folder of the jobs' states of one start of a sweep."""
+    return sweep_dir / ".sweep" / start
 
 
 def run_job(cfg: DictConfig, start: str) -> float | None:
@@ -126,11 +112,11 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     hydra = HydraConfig.get()
     folder, overrides = Path(hydra.runtime.output_dir), job_overrides()
     job = Job(hydra.job.num, " ".join(overrides), str(folder))
-    records = Records(Path(hydra.runtime.cwd, hydra.sweep.dir), start)
+    records = _records(Path(hydra.runtime.cwd, hydra.sweep.dir), start)
     if hydra.runtime.choices["hydra/launcher"] != "basic":
         os.environ.setdefault("TQDM_DISABLE", "1")  # the bars of jobs side by side overwrite each other
         _stop_with_parent()
-    records.write(job)
+    write_job(job, records)
     say(f"Job {job.number}: {job.overrides}")
     try:
         with locked(folder, _LOCK_PATIENCE_S), exits_explained():
@@ -144,7 +130,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
         if isinstance(error, OSError) and is_about_folder(error, folder):
             job.reason = f"its folder cannot be made or written to: {reason_of(error)}"
         write_error(folder, error)
-    records.write(job)
+    write_job(job, records)
     if job.state != _FINISHED:
         say(f"Job {job.number}: {job.state}{f': {job.reason}' if job.reason else ''}")
     if job.state == _STOPPED:
@@ -190,7 +176,7 @@ def _watch(parent: int) -> None:
 
 def has_begun(start: str) -> bool:
     """Return whether any job has started."""
-    return SweepFolderCallback.path is not None and bool(Records(SweepFolderCallback.path, start).read())
+    return SweepFolderCallback.path is not None and bool(read_jobs(_records(SweepFolderCallback.path, start)))
 
 
 def report(start: str, error: BaseException | None = None) -> int:
@@ -204,9 +190,11 @@ def report(start: str, error: BaseException | None = None) -> int:
     """
     sweep_dir = SweepFolderCallback.path
     assert sweep_dir is not None
-    records = Records(sweep_dir, start)
-    jobs = records.read()
-    records.remove()
+    records = _records(sweep_dir, start)
+    jobs = read_jobs(records)
+    shutil.rmtree(records, ignore_errors=True)
+    with suppress(OSError):  # another start of the sweep may use it
+        records.parent.rmdir()
     is_stopped = isinstance(error, KeyboardInterrupt | SystemExit)
     for job in jobs:
         if job.state == _RUNNING:
