@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ from hpamdp import keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.files import replacing
-from hpamdp.messages import LenientStream, first_line, warn
+from hpamdp.messages import first_line, warn
 from hpamdp.policies.base import Learner
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import AssembledRun
@@ -284,7 +283,6 @@ class Trainer:
             unit=self.unit,
             unit_scale=True,
             mininterval=1.0,
-            file=LenientStream(sys.stderr),
             disable=not self.shows_progress,
         )
         for learner in self.parts.agent.learners:
@@ -299,10 +297,7 @@ class Trainer:
             if is_new or self.is_evaluation_due:
                 self._evaluate(bar, request)
             while not self.is_over() and request.signal is None:
-                try:
-                    num = self._learn(collection)
-                finally:
-                    _warn_of_notices(collection, bar)
+                num = self._learn(collection)
                 last = self.frames
                 self.frames += num
                 take_time()
@@ -481,12 +476,6 @@ def check_scalars(scalars: Mapping[str, float]) -> None:
     for name, value in scalars.items():
         if not math.isfinite(value):
             raise DivergedError(f"{name} is {value}")
-
-
-def _warn_of_notices(collection: Collection, bar: tqdm) -> None:
-    for notice in collection.notices():
-        bar.clear()
-        warn(notice)
 
 
 def _is_due(before: int, now: int, every: int) -> bool:

@@ -76,10 +76,6 @@ class Collection:
         """
         raise NotImplementedError
 
-    def notices(self) -> list[str]:
-        """Return the messages for the user since the last call, for example about a replaced worker."""
-        return []
-
     @abstractmethod
     def state(self) -> dict[str, Any]:
         """Return the state of the collection for a checkpoint.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -11,6 +12,7 @@ from typing import Any, ClassVar, NoReturn, TypeVar
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from tqdm import tqdm
 
 from hpamdp import keys
 from hpamdp.cards import CollectorCard
@@ -62,7 +64,6 @@ class WorkerCollection(Collection):
         self._is_closing = False
         self._restarts = 0
         self._restarting = threading.Lock()
-        self._notices: list[str] = []
         self._parts = parts
         self._policy = parts.policy
         self._specs = parts.agent.specs
@@ -182,7 +183,8 @@ class WorkerCollection(Collection):
             if self._is_closing or self._restarts >= self.options.max_restarts:
                 raise death
             self._restarts += 1
-            self._notices.append(f"{death}; it was replaced (restart {self._restarts} of {self.options.max_restarts})")
+            line = f"{death}; it was replaced (restart {self._restarts} of {self.options.max_restarts})"
+            tqdm.write(line, file=sys.stderr)  # above the bar of the training
         self._end(number)
         self._batches[number] = None
         self._cpu_s_of_dead += self._cpu_s[number]
@@ -193,11 +195,6 @@ class WorkerCollection(Collection):
         futures = [self._threads.submit(call, number) for number in range(len(self.workers))]
         wait(futures)
         return [future.result() for future in futures]
-
-    def notices(self) -> list[str]:
-        """Return a message for each worker that was replaced since the last call."""
-        notices, self._notices = self._notices, []
-        return notices
 
     def next(self) -> TensorDictBase:
         """Send the policy's state and collect a batch. With `ahead`, return the batch that was begun and begin another.
