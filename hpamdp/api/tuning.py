@@ -265,8 +265,8 @@ def _study(folder: Any, objective: _Objective) -> Study:
 def _suggested(trial: Trial, name: str, values: Range | list[Any]) -> Any:
     if isinstance(values, list):
         return trial.suggest_categorical(name, values)
-    if values.is_whole:
-        return trial.suggest_int(name, int(values.low), int(values.high), step=values.step, log=values.is_log)
+    if isinstance(values.low, int) and isinstance(values.high, int):
+        return trial.suggest_int(name, values.low, values.high, step=values.step, log=values.is_log)
     return trial.suggest_float(name, values.low, values.high, log=values.is_log)
 
 

@@ -28,7 +28,6 @@ NESTED = "a yaml file names itself among its defaults, or a value nests too deep
 RECIPE = "recipe"
 _LONGEST_NAME = 200  # letters of a yaml file's name
 _SHOWN = 200  # letters of a command line in an error
-_MISSING = "???"  # what OmegaConf takes for a value that is missing
 _NAMED_BY_YAML = "a yaml file names the class; give the name of the file"
 # Entries that the learner of a single option cannot have, and the advice in the error.
 _NOT_PER_OPTION = {
@@ -313,7 +312,7 @@ def plain(node: Any, where: str = "the config", *, may_lack: bool = False) -> di
     Args:
         node: the part.
         where: its name in errors.
-        may_lack: whether a value may be missing, since a saved run has it. Then it is left out.
+        may_lack: whether a value may be missing, since a saved run has it. Then it is `???`.
 
     Raises:
         ConfigError: the part is no mapping, a value is missing, or a value cannot be resolved.
@@ -329,17 +328,7 @@ def plain(node: Any, where: str = "the config", *, may_lack: bool = False) -> di
     except RecursionError as error:
         raise ConfigError(f"{where}: a value refers to itself, or nests too deep") from error
     assert isinstance(container, dict)
-    values = {str(name): value for name, value in container.items()}
-    return _without_missing(values) if may_lack else values
-
-
-def _without_missing(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values that are not missing, also in the mappings among them."""
-    return {
-        name: _without_missing(value) if isinstance(value, Mapping) else value
-        for name, value in values.items()
-        if value != _MISSING
-    }
+    return {str(name): value for name, value in container.items()}
 
 
 def is_name(name: object) -> TypeGuard[str]:

@@ -24,11 +24,6 @@ class Range:
     step: int = 1
     is_log: bool = False
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether all values are whole numbers."""
-        return isinstance(self.low, int) and isinstance(self.high, int)
-
 
 Space = dict[str, Range | list[Any]]
 

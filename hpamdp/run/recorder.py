@@ -87,13 +87,11 @@ class Recorder:
         self._resumed_from = folder
 
     def start(self) -> None:
-        """Start the logger, if the run has a folder. It takes over the rows of a resumed run.
+        """Start the logger of a run with a folder. It takes over the rows of a resumed run.
 
         Raises:
             ConfigError: the logger refuses its settings.
         """
-        if self.output_dir is None:
-            return
         earlier = None
         if self._resumed_from is not None:
             earlier = EarlierRun(self._resumed_from, self.metrics.rows())

@@ -7,10 +7,10 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from hpamdp.messages import one_line
 
@@ -68,26 +68,26 @@ def stop_on_signals() -> Iterator[StopRequest]:
     Only the main thread notes signals, since Python delivers them to no other thread.
     """
     request = StopRequest()
-    before = {number: signal.getsignal(number) for number in _changeable_signals()}
-    handled = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
-    for number in handled:
-        signal.signal(number, request.note)
-    try:
+    with _handled(request.note, [each for each in _changeable_signals() if signal.getsignal(each) != signal.SIG_IGN]):
         yield request
-    finally:
-        for number, handler in handled.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
 def signals_ignored() -> Iterator[None]:
     """Ignore the signals that stop a run, while it saves."""
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in _changeable_signals()}
+    with _handled(signal.SIG_IGN, _changeable_signals()):
+        yield
+
+
+@contextmanager
+def _handled(handler: Any, numbers: Sequence[signal.Signals]) -> Iterator[None]:
+    """Handle these signals inside the block."""
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
 
 
 def pass_on_signal() -> None:
