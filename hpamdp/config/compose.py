@@ -215,7 +215,13 @@ def _with_files(
 
     found = []
     for where, choice in choices.items():
-        name, given = _name_and_settings(choice, where, what, refused)
+        given = dict(choice) if isinstance(choice, Mapping) else {"name": choice}
+        name = given.pop("name", None)
+        if not is_name(name):
+            raise ConfigError(f"{where}={as_json(choice)}: must be the name of {what}, or its name and settings")
+        for setting, instead in refused.items():
+            if setting in given:
+                raise ConfigError(f"{where}.{setting}: {instead}")
         try:
             own = written(name)
         except MissingChoiceError as error:
@@ -224,22 +230,6 @@ def _with_files(
             raise ConfigError(f"{where}={name}: {file_of(group, name)} names no class as {TARGET}")
         found.append((name, {**own, **given}))
     return found
-
-
-def _name_and_settings(choice: Any, where: str, what: str, refused: Mapping[str, str]) -> tuple[str, dict[str, Any]]:
-    """Return the name of a yaml file in a list or mapping, and the settings beside it.
-
-    Raises:
-        ConfigError: there is no name, or one of the settings in `refused`, which give the advice for the error.
-    """
-    given = dict(choice) if isinstance(choice, Mapping) else {"name": choice}
-    name = given.pop("name", None)
-    if not is_name(name):
-        raise ConfigError(f"{where}={as_json(choice)}: must be the name of {what}, or its name and settings")
-    for setting, instead in refused.items():
-        if setting in given:
-            raise ConfigError(f"{where}.{setting}: {instead}")
-    return name, given
 
 
 def compose(overrides: list[str]) -> DictConfig:

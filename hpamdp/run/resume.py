@@ -108,10 +108,11 @@ def _check_same_run(saved: Mapping[str, Any], resolved: Config, file: Path, word
         is_later = bool(own) and own.partition(".")[0] not in saved["env"]
         has_moved = isinstance(value, str) and resolved.env.is_guarded(own, value)
         if group in given and not is_later and not has_moved:
-            shown, show = name.removeprefix(_CHOSEN), str if name.startswith(_CHOSEN) else as_json
+            shown, is_choice = name.removeprefix(_CHOSEN), name.startswith(_CHOSEN)
+            given_now, saved_then = (str(each) if is_choice else as_json(each) for each in (value, earlier))
             raise ConfigError(
-                f"{shown}={show(value)}: the run in {file} has {shown}={show(earlier)}; leave it out when you "
-                f"resume, or start a run with {setting('low.checkpoint', str(file.parent))}"
+                f"{shown}={given_now}: the run in {file} has {shown}={saved_then}; leave it out when you resume, or "
+                f"start a run with {setting('low.checkpoint', str(file.parent))}"
             )
 
 
