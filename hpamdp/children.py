@@ -13,22 +13,17 @@ from hpamdp.search_path import is_clone
 _VARIABLE, _OURS = "PYTHONSAFEPATH", "hpamdp"
 
 
-def protect_children() -> None:
-    """Make Python processes that are started from now on look for modules in the working directory last."""
-    if not is_clone(os.getcwd()):
-        os.environ.setdefault(_VARIABLE, _OURS)
-
-
 def unprotect_children() -> None:
-    """Undo `protect_children`, in this process or in a child process."""
+    """Undo `children_protected`, in this process or in a child process."""
     if os.environ.get(_VARIABLE) == _OURS:
         del os.environ[_VARIABLE]
 
 
 @contextmanager
 def children_protected() -> Iterator[None]:
-    """Protect the processes that are started inside the block; see `protect_children`."""
-    protect_children()
+    """Make Python processes that are started inside the block look for modules in the working directory last."""
+    if not is_clone(os.getcwd()):
+        os.environ.setdefault(_VARIABLE, _OURS)
     try:
         yield
     finally:

@@ -19,7 +19,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from hpamdp.children import protect_children, unprotect_children
+from hpamdp.children import children_protected, unprotect_children
 from hpamdp.config.command_line import CommandLine, completed, parse, saved_run
 from hpamdp.config.compose import conf_dir, job_overrides
 from hpamdp.config.errors import ConfigError, problems_explained
@@ -113,6 +113,7 @@ class _Parser(argparse.ArgumentParser):
         raise ConfigError(f"{message}; see {self.prog} --help")
 
 
+@children_protected()
 def _run_hydra(line: CommandLine, conf: Path) -> None:
     """Let Hydra run the job or the sweep, and report mistakes in the command line in one line."""
     has_started = False
@@ -123,7 +124,6 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         has_started = True
         return _run_job(cfg, start)
 
-    protect_children()
     try:
         line = completed(_with_saved_choices(line), conf)
         sys.argv[1:] = line.argv()  # which Hydra parses
@@ -137,8 +137,6 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         if not has_started and isinstance(error, BEFORE_A_JOB) and not isinstance(error, ConfigError):
             _exit_with(explained(error, line, conf))
         raise
-    finally:
-        unprotect_children()
     if sweep.has_begun(start):
         sys.exit(sweep.report(start))
     if line.is_multirun and not line.only_shows:
