@@ -20,8 +20,9 @@ from hpamdp.messages import invalid_action
 # - mask: rows that move, or that restart, bool `[N]`.
 # - settings, mode: see `hpamdp.env.kernels`.
 # - results: the arrays of `Results`, to be filled.
+# It returns -1, or the number of the first row with an invalid action; then nothing has changed.
 # The tuples are plain: for named ones, Numba takes 5 us more a call.
-Advance = Callable[..., None]
+Advance = Callable[..., int]
 
 
 class Results(NamedTuple):
@@ -148,12 +149,6 @@ class KernelRows:
         mask: np.ndarray | None,
     ) -> Results | int:
         """Call the kernel and return its results, or the number of the first row with an invalid action."""
-        option = self._no_choice if option is None else option
-        action = option, discrete, (parameters, self._parameter_offsets, self._bounds)
-        if mode != RESTART:
-            invalid: int = kernels.invalid_row(*action, self.integers, self._settings, mode)
-            if invalid >= 0:
-                return invalid
         num_readings, n = 2 if mode == ACT_AND_RESTART else 1, self._num_rows
         results = (
             np.empty((num_readings, n, self._observation_dim), np.float32),
@@ -162,9 +157,17 @@ class KernelRows:
             np.empty((num_readings, 3, n), np.bool_),
             np.zeros(n, np.float32),
         )
-        mask = self._all if mask is None else mask
-        self._advance(self._state, *action, mask, self._settings, mode, results)
-        return Results(*results)
+        invalid = self._advance(
+            self._state,
+            self._no_choice if option is None else option,
+            discrete,
+            (parameters, self._parameter_offsets, self._bounds),
+            self._all if mask is None else mask,
+            self._settings,
+            mode,
+            results,
+        )
+        return Results(*results) if invalid < 0 else invalid
 
 
 def invalid_choice(

@@ -209,7 +209,7 @@ def all_finite(values: Any) -> Any:
     return are_finite
 
 
-@kernel
+@part
 def invalid_row(option: Any, discrete: Any, parameters: Any, integers: Any, settings: Any, mode: Any) -> Any:
     """Return the first row with an unknown option, an unknown action or a parameter that is not finite, or -1.
 
@@ -219,8 +219,10 @@ def invalid_row(option: Any, discrete: Any, parameters: Any, integers: Any, sett
         parameters: parameters of all actions, their places and their bounds; see `hpamdp.env.kernel_rows`.
         integers: integer columns of the state.
         settings: settings of the problem.
-        mode: with ACT_OR_RESTART, rows that start an episode may have any action.
+        mode: with ACT_OR_RESTART, rows that start an episode may have any action. With RESTART, all rows may.
     """
+    if mode == RESTART:
+        return -1
     given, places, _ = parameters
     # First check all rows at once: a branch on each row's action took a sixth of Catch Point's step. The loop below
     # finds the row.

@@ -33,6 +33,7 @@ from hpamdp.env.kernels import (
     ZERO,
     episode_hash,
     inlined,
+    invalid_row,
     kernel,
     normal,
     part,
@@ -487,10 +488,13 @@ def _report(first: Any, count: Any, scratch: Any, numbers: Any, outcomes: Any, f
 @kernel
 def advance(
     state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
-) -> None:
+) -> int:
     """Press or restart in every row, in place; see `hpamdp.env.kernel_rows`. The only extra is the fraction of fuel."""
     floats, integers = state
     observations, outcomes, extras, flags, rewards = results
+    invalid = invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     scratch = np.empty(_NUM_FLOATS * _BLOCK, np.float32)
     numbers = np.empty(_NUM_INTEGERS * _BLOCK, np.int32)
     has_noise = (settings[SLIP_CHANCE] > 0.0) | _has_motor_noise(settings)
@@ -515,6 +519,7 @@ def advance(
             _observe(first, count, scratch, numbers, settings, observations[reading])
             _report(first, count, scratch, numbers, outcomes[reading], extras[reading, 0], flags[reading])
         _store(floats, integers, first, count, scratch, numbers)
+    return -1
 
 
 def settings_of(rules: BoatDockOptions) -> list[float]:

@@ -276,10 +276,13 @@ def _observe(floats: Any, integers: Any, row: Any, settings: Any, observation: A
 @kernel
 def advance(
     state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
-) -> None:
+) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     floats, integers = state
     observations, outcomes, extras, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     trips = _F(settings[TRIPS])
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
@@ -294,3 +297,4 @@ def advance(
             extras[reading, 1, row] = floats[AT.total_score, row] / trips
             extras[reading, 2, row] = _F(integers[AT.docked, row]) / trips
             kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1

@@ -44,10 +44,13 @@ def _act(floats: Any, integers: Any, row: Any, action: Any, given: Any, settings
 @kernel
 def advance(
     state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
-) -> None:
+) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     floats, integers = state
     observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
         if mode != kernels.RESTART and mask[row] and not was_over:
@@ -66,3 +69,4 @@ def advance(
                 observations[reading, row, 4] = _F(misses) / _SIX - ONE
                 observations[reading, row, 5] = _F(integers[STEPS_ROW, row]) / _TWELVE - ONE
             kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1

@@ -301,10 +301,13 @@ def _observe(entries: Any, integers: Any, row: Any, settings: Any, observation: 
 @kernel
 def advance(
     state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
-) -> None:
+) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     floats, integers = state
     observations, outcomes, extras, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     of_similarity = 4 * (1 << int(settings[WIRES])) * int(settings[COLUMNS])
     drawn = np.empty((2, _MOST_ROWS, _MOST_ROWS))
     block = np.empty((_SIDE_BY_SIDE, len(floats)), np.float32)
@@ -332,3 +335,4 @@ def advance(
         for place in range(len(floats)):
             for i in range(num):
                 floats[place, first + i] = block[i, place]
+    return -1

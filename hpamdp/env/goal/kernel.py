@@ -381,10 +381,13 @@ def _act(floats: Any, integers: Any, discrete: Any, rows: Any, aims: Any, settin
 @kernel
 def advance(
     state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
-) -> None:
+) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     floats, integers = state
     observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     before = integers[OUTCOME_ROW].copy()
     if mode != kernels.RESTART:
         aims = np.empty((2, len(mask)), np.float32)
@@ -405,3 +408,4 @@ def advance(
                 body[:] = floats[:, row]
             _observe(body, settings, observations[reading, row])
             kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1

@@ -195,10 +195,13 @@ def _store(lanes: Any, numbers: Any, first: Any, width: Any, floats: Any, intege
 @kernel
 def advance(
     state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
-) -> None:
+) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     floats, integers = state
     observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     max_steps, slides = int32(min(settings[kernels.MAX_STEPS], _MOST_STEPS)), settings[SLIDES] != 0.0
     latest = _F(max(settings[kernels.MAX_STEPS] - 1.0, 1.0))
     lanes, numbers = np.zeros(_NUM_FLOATS * _LANES, np.float32), np.zeros(_NUM_INTEGERS * _LANES, np.int32)
@@ -235,3 +238,4 @@ def advance(
                 outcome = numbers[_OUTCOME * _LANES + j]
                 kernels.report(outcome, len(rules.OUTCOMES), unsigned(first + j), outcomes[reading], flags[reading])
         _store(lanes, numbers, first, width, floats, integers)
+    return -1

@@ -22,10 +22,13 @@ _FORCE = _F(rules._FORCE)
 @kernel
 def advance(
     state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
-) -> None:
+) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     floats, integers = state
     observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
         if mode != kernels.RESTART and mask[row] and not was_over:
@@ -44,3 +47,4 @@ def advance(
                 point_kernel.start(floats, row, bits, step)
             point_kernel.observe(floats, row, observations[reading, row])
             kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1

@@ -105,10 +105,13 @@ def _observe(floats: Any, integers: Any, row: Any, tiles: Any, observation: Any)
 @kernel
 def advance(
     state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
-) -> None:
+) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     floats, integers = state
     observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     slip = _F(settings[SLIP])
     has_goal, tiles = settings[NUM_OPTIONS] > 0, int(settings[TILES])
     for row in range(len(mask)):
@@ -130,3 +133,4 @@ def advance(
                 integers[_COFFEE, row], integers[_MAIL, row] = 0, 0
             _observe(floats, integers, row, tiles, observations[reading, row])
             kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1

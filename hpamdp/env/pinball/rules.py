@@ -185,10 +185,13 @@ def _start(floats: Any, row: Any, places: Any, bits: Any, step: Any) -> None:
 @kernel
 def advance(
     state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
-) -> None:
+) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     floats, integers = state
     observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     end_polygons = _FIRST + 6 * int(settings[NUM_POLYGONS])
     end_edges = end_polygons + 6 * int(settings[NUM_EDGES])
     polygons = settings[_FIRST:end_polygons].astype(np.float32).reshape((-1, 6))
@@ -223,3 +226,4 @@ def advance(
             observations[reading, row, 3] = floats[_VY, row] / _MAX_SPEED
             write_tiles(floats[_X, row], floats[_Y, row], tiles, observations[reading, row], len(OBSERVATION_NAMES))
             kernels.report(integers[OUTCOME_ROW, row], len(OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1

@@ -225,10 +225,13 @@ def _observe(floats: Any, row: Any, observation: Any) -> None:
 @kernel
 def advance(
     state: Any, option: Any, discrete: Any, parameters: Any, mask: Any, settings: Any, mode: Any, results: Any
-) -> None:
+) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     floats, integers = state
     observations, outcomes, _, flags, rewards = results
+    invalid = kernels.invalid_row(option, discrete, parameters, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     noise = _F(settings[NOISE])
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != ON_THE_WAY
@@ -245,3 +248,4 @@ def advance(
                 _start(floats, row)
             _observe(floats, row, observations[reading, row])
             kernels.report(integers[OUTCOME_ROW, row], len(OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1
