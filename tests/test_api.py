@@ -123,20 +123,16 @@ def test_an_agent_acts_in_a_vector_of_environments_as_in_single_ones(boat_agent)
 # Import and names.
 
 
-def test_the_collector_leaves_out_what_imports_have_made():
+def test_importing_the_package_loads_no_torch_and_gives_exactly_the_public_names_and_frees_the_collector_of_imports():
     code = (
-        "import gc, hpamdp; hpamdp.load; assert gc.isenabled(); assert gc.get_freeze_count() == 0; "
+        "import gc, sys, hpamdp; assert 'torch' not in sys.modules; print(*hpamdp.__all__); "
+        "hpamdp.load; assert gc.isenabled(); assert gc.get_freeze_count() == 0; "
         "print(gc.get_stats()[2]['collections'], len(gc.get_objects(generation=0)))"
     )
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    searches, young = map(int, printed.split())
-    assert searches <= 2  # before torch is imported
-    assert young < 10_000
-
-
-def test_importing_the_package_loads_no_torch_and_gives_exactly_the_public_names():
-    code = "import sys, hpamdp; assert 'torch' not in sys.modules; print(*hpamdp.__all__)"
-    names = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    *names, searches, young = printed.split()
+    assert int(searches) <= 2  # before torch is imported
+    assert int(young) < 10_000
     assert {"Agent", "ConfigError", "HPPO", "UCB", "load", "make", "train"} <= {*names}
     assert all(getattr(hpamdp, name).__doc__ for name in names)
 

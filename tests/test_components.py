@@ -106,9 +106,9 @@ def test_the_learners_of_values_reach_the_best_pair_of_a_step(learner_class):
 def test_planners_reach_the_best_pair_of_a_step(learner_class):
     torch.manual_seed(0)
     settings = {"updates_per_step": 1.0, "horizon": 1}
-    settings |= {"warmup_steps": 200, "num_samples": 128} if learner_class is DLPA else {"warmup_steps": 300}
+    settings |= {"warmup_steps": 120, "num_samples": 128} if learner_class is DLPA else {"warmup_steps": 160}
     learner = learner_class(PAMDPSpecs.from_env(OneStep()), **settings)
-    train(learner, OneStep(20), 14 if learner_class is DLPA else 24)
+    train(learner, OneStep(20), 10 if learner_class is DLPA else 14)
     assert greedy_reward(learner) > 0.9
 
 
