@@ -88,7 +88,7 @@ def play_with_forbidden_actions(name: str, *, is_compiled: bool = False) -> None
     learner = make_learner(name, specs)
     if is_compiled:
         learner.compile_updates()
-    play_and_learn(env, HierarchicalAgent(None, [learner], specs), 6)
+    play_and_learn(env, HierarchicalAgent(None, [learner], specs), 4)
     assert env.base_env.violations == 0
     parameters = [part for part in learner.state_dict().values() if torch.is_tensor(part) and part.is_floating_point()]
     assert not any(part.isnan().any() for part in parameters)
@@ -199,7 +199,7 @@ def test_a_forbidden_option_is_never_chosen(high):
     selector: Selector = config.high.build(specs=specs, device=CPU)
     learner = make_learner("pdqn", specs) if selector.card.asks_learners else Random(specs)
     learners = [learner] * specs.num_options if selector.card.asks_learners else [learner]
-    play_and_learn(env, HierarchicalAgent(selector, learners, specs), 8)
+    play_and_learn(env, HierarchicalAgent(selector, learners, specs), 5)
     assert env.base_env.violations == 0
 
 
