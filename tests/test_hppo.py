@@ -222,7 +222,7 @@ def test_rows_of_other_learners_change_nothing():
 
 def test_the_learner_finds_the_best_discrete_action_and_its_parameters():
     learner = make()
-    for _ in range(40):
+    for _ in range(25):
         td = one_step_rows(learner, 1000, slope=0.5)
         scalars = learner.learn(td, everything(td))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -269,7 +269,7 @@ def test_discrete_actions_without_parameters_are_learned_too():
 
 
 def test_the_critics_own_learning_rate_falls_with_that_of_the_actors():
-    learner = make(anneal_steps=200, minibatch_size=2, critic_lr=3e-2)
+    learner = make(anneal_steps=200, minibatch_size=50, critic_lr=3e-2)
     td = random_rows(learner, 50, 2)
     rates = []
     for _ in range(3):

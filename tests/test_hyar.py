@@ -170,7 +170,7 @@ def test_the_greedy_form_or_a_search_leaves_a_discrete_action_whose_neighbours_a
         reward=torch.tensor([0.5, -1.0, 1.0])[taken], next_state=torch.zeros(num, 1), discount=torch.zeros(num),
         latent=torch.full((num, 2), torch.nan), batch_size=[num],
     )  # fmt: skip
-    for _ in range(250):
+    for _ in range(160):
         learner.updates += 1
         learner.update_once(rows)
     with set_exploration_type(ExplorationType.DETERMINISTIC):

@@ -485,5 +485,5 @@ def score(low: str, memory: str, seed: int = 0, **settings) -> float:
 
 @pytest.mark.parametrize("memory", ["none", "stack"])
 def test_a_stack_solves_what_cannot_be_solved_without_memory(memory):
-    found = score("hppo", memory, total_frames=8192, num_envs=32, steps_per_batch=32)
+    found = score("hppo", memory, total_frames=6144, num_envs=32, steps_per_batch=32)
     assert found >= 0.9 if memory == "stack" else abs(found) < 0.15

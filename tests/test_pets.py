@@ -531,7 +531,7 @@ def test_plans_avoid_or_reach_terminations_if_every_reward_is_the_same(reward, i
         after = torch.rand(len(state), 4) * 2 - 1
         return batch_of(state, td[keys.DISCRETE], unit, torch.full((len(state),), reward), after, ends), ends
 
-    for _ in range(12):
+    for _ in range(8):
         batch, _ = play(torch.rand(20, 4) * 2 - 1)
         learn(learner, batch)
     with set_exploration_type(ExplorationType.DETERMINISTIC):

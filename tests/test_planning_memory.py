@@ -56,7 +56,7 @@ def learn(learner: PETS | DLPA, rolled: TensorDict) -> None:
 def test_with_a_memory_plans_use_a_hidden_sign_that_the_step_before_has_revealed(kind, memory, low, high):
     env = Cue(16, length=2)
     learner = make(env, memory, kind)
-    for _ in range(10):
+    for _ in range(7):
         learn(learner, played(env, learner, 4))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rolled = played(Cue(200, length=2, seed=5), learner, 2)
