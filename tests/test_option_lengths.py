@@ -15,7 +15,7 @@ from test_assemble import train
 from test_decisions import check_accounts, collect
 from test_grid import SHORT, SHORT_SELECTORS
 from test_resume import SMALL as RESUMED
-from test_resume import rows_of, stop_and_resume
+from test_resume import rows_without_times, stop_and_resume
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_env import ToyEnv
@@ -116,7 +116,7 @@ def test_lengths_that_leave_no_choice_give_the_run_of_options_of_that_length(hig
     fixed = [*words, "agent.termination=steps", "agent.option_lengths=null", "agent.option_length=3"]
     assert run(compose_config([*words, "agent.option_lengths=[3]"]), tmp_path / "chosen") == 0
     assert run(compose_config(fixed), tmp_path / "steps") == 0
-    chosen, steps = rows_of(tmp_path / "chosen"), rows_of(tmp_path / "steps")
+    chosen, steps = rows_without_times(tmp_path / "chosen"), rows_without_times(tmp_path / "steps")
     for row in (*chosen, *steps):
         for name in [name for name in row if name.startswith("high/practice_")]:  # of pairs, and of options
             del row[name]
@@ -266,7 +266,7 @@ RUNS = [
 def test_lengths_are_chosen_over_every_learner(high, low, sharing, tmp_path):
     given = words_of(high, low, f"agent.sharing={sharing}")
     assert run(compose_config(given), tmp_path, given) == 0
-    rows = rows_of(tmp_path)
+    rows = rows_without_times(tmp_path)
     assert 1.0 <= float(rows[-1]["eval/option_length"]) <= 4.0
     assert 1.0 <= float(rows[-1]["high/length"]) <= 4.0
 

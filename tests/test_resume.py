@@ -167,7 +167,7 @@ def test_a_run_goes_on_past_the_largest_int32_of_steps_and_episodes_and_resumes_
     given = {"low": "random", "film": False, "progress": False, **sizes, **every}
     hpamdp.train("catch_point", folder=tmp_path / "whole", callbacks=[Far()], **given)
     hpamdp.train(folder=tmp_path / "resumed", resume=str(tmp_path / "copy"), progress=False)
-    assert rows_of(tmp_path / "resumed") == rows_of(tmp_path / "whole")
+    assert rows_without_times(tmp_path / "resumed") == rows_without_times(tmp_path / "whole")
     assert [float(row["frames"]) for row in rows_of(tmp_path / "whole")] == [2**31 + 32.0 * i for i in range(-3, 3)]
     parts, whole = (parts_of_run(tmp_path / name) for name in ("resumed", "whole"))
     assert (whole["collection"]["env"]["episode"] < 0).all()
