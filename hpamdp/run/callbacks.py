@@ -19,7 +19,7 @@ from hpamdp.files import replacing
 from hpamdp.messages import as_code, first_line, warn
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.options import CARDS, PatienceOptions, TimeLimitOptions
-from hpamdp.run.state_file import check_savable
+from hpamdp.run.state_file import as_bytes
 from hpamdp.run_files import BEST_NAME
 from hpamdp.settings import SettingError
 
@@ -331,7 +331,7 @@ def states_of(callbacks: Mapping[str, Callback]) -> dict[str, dict[str, Any]]:
         with mistakes_explained(name):
             states[name] = callback.state()
         try:
-            check_savable("state", states[name])
-        except (TypeError, NotImplementedError) as error:  # torch raises the latter for a tensor without numbers
-            raise CallbackError(f"{name}: {first_line(error)}") from error
+            as_bytes({"state": states[name]})
+        except (TypeError, RuntimeError, KeyError) as error:
+            raise CallbackError(f"{name}.state: no checkpoint can hold it ({first_line(error)})") from error
     return states

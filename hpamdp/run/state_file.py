@@ -39,23 +39,24 @@ def write(path: Path, state: Mapping[str, Any]) -> None:
         TypeError: a value is of another type.
         OSError: the file cannot be written; the old file stays as it is.
     """
-    packer = _Packer()
-    content: dict[str, Any] = {"state": {name: packer.packed(name, value) for name, value in state.items()}}
-    content["checksums"] = {name: _checksum(tensor) for name, tensor in packer.tensors.items()}
-    content["checksum"] = _checksum_of_json(content)
-    data = save(packer.tensors, {METADATA_KEY: json.dumps(content, allow_nan=False)})
+    data = as_bytes(state)
     with replacing(path) as partial:
         partial.write_bytes(data)
 
 
-def check_savable(name: str, value: Any) -> None:
-    """Check that `write` can write a value.
+def as_bytes(state: Mapping[str, Any]) -> bytes:
+    """Return what `write` writes.
 
     Raises:
-        TypeError: a value in it is of another type; `name` is its name.
-        NotImplementedError: a tensor has no numbers.
+        TypeError: a value is of another type.
+        RuntimeError: a tensor is sparse, or has no numbers.
+        KeyError: safetensors does not know the type of a tensor.
     """
-    _Packer().packed(name, value)
+    packer = _Packer()
+    content: dict[str, Any] = {"state": {name: packer.packed(name, value) for name, value in state.items()}}
+    content["checksums"] = {name: _checksum(tensor) for name, tensor in packer.tensors.items()}
+    content["checksum"] = _checksum_of_json(content)
+    return save(packer.tensors, {METADATA_KEY: json.dumps(content, allow_nan=False)})
 
 
 class _Packer:
