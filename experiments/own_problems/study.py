@@ -97,7 +97,7 @@ def draw(curves: Rows, path: Path) -> None:
     problems = groups(curves, "problem")
     with rc_context(STYLE):
         figure = Figure(figsize=(9.2, 5.4), layout="constrained")
-        panels = figure.subplots(2, -(-len(problems) // 2), sharex=True, sharey=True, squeeze=False).flat
+        panels = figure.subplots(2, -(-len(problems) // 2), sharex=True, sharey=True, squeeze=False).ravel()
         for axes, ((problem,), rows) in zip(panels, problems.items(), strict=False):
             for (library, player), of_player in groups(rows, "library", "player").items():
                 colour = COLOURS.get(player) or LEARNER_COLOURS[player.split()[0]]
@@ -113,7 +113,9 @@ def draw(curves: Rows, path: Path) -> None:
             axes.xaxis.set_minor_locator(NullLocator())
             axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         fullest = max(figure.axes, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
-        fullest.legend(frameon=False, fontsize=8, loc="lower right")
+        for empty in panels[len(problems) :]:
+            empty.set_axis_off()
+        panels[-1].legend(*fullest.get_legend_handles_labels(), frameon=False, fontsize=8, loc="lower right")
         figure.supxlabel("CPU seconds since the start of the program")
         figure.supylabel("way from random play to the best policy")
         figure.savefig(path)
