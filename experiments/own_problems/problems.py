@@ -1,4 +1,4 @@
-"""Six problems of the kinds that people have at work, as Gymnasium environments in plain Python.
+"""Seven problems of the kinds that people have at work, as Gymnasium environments in plain Python.
 
 Each action is a choice together with a number: which supplier and how much, which mode and which power. Rewards and
 observations have their natural units. `optimum.py` computes the best return of each by dynamic programming.

@@ -109,8 +109,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         first_env: number of the first environment, if other processes have those before it.
         oracle: whether to write the action of the problem's scripted player under `oracle`: `discrete` and
             `parameters`, `[N, P]`.
-        human: whether to write what people would choose under `human`, if the problem knows it.
-        flatten_pictures: whether pictures are float32 numbers in [0, 1], a vector like any other.
+        human: whether to write what people would choose under `human`; refused if the problem does not know it.
+        flatten_pictures: whether pictures, if there are any, are float32 numbers in [0, 1], a vector like any other.
         settings: single settings by name, in place of those in `options`.
 
     Raises:

@@ -21,13 +21,13 @@ class PlanningOracle(ABC):
         shape: numbers N of environments, P of plans for each and L of actions in a plan.
         num_discrete: number of discrete actions.
         bounds: of the parameter, the same for all discrete actions.
-        num_options: number of options among which the best one is told; 0 if none is.
+        num_options: number of options; if 0, `read` has no `option`.
         device: of the tensors.
 
     Attributes:
         discrete, parameters: the plans, `[N, P, L]`.
         option: the best option, int64 `[N]`.
-        planned_at: steps of the episode before the plan, int64 `[N]`.
+        planned_at: steps of the episode before the plan, int64 `[N]`; 0 where a subclass shifts the plan itself.
     """
 
     saved_names: ClassVar[tuple[str, str]]  # of `discrete` and `parameters` in a checkpoint

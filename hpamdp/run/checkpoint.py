@@ -2,8 +2,8 @@
 
 A checkpoint is a safetensors file (see `state_file`). It holds the run's progress, the agent, and a state for each
 other part of the run. Opening somebody else's file runs none of its code. Loading changes an agent only if the whole
-file fits: names, types and shapes are compared first. The values need no comparison, since the file's checksums say
-that they are as a run wrote them.
+file fits: names, types and shapes are compared first. Checksums say that the values are as a run wrote them; NaN and
+infinite weights are refused.
 
 TorchRL's `Checkpoint` is not used. It reads a replay buffer's prefetch queue with pickle, and stores replay buffers at
 full capacity. It also moves the old file away before the new one is in place.
@@ -328,17 +328,17 @@ def _state_for(module: nn.Module, saved: Any, file: Path, *, may_lack: str = "")
         ValueError: the state is of another module.
         ConfigError: the state holds NaN or inf, as that of a run that diverged.
     """
-    saved, later, any_size = _by_name(saved), added_later(module), buffers_sized_by_data(module)
+    saved, later, any_size = _by_name(saved), added_later(module), _buffers_sized_by_data(module)
     own = {
         key: value
         for key, value in module.state_dict(keep_vars=True).items()
         if key in saved or not (key in later or (may_lack and key.startswith(may_lack)))
     }
-    state = dict(check_names(saved, own))
+    state = dict(_check_names(saved, own))
     for key, value in own.items():
         if not isinstance(value, Tensor):
             continue
-        check_form(key, state[key], value, any_size=id(value) in any_size)
+        _check_form(key, state[key], value, any_size=id(value) in any_size)
         tensor = state[key] = state[key].to(value.dtype)
         for what, is_wrong in (("NaN", torch.isnan), ("inf", torch.isinf)):
             if is_wrong(tensor).any() and not is_wrong(value).any():
@@ -353,7 +353,7 @@ def _state_for_other(name: str, part: Any, saved: Any) -> dict[str, Any]:
         ValueError: the state is of another part.
     """
     if isinstance(part, torch.optim.Optimizer):
-        return checked_optimizer(name, saved, part)
+        return _checked_optimizer_state(name, saved, part)
     check_like(name, saved, part.state_dict())
     return _by_name(saved)
 
@@ -387,7 +387,7 @@ def set_generators(generators: Mapping[str, Any]) -> None:
     GlobalRNGState().load_state_dict(states)
 
 
-def check_form(where: str, saved: object, own: Tensor, *, any_size: bool = False) -> None:
+def _check_form(where: str, saved: object, own: Tensor, *, any_size: bool = False) -> None:
     """Refuse a value unless it is a tensor with the dtype and shape of `own`; float16 may stand for float32.
 
     Args:
@@ -422,15 +422,15 @@ def check_like(where: str, saved: Any, own: Any) -> None:
         ValueError: the values differ; the message names the first difference.
     """
     if isinstance(own, Tensor):
-        check_form(where, saved, own)
+        _check_form(where, saved, own)
     elif isinstance(own, Mapping):
-        for name, value in check_names(saved, own, where).items():
+        for name, value in _check_names(saved, own, where).items():
             check_like(f"{where}.{name}", value, own[name])
     elif type(saved) is not type(own):
         raise ValueError(f"{where} is {type(saved).__name__}, but must be {type(own).__name__}")
 
 
-def check_names(saved: object, own: Mapping[str, Any], where: str = "a state dict") -> Mapping[str, Any]:
+def _check_names(saved: object, own: Mapping[str, Any], where: str = "a state dict") -> Mapping[str, Any]:
     """Return nested values if their names are the names of `own`.
 
     Raises:
@@ -444,7 +444,7 @@ def check_names(saved: object, own: Mapping[str, Any], where: str = "a state dic
     return saved
 
 
-def buffers_sized_by_data(module: nn.Module) -> set[int]:
+def _buffers_sized_by_data(module: nn.Module) -> set[int]:
     """Return the ids of a module's buffers whose sizes depend on data."""
     sized = [part for part in module.modules() if isinstance(part, SizedByData)]
     return {id(buffer) for part in sized for buffer in part.buffers(recurse=False)}
@@ -460,7 +460,7 @@ def _state_after_a_step(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
     return another.state_dict()
 
 
-def checked_optimizer(where: str, saved: Mapping[str, Any], optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+def _checked_optimizer_state(where: str, saved: Mapping[str, Any], optimizer: torch.optim.Optimizer) -> dict[str, Any]:
     """Return a saved state that an optimizer can load. Torch's fused optimizers compare no shapes themselves.
 
     Args:

@@ -93,9 +93,10 @@ def resolve(
 
 
 def _check_same_run(saved: Mapping[str, Any], resolved: Config, file: Path, words: Sequence[str]) -> None:
-    """Refuse another seed or problem, under whose name the resumed run would be saved.
+    """Refuse another seed or problem than the run had: its results would be saved as those of the new one.
 
-    A path or an entry point may change, since the files of a run may have moved.
+    A path or an entry point may change, since the files of a run may have moved. So may a setting that a later version
+    has added to the problem.
 
     Raises:
         ConfigError: a word changes one of them.
@@ -326,5 +327,5 @@ def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
 
 
 def _rank(name: str) -> int:
-    """Return a number that puts settings before those that may follow from them: choices, values of the run, others."""
+    """Return a number by which differing settings are named: first choices, then values of the run, then all others."""
     return 0 if name.startswith(_CHOSEN) else 1 + ("." in name)

@@ -17,7 +17,7 @@ from hpamdp.messages import one_line
 # Ctrl-C, a cluster's stop, the warning of SLURM and others before the time limit, and a closed terminal.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGXCPU)
 _URGENT = (signal.SIGINT, signal.SIGTERM)
-_SAME_REQUEST_S = 1.0  # `timeout 60 make run` and some launchers deliver one signal twice
+_SAME_REQUEST_S = 1.0  # `timeout 60 make run` and some launchers deliver a signal twice
 
 
 class StopRequest:
@@ -47,7 +47,7 @@ class StopRequest:
             self._is_urgent = False
 
     def note(self, number: int, frame: FrameType | None) -> None:
-        """Note the signal. A second Ctrl-C or SIGTERM interrupts at once, unless it comes within the same second.
+        """Note the signal. A Ctrl-C or SIGTERM interrupts at once if it comes over a second after the first signal.
 
         Raises:
             KeyboardInterrupt: the signal is the second one, or came in a block of `taken_at_once`.

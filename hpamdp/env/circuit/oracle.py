@@ -57,7 +57,6 @@ class CircuitOracle(PlanningOracle):
         design: settings of the circuits; native, or with the fixed target of `task`.
         task: name of the task.
         device: of the tensors.
-
     """
 
     saved_names = ("gates", "angles")

@@ -50,7 +50,7 @@ class PlanningLearner(ReplayLearner):
         self.policy.bonus = bonus.scaled(self.options.reward_scale)
 
     def start(self) -> None:
-        """Plan from now on, if the warm-up has shown what to plan for."""
+        """Plan from now on."""
         self.on_progress(0)
 
     def update_end_values(self, rows: TensorDictBase) -> dict[str, Tensor]:
@@ -80,7 +80,10 @@ class PlanningLearner(ReplayLearner):
         return self.end_values.of_own(self.target_perception.of_states(states))
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Add after which steps no plan goes on, `terminated` bool `[*B, T]`; they have no discount."""
+        """Return the rows with `terminated` bool `[*B, T]`: no plan goes on after these steps, and nothing counts then.
+
+        A step that ends a trip is one of them.
+        """
         rows, ends = super().transitions(batch), plan_ends(batch)
         rows.set("discount", torch.where(ends, 0.0, rows["discount"]))
         return rows.set("terminated", ends)

@@ -57,6 +57,7 @@ class ReplayLearner(Learner):
         owner: the discrete action that each parameter belongs to, int64 `[num_parameters]`.
         catches_up: true if the first updates make up for the steps of the warm-up.
         max_grad_norm: largest gradient norm of a gradient step; if None, there is no limit.
+        critics: the critics, of learners that have some.
     """
 
     card = REPLAY_CARD
