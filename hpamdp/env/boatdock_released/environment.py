@@ -50,10 +50,13 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
     An environment always keeps its controller, so no selector can be used with it.
 
     `float_type`, which a subclass may set, is the type of the computation and its results. Durations are always
-    rounded in float32. For the constructor's arguments see `BatchedEnv`. `reset` also takes layouts, which the
-    environments keep: a tensordict with `start` and `goal` `[N, 2]` in screen px and, for the incongruent
-    controller, optionally `keymap` int `[N]`. Raises: ValueError: an argument, action or layout is invalid; the
-    state is unchanged.
+    rounded in float32. For the constructor's arguments see `BatchedEnv`.
+
+    `reset` also takes layouts, which the environments keep: a tensordict with `start` and `goal` `[N, 2]` in screen px
+    and, for the incongruent controller, optionally `keymap` int `[N]`.
+
+    Raises:
+        ValueError: an argument, action or layout is invalid; the state is unchanged.
     """
 
     Options = ReleasedBoatDockOptions
