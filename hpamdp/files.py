@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import glob
+import io
 import os
 import secrets
 import stat
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 _ABANDONED_S = 3600.0  # after which nobody still writes to a file
+_DIGEST_BYTES = 32  # of the SHA-256 that a file of the cache begins with
 
 
 @contextmanager
@@ -106,7 +108,7 @@ def read_regular(path: Path, max_bytes: int, *, follow_links: bool = True) -> by
 def kept_in_cache(kind: str, depends_on: bytes, compute: Callable[[], np.ndarray]) -> np.ndarray:
     """Return an array that takes seconds to compute, and keep it in the user's cache for later runs.
 
-    If the cache cannot be read or written, or a file there was cut off, the array is computed.
+    If the cache cannot be read or written, or a file there was damaged, the array is computed.
 
     Args:
         kind: name of the array's folder in the cache.
@@ -116,13 +118,17 @@ def kept_in_cache(kind: str, depends_on: bytes, compute: Callable[[], np.ndarray
     import numpy as np
     from platformdirs import user_cache_path
 
-    file = user_cache_path("hpamdp") / kind / f"{sha256(depends_on).hexdigest()}.npy"
-    with suppress(OSError, ValueError, EOFError):
-        kept: np.ndarray = np.load(file, allow_pickle=False)
-        return kept
+    file = user_cache_path("hpamdp") / kind / f"{sha256(depends_on).hexdigest()}.bin"
+    with suppress(OSError):
+        digest, data = (content := file.read_bytes())[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        if sha256(data).digest() == digest:
+            read: np.ndarray = np.load(io.BytesIO(data), allow_pickle=False)
+            return read
     array = compute()
+    written = io.BytesIO()
+    np.save(written, array)
     with suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as partial:
-            np.save(partial, array)
+            partial.write_bytes(sha256(written.getvalue()).digest() + written.getvalue())
     return array

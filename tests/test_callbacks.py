@@ -156,11 +156,20 @@ def test_metrics_of_ones_own_are_columns_of_every_row_and_part_of_the_summary(tm
     assert json.loads((folder / "summary.json").read_text())["own/frames"] == 128.0
 
 
-def test_a_metric_that_is_no_number_is_told_in_one_line_after_training_was_saved(tmp_path):
-    own = OwnMetrics(lambda trainer: {"x": math.nan} if trainer.frames == 64 else {})
+@pytest.mark.parametrize(
+    ("returned", "complaint"),
+    [
+        ({"x": math.nan}, "OwnMetrics.metrics: x=nan: must be a finite number"),
+        ({"a\rb": 1.0}, "the name must be a text in one line"),
+    ],
+)
+def test_a_metric_without_a_number_or_a_name_is_told_in_one_line_after_training_was_saved(
+    returned, complaint, tmp_path
+):
+    own = OwnMetrics(lambda trainer: returned if trainer.frames == 64 else {})
     with pytest.raises(CallbackError) as error:
         train(own, folder=tmp_path / "run")
-    assert "OwnMetrics.metrics: x=nan: must be a finite number" in str(error.value)
+    assert complaint in str(error.value)
     assert checkpoint.progress_of(tmp_path / "run/checkpoint.safetensors")["frames"] == 64
 
 
@@ -228,6 +237,20 @@ def test_a_state_may_hold_nan_for_what_is_not_known_yet(tmp_path):
     source = tmp_path / "run" / "checkpoint.safetensors"
     begin(make_config([*SMALL, f"resume={source}"]), source, callbacks=[again]).parts.close()
     assert math.isnan(again.values["last"]) and again.values["all"].tolist() == [-9, 3, 5]
+
+
+def test_a_callback_that_cannot_take_the_saved_state_is_named(tmp_path):
+    class Other(Callback):
+        def set_state(self, state):
+            raise AttributeError("no shape")
+
+    train(Unknown(), folder=tmp_path / "run")
+    Other.__name__ = "Unknown"
+    source = tmp_path / "run" / "checkpoint.safetensors"
+    with pytest.raises(
+        ConfigError, match=r"does not fit this run \(Unknown.set_state raised AttributeError: no shape\)"
+    ):
+        begin(make_config([*SMALL, f"resume={source}"]), source, callbacks=[Other()])
 
 
 def test_callbacks_are_called_in_the_order_of_the_list_and_before_those_from_python(tmp_path):

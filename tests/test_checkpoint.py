@@ -121,6 +121,14 @@ def test_a_damaged_checkpoint_is_refused_in_one_line(numbers, trained, parts, tm
         assert "\n" not in str(error.value), number
 
 
+def test_a_changed_number_of_a_network_is_called_damage(trained, parts, tmp_path):
+    data = (trained / "checkpoint.safetensors").read_bytes()
+    weights = parts_of(trained / "checkpoint.safetensors")["agent"]
+    place = data.index(max(weights.values(), key=torch.numel).numpy().tobytes())
+    (tmp_path / "damaged").write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+    assert "damaged, or not a checkpoint of this program (the checksum of" in refusal(tmp_path / "damaged", parts)
+
+
 def test_missing_parts_foreign_files_and_other_agents_are_refused(trained, parts, tmp_path):
     file = trained / "checkpoint.safetensors"
     for gone in ("format", "progress", "agent", "rng", "learner0_actor", "collection"):

@@ -155,7 +155,7 @@ def test_an_array_in_the_cache_is_computed_once_and_again_if_its_file_is_broken(
         assert kept_in_cache("arrays", given, compute).tolist() == [0, 1, 2]
     assert len(computed) == 2
     for file in (tmp_path / "hpamdp" / "arrays").iterdir():
-        file.write_bytes(file.read_bytes()[:-1])
+        file.write_bytes(file.read_bytes()[:-1] + b"\1")
     assert kept_in_cache("arrays", b"one", compute).tolist() == [0, 1, 2]
     assert len(computed) == 3
     monkeypatch.setenv("XDG_CACHE_HOME", os.devnull)

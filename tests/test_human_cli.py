@@ -100,6 +100,19 @@ def test_a_recording_without_a_press_is_checked_and_summarised_and_gives_no_tran
 
 
 @pytest.mark.parametrize(
+    ("form", "given", "said"),
+    [
+        ("csv", ["--reward", "sparse", "--observation", "pixels"], "--reward sparse, --observation pixels: no effect"),
+        ("memmap", ["--one-frame"], "--one-frame: no effect on transitions, which always have one frame"),
+    ],
+)
+def test_options_that_an_export_would_ignore_are_refused(capsys, people_file, tmp_path, form, given, said):
+    to = tmp_path / "out"
+    assert said in error_of(capsys, "export", people_file, "--any-file", "--format", form, "--to", to, *given)
+    assert not to.exists()
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"), [(["check", "none.mat"], "there is no such file"), (["download"], "required: --url")]
 )
 def test_usage_errors_are_one_line(capsys, arguments, message):

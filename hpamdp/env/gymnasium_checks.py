@@ -41,7 +41,11 @@ def describe(value: Any) -> str:
 
 
 def parameter_arrays(
-    parameters: Any, parameter_dims: Sequence[int], batch: tuple[int, ...], where: str = "step"
+    parameters: Any,
+    parameter_dims: Sequence[int],
+    batch: tuple[int, ...],
+    where: str = "step",
+    name: str = "parameters",
 ) -> list[np.ndarray]:
     """Return the parameters of each discrete action, `[*batch, dim]` each.
 
@@ -50,15 +54,16 @@ def parameter_arrays(
         parameter_dims: number of parameters of each discrete action.
         batch: `()` for one environment, `(N,)` for many.
         where: begins the error.
+        name: of the parameters in the error.
 
     Raises:
         ValueError: it is no such tuple.
     """
     if not isinstance(parameters, (tuple, list)) or len(parameters) != len(parameter_dims):
         num = len(parameter_dims)
-        raise ValueError(f"{where}: parameters must be a tuple of length {num}, but is {describe(parameters)}")
+        raise ValueError(f"{where}: {name} must be a tuple of length {num}, but is {describe(parameters)}")
     return [
-        as_array(f"{where}: parameters of action {number}", array, (*batch, dim))
+        as_array(f"{where}: {name} of action {number}", array, (*batch, dim))
         for number, (array, dim) in enumerate(zip(parameters, parameter_dims, strict=True))
     ]
 

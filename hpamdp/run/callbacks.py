@@ -73,11 +73,7 @@ class Callback:
         return {}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`.
-
-        Raises:
-            KeyError, TypeError, ValueError: the state is of another callback.
-        """
+        """Continue from a `state`."""
 
 
 class BestAgent(Callback):
@@ -304,6 +300,8 @@ def metrics_of(callbacks: Mapping[str, Callback], trainer: Trainer) -> dict[str,
             raise CallbackError(f"{name}.metrics: must return numbers by their names, not {type(metrics).__name__}")
         for metric, value in metrics.items():
             where = f"{name}.metrics: {metric}={value!r:.60}"
+            if not isinstance(metric, str) or not metric or not metric.isprintable():
+                raise CallbackError(f"{where}: the name must be a text in one line")
             if f"{OWN}{metric}" in row:
                 raise CallbackError(f"{where}: another callback has a metric of this name")
             row[f"{OWN}{metric}"] = _finite_number(where, value)

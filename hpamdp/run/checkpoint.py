@@ -198,7 +198,7 @@ def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) ->
     opened, _ = _opened(file)
     states = []
     with _explained(f"low.checkpoint={file}: of another class or size than low"):
-        saved = _by_name(opened.read("agent", device))
+        saved = _by_name(_read(opened, file, "agent", device))
         saved_num = len({name.split(".")[1] for name in saved if name.startswith("learners.")})
         if saved_num not in (0, len(agent.learners)):
             held = "1 learner" if saved_num == 1 else f"{saved_num} learners"
@@ -246,9 +246,9 @@ def load(
     loaded = {}
     with _explained(f"{file}: does not fit this agent, whose sizes env sets"):
         may_lack = "" if with_training else FOR_TRAINING
-        networks = _state_for(agent, opened.read("agent", device), file, may_lack=may_lack)
+        networks = _state_for(agent, _read(opened, file, "agent", device), file, may_lack=may_lack)
         for name in stateful.keys() & {*opened.names}:
-            saved = opened.read(name, device)
+            saved = _read(opened, file, name, device)
             if name in buffers:
                 num = min(saved["write_count"], stateful[name]._storage.max_size)
                 loaded[name] = {"rows": TensorDict(saved["rows"], [num]), "write_count": saved["write_count"]}
@@ -312,6 +312,16 @@ def _opened(file: Path) -> tuple[state_file.StateFile, dict[str, Any]]:
         if number != FORMAT:
             raise ValueError(f"format {number}, but this version reads {FORMAT}")
         return opened, _by_name(opened.read("progress"))
+
+
+def _read(opened: state_file.StateFile, file: Path, name: str, device: torch.device) -> Any:
+    """Return a value of an open file.
+
+    Raises:
+        ConfigError: the value is damaged.
+    """
+    with _explained(_damage_of(file)):
+        return opened.read(name, device)
 
 
 def _state_for(module: nn.Module, saved: Any, file: Path, *, may_lack: str = "") -> dict[str, Any]:

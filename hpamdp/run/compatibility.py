@@ -478,6 +478,8 @@ def lack_of(need: str, config: Config) -> str | None:
 def _complaints_about_problem(config: Config, problem: ProblemFacts) -> Iterator[str]:
     """Yield what does not go with the problem."""
     grouping, env = config.run.env.grouping, config.env
+    if grouping == "default" and not problem.default_options:
+        yield f"env.grouping=default: {env} suggests none; name the actions of each option"
     for level in _levels(config):
         if grouping is not None and level.card.needs:
             yield f"env.grouping: {level} knows nothing of them; use another {level.group}"

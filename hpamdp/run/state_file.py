@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import json
 import math
-import numbers
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save
@@ -78,8 +78,8 @@ class _Packer:
         if isinstance(value, list | tuple):
             items = [self.packed(f"{name}/{i}", part) for i, part in enumerate(value)]
             return items if isinstance(value, list) else {"$tuple": items}
-        if isinstance(value, numbers.Real) and not isinstance(value, bool | int | float):  # a number of NumPy
-            value = int(value) if isinstance(value, numbers.Integral) else float(value)
+        if isinstance(value, np.generic):
+            value = value.item()
         if isinstance(value, float) and not math.isfinite(value):
             return {"$float": str(float(value))}
         if value is None or isinstance(value, bool | int | float | str):
@@ -139,6 +139,8 @@ class StateFile:
         tensor: Tensor = self._file.get_tensor(name)
         if _checksum(tensor) != self._checksums[name]:
             raise ValueError(f"the checksum of {name} is wrong")
+        if tensor.dtype == torch.bool and (tensor.view(torch.uint8) > 1).any():
+            raise ValueError(f"{name} holds other bytes than 0 and 1")
         return tensor
 
 

@@ -126,11 +126,14 @@ class Trainer:
         """Set the saved states of callbacks. A callback without a saved state begins as in a new run.
 
         Raises:
-            KeyError, TypeError, ValueError: a state is of another callback.
+            ValueError: a callback cannot take the state, such as that of another one.
         """
         for name, callback in self.callbacks.items():
             if name in states:
-                callback.set_state(states[name])
+                try:
+                    callback.set_state(states[name])
+                except Exception as error:  # the state may be of another callback of this name
+                    raise ValueError(f"{name}.set_state raised {type(error).__name__}: {first_line(error)}") from error
         dropped = [name for name, state in states.items() if state and name not in self.callbacks]
         if dropped:
             warn(f"the checkpoint holds the state of {', '.join(dropped)}, but this run has no such callback")

@@ -133,13 +133,10 @@ def _parser() -> argparse.ArgumentParser:
         "--one-frame", action="store_true", help="csv, npz: move every harbour to the environment's centre"
     )
     export_parser.add_argument(
-        "--reward", choices=("paper", "sparse"), default="paper", help="memmap, minari: the reward (default paper)"
+        "--reward", choices=("paper", "sparse"), help="memmap, minari: the reward (default paper)"
     )
     export_parser.add_argument(
-        "--observation",
-        choices=("scaled", "pixels"),
-        default="scaled",
-        help="memmap, minari: the observation (default scaled)",
+        "--observation", choices=("scaled", "pixels"), help="memmap, minari: the observation (default scaled)"
     )
     export_parser.set_defaults(run=_export)
     return parser
@@ -317,6 +314,7 @@ def _print_row(name: str, figures: Figures) -> None:
 
 def _export(options: argparse.Namespace) -> None:
     is_table = options.format in _TABLE_FORMATS
+    _refuse_options_without_effect(options, is_table=is_table)
     data = select(
         _read(options, one_frame=options.one_frame or not is_table),
         complete=options.complete,
@@ -331,6 +329,18 @@ def _export(options: argparse.Namespace) -> None:
     say(f"{options.to}: {len(data.episodes)} episodes, {len(data.presses)} presses")
 
 
+def _refuse_options_without_effect(options: argparse.Namespace, *, is_table: bool) -> None:
+    given = {
+        f"--reward {options.reward}": is_table and options.reward is not None,
+        f"--observation {options.observation}": is_table and options.observation is not None,
+        "--one-frame": not is_table and options.one_frame,
+    }
+    ignored = [option for option, is_ignored in given.items() if is_ignored]
+    if ignored:
+        of = "tables, which hold what was recorded" if is_table else "transitions, which always have one frame"
+        raise DataError(f"{', '.join(ignored)}: no effect on {of}; leave it out with --format {options.format}")
+
+
 def _export_tables(data: HumanData, options: argparse.Namespace) -> None:
     if options.format == "csv":
         export.write_csv(data._asdict(), Path(options.to), axes=("x", "y"))
@@ -339,7 +349,7 @@ def _export_tables(data: HumanData, options: argparse.Namespace) -> None:
 
 
 def _export_transitions(data: HumanData, options: argparse.Namespace) -> None:
-    rows = transitions(data, reward=options.reward, observation=options.observation)
+    rows = transitions(data, reward=options.reward or "paper", observation=options.observation or "scaled")
     if options.format == "memmap":
         export.write_memmap(rows, Path(options.to))
     else:

@@ -180,6 +180,6 @@ class NumpyBoats(NumpyRows):
             names = ", ".join(self._leaf_names)
             raise ValueError(f"step: the action must be a tuple ({names}), but is {describe(action)}")
         named = dict(zip(self._leaf_names, action, strict=True))
-        durations = parameter_arrays(named["duration"], (1,) * task.NUM_KEYS, self._batch)
+        durations = parameter_arrays(named["duration"], (1,) * task.NUM_KEYS, self._batch, name="duration")
         named["duration"] = np.concatenate(durations, axis=-1)
         return named
