@@ -98,14 +98,17 @@ def table(rows: Rows) -> str:
 
 
 def choosing(rows: Rows) -> str:
-    """Return a line for each cell of choosing selectors with three seeds or more: score, and score over one boat."""
+    """Return a line for each cell of choosing selectors with three seeds or more: score, and score over one boat.
+
+    UCB cannot see the layout, so it does not choose.
+    """
     lines = [
         "| selector | learner | presses | n | score | below the ceiling | over one boat | oracle's | weighted | "
         "regret | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for (high, low, frames), runs in groups(rows, "high", "low", "frames").items():
-        if high == "none" or len(runs) < 3:
+        if high in ("none", "ucb") or len(runs) < 3:
             continue
         alone = single(rows, low)
         columns = ("score", "ceiling", "agreement", "weighted", "regret", "cpu_s")
