@@ -57,7 +57,7 @@ def test_problems_suggest_options():
         (["env=platform", "+env.grouping={run: []}"], "env.grouping: option run allows no action; name at least one"),
         (["env=platform", "+env.grouping={}"], "env.grouping: name at least one option"),
         (["env=rooms", "+env.grouping={up: [0]}"], "env.grouping: RoomsEnv has options of its own: skates, boots"),
-        (["env=catch_point", "+env.grouping=default"], "env.grouping: name at least one option"),
+        (["env=catch_point", "+env.grouping=default"], "env.grouping=default: env=catch_point suggests none"),
         (["env=hard_move", "low=planner", "+env.grouping=default"], "env.grouping: low=planner knows nothing of"),
         (["env=platform", "+env.grouping=3"], "env.grouping=3: must"),
     ],
