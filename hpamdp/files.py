@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     import numpy as np
 
 _ABANDONED_S = 3600.0  # after which nobody still writes to a file
-_DIGEST_BYTES = 32  # of the SHA-256 that a file of the cache begins with
+_MAX_KEPT_BYTES = 2**26  # of an array in the cache
+_DIGEST_BYTES = 32  # of the array's SHA-256, which its file begins with
 
 
 @contextmanager
@@ -120,7 +121,8 @@ def kept_in_cache(kind: str, depends_on: bytes, compute: Callable[[], np.ndarray
 
     file = user_cache_path("hpamdp") / kind / f"{sha256(depends_on).hexdigest()}.bin"
     with suppress(OSError):
-        digest, data = (content := file.read_bytes())[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        kept = read_regular(file, _MAX_KEPT_BYTES)
+        digest, data = kept[:_DIGEST_BYTES], kept[_DIGEST_BYTES:]
         if sha256(data).digest() == digest:
             read: np.ndarray = np.load(io.BytesIO(data), allow_pickle=False)
             return read

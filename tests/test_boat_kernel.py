@@ -112,7 +112,7 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
         is_other_try = (env.state.start_x - fresh.start_x).abs() > 1.0
         num_different += int((is_other_try & same).sum())
         same = same & ~is_other_try
-        compare(env.state, fresh, same, rounding_of_positions(before, moved, max(by_tensors.rules.noises) > 0.0))
+        compare(env.state, fresh, same, rounding_of_positions(before, moved, max(by_tensors.options.noises) > 0.0))
         again = by_tensors.observe(fresh)
         assert torch.allclose(
             root["observation"][same], again[same], atol=1e-3 if rules.get("observation") == "pixels" else 3e-5

@@ -113,7 +113,7 @@ def follow(env: BoatDockEnv, option: int | None) -> tuple[torch.Tensor, torch.Te
     row = torch.arange(env.num_envs)
     for number in range(planner.MAX_PRESSES + 1):
         chosen = td["oracle", "option"]
-        if option is not None and (number == 0 or env.rules.switch_cost is None):
+        if option is not None and (number == 0 or env.options.switch_cost is None):
             chosen = torch.full_like(chosen, option)
         td[keys.OPTION] = chosen
         td[keys.DISCRETE] = td["oracle", "discrete"][row, chosen]
@@ -155,7 +155,7 @@ def test_boats_that_are_put_elsewhere_have_the_plans_of_that_place(presses):
         td = other.step(td)["next"]
     env.state = other.state
     planned = env.read()["oracle"]
-    first = planner.plans_of_options(env.rules, env.state)
+    first = planner.plans_of_options(env.options, env.state)
     assert torch.equal(planned["discrete"], first.keys[..., 0])
     assert torch.equal(planned["parameters"], first.durations[..., 0])
     if presses == 0:

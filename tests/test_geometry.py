@@ -24,7 +24,7 @@ NUM = 300
 
 def boat_columns(env: BoatDockEnv, seen: torch.Tensor) -> dict[str, torch.Tensor]:
     """Return the boats' columns from observations; the columns that are not observed stay as they are."""
-    is_pixels = env.rules.observation == "pixels"
+    is_pixels = env.options.observation == "pixels"
     lengths = seen[:, [0, 1, 2, 3, 8, 9]]
     lengths = lengths - torch.tensor([640.0, 512.0] * 3) if is_pixels else lengths * 120.0
     names = ("start_x", "start_y", "goal_x", "goal_y", "x", "y")

@@ -61,8 +61,8 @@ class OwnProblem(gymnasium.Env):
         raise NotImplementedError
 
     def observe(self) -> Any:
-        """Return the observation of the state."""
-        raise NotImplementedError
+        """Return the observation of the state: its two numbers and the time."""
+        return np.array([*self.state, self.time], np.float32)
 
     def read(self, action: Any) -> tuple[int, float]:
         """Return the choice and its amount, given an action of the space: a fraction of its limit."""
@@ -183,10 +183,6 @@ class Inventory(OwnProblem):
             reward = reward + 4.0 * stock
         return (stock, np.clip(20.0 + 0.9 * (level - 20.0) + drift, 8.0, 32.0)), reward, False
 
-    def observe(self) -> np.ndarray:
-        """Return stock, level of the demand and day."""
-        return np.array([*self.state, self.time], np.float32)
-
 
 class Heating(OwnProblem):
     """A house for a day of quarter hours: off, the heat pump or the electric heater, with a power.
@@ -273,10 +269,6 @@ class Queue(OwnProblem):
         mean = 7.0 + 3.0 * math.sin(2 * math.pi * time / 50)
         return (queue, np.clip(rate + 0.2 * (mean - rate) + drift, 2.0, 14.0)), reward, False
 
-    def observe(self) -> np.ndarray:
-        """Return the queue, the rate of arrivals and the quarter hour."""
-        return np.array([*self.state, self.time], np.float32)
-
 
 class Irrigation(OwnProblem):
     """A field for a season of 120 days: nothing, drip or sprinkler, with mm of water. The harvest is paid at the end.
@@ -311,10 +303,6 @@ class Irrigation(OwnProblem):
         if time == cls.steps - 1:
             reward = reward + 250.0 * crop
         return (moisture, crop), reward, False
-
-    def observe(self) -> np.ndarray:
-        """Return moisture, crop and day."""
-        return np.array([*self.state, self.time], np.float32)
 
 
 class Vehicle(OwnProblem):
@@ -392,10 +380,6 @@ class Pricing(OwnProblem):
         if time == cls.steps - 1:
             reward = reward + 2.0 * stock
         return (stock, np.clip(0.95 * attention + 0.01 * spent + drift, 0.0, 4.0)), reward, stock <= 0.0
-
-    def observe(self) -> np.ndarray:
-        """Return stock, attention and day."""
-        return np.array([*self.state, self.time], np.float32)
 
 
 TUNED: dict[str, type[OwnProblem]] = {

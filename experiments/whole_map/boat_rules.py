@@ -49,15 +49,15 @@ class TensorBoats(BoatDockEnv):
 
     def start(self, episode: Tensor, rng: RngKey) -> BoatState:
         """Return the states of environments with new layouts."""
-        return start(episode, rng, self.rules)
+        return start(episode, rng, self.options)
 
     def act(self, state: BoatState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[BoatState, Tensor]:
         """Return the states after one press, and the rewards `[N]`."""
-        return act(state, action.option, action.discrete, action.parameters.squeeze(-1), rng, self.rules)
+        return act(state, action.option, action.discrete, action.parameters.squeeze(-1), rng, self.options)
 
     def observe(self, state: BoatState) -> Tensor:
         """Return the observations, `[N, 16]`, or `[N, 14]` in pixels."""
-        return observe(state, self._noise_rng(state) if self.rules.sensor_noise > 0.0 else None, self.rules)
+        return observe(state, self._noise_rng(state) if self.options.sensor_noise > 0.0 else None, self.options)
 
     def extras(self, state: BoatState) -> Sequence[Tensor]:
         """Return the fraction of fuel that is left."""

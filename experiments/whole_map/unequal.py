@@ -49,12 +49,12 @@ class WeakBoatEnv(boat_rules.TensorBoats):
         """Return the states after one press, and the rewards `[N]`."""
         option, key = action.option.int(), action.discrete.int()
         held = torch.where(state.controller == NOT_CHOSEN, option, state.controller)
-        dir_x, dir_y = boat_rules.direction_of(self.rules, held, state.keymap, key)
+        dir_x, dir_y = boat_rules.direction_of(self.options, held, state.keymap, key)
         strength = torch.where(held == CONGRUENT, 1.0 / 3.0, 1.0)
         position = (state.x, state.y, state.fuel, state.goal_x, state.goal_y)
         pressed = physics.press(*position, dir_x, dir_y, action.parameters.squeeze(-1), strength=strength)
         after = boat_rules.after_press(state, pressed, dir_x, dir_y, held)
-        return after, boat_rules.reward_of(state, after, self.rules)
+        return after, boat_rules.reward_of(state, after, self.options)
 
 
 class _SlippersOptions(RoomsOptions):

@@ -319,7 +319,7 @@ def _finite_number(where: str, value: Any) -> float:
 
 
 def states_of(callbacks: Mapping[str, Callback]) -> dict[str, dict[str, Any]]:
-    """Return the states of all callbacks, given by name.
+    """Return copies of the states of all callbacks, given by name.
 
     Raises:
         CallbackError: a checkpoint cannot hold a state.
@@ -327,9 +327,10 @@ def states_of(callbacks: Mapping[str, Callback]) -> dict[str, dict[str, Any]]:
     states = {}
     for name, callback in callbacks.items():
         with mistakes_explained(name):
-            states[name] = callback.state()
+            state = callback.state()
         try:
-            as_bytes({"state": states[name]})
+            as_bytes({"state": state})
+            states[name] = copy.deepcopy(state)  # the callback may go on to change it
         except (TypeError, RuntimeError, KeyError) as error:
             raise CallbackError(f"{name}.state: no checkpoint can hold it ({first_line(error)})") from error
     return states

@@ -76,7 +76,7 @@ class PlayedDemonstrations(Demonstrations):
 def _boats(env: object) -> BoatDockEnv:
     if not isinstance(env, BoatDockEnv):
         raise SettingError("people docked boats; use env=boatdock or data=none")
-    if not env.rules.are_peoples:
+    if not env.options.are_peoples:
         raise SettingError(
             "people kept one of their two controllers; use data=none, or leave out env.boats and env.switch_cost"
         )
@@ -84,14 +84,14 @@ def _boats(env: object) -> BoatDockEnv:
 
 
 def _controller_of(env: BoatDockEnv) -> str | None:
-    return env.rules.controller if env.rules.controller in harbour.CONTROLLERS else None
+    return env.options.controller if env.options.controller in harbour.CONTROLLERS else None
 
 
 def _as_returned(
     data: HumanData, env: BoatDockEnv, options: PeoplesOptions, *, complete: bool = False
 ) -> tuple[TensorDict, TensorDict | None]:
     """Return the transitions and, if the agent chooses, the decisions, as the environment would return them."""
-    rules = env.rules
+    rules = env.options
     data = select(
         data,
         complete=complete,

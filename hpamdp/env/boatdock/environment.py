@@ -113,23 +113,22 @@ class BoatDockEnv(KernelEnv[BoatState]):
                 f"{options.unlike_peoples()}: people kept one of their two controllers, so what they chose says "
                 "nothing here; leave it out"
             )
-        self.rules = options
-        self.observation_names = task.observation_names(self.rules.observation)
+        self.observation_names = task.observation_names(self.options.observation)
         self._played = None if options.recording is None else _figures_of(options.recording, options.controller)
         if self._has_oracle:
-            self.planning_oracle = BoatDockOracle(self.num_envs, self.rules, self.device)
+            self.planning_oracle = BoatDockOracle(self.num_envs, self.options, self.device)
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the rules in numbers."""
-        return kernel.settings_of(self.rules)
+        return kernel.settings_of(self.options)
 
     def start_columns(self, given: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """Check a layout and return the columns of the state that it sets."""
-        return layout_columns(given, self.num_envs, self.rules)
+        return layout_columns(given, self.num_envs, self.options)
 
     def gymnasium_form(self) -> BoatForm:
         """Return the form of `hpamdp/BoatDock-v0`."""
-        return BoatForm(self, self.rules)
+        return BoatForm(self, self.options)
 
     @property
     def symmetries(self) -> Symmetries:
@@ -169,7 +168,7 @@ class BoatDockEnv(KernelEnv[BoatState]):
         """
         same = tuple(range(num_controllers))
         orders = list(itertools.permutations(same)) if num_controllers <= _MOST_SWAPPED else [same]
-        noise = self.rules.noises
+        noise = self.options.noises
         return [order for order in orders if num_controllers == 1 or [noise[number] for number in order] == list(noise)]
 
     @property
@@ -180,7 +179,7 @@ class BoatDockEnv(KernelEnv[BoatState]):
         the distance. The harbour is always the same. The goal follows from its offset.
         """
         names = ["start_x", "start_y", "centre_x", "centre_y", "radius", "velocity_x", "velocity_y"]
-        if self.rules.observation == "scaled" and self.rules.sensor_noise == 0.0:
+        if self.options.observation == "scaled" and self.options.sensor_noise == 0.0:
             names += ["goal_x", "goal_y"]
         tables = self._directions()
         if len(tables) == 1:
@@ -200,22 +199,22 @@ class BoatDockEnv(KernelEnv[BoatState]):
 
     def _directions(self) -> list[list[Tensor]]:
         """Return the possible tables of the keys' directions for each controller, float64 `[3, 2]`."""
-        boats = self.rules.own_boats
+        boats = self.options.own_boats
         if boats is not None:
             of_each = [[table] for table in torch.tensor(boats.directions, dtype=torch.float64)]
-            is_fixed = self.rules.controller in boats.names
-            return [of_each[boats.names.index(self.rules.controller)]] if is_fixed else of_each
-        maps = (1, 2) if self.rules.keymap == "random" else (self.rules.keymap,)
+            is_fixed = self.options.controller in boats.names
+            return [of_each[boats.names.index(self.options.controller)]] if is_fixed else of_each
+        maps = (1, 2) if self.options.keymap == "random" else (self.options.keymap,)
         table = torch.tensor(harbour.DIRECTIONS, dtype=torch.float64)
         both = [[table[number - 1] for number in maps], [table[2]]]
-        if self.rules.controller in harbour.CONTROLLERS:
-            return [both[harbour.CONTROLLERS.index(self.rules.controller)]]
+        if self.options.controller in harbour.CONTROLLERS:
+            return [both[harbour.CONTROLLERS.index(self.options.controller)]]
         return both
 
     def _vectors(self) -> tuple[tuple[tuple[int, int], ...], tuple[tuple[float, float], ...]]:
         """Return which entries of the observation are vectors, and from where on they are measured."""
         places: tuple[tuple[int, int], ...] = ((0, 1), (2, 3), (8, 9))
-        if self.rules.observation == "pixels":
+        if self.options.observation == "pixels":
             return (*places, (10, 11)), (*[harbour.CENTRE] * len(places), (0.0, 0.0))
         return (*places, (10, 11), (14, 15)), ()
 
@@ -245,25 +244,25 @@ class BoatDockEnv(KernelEnv[BoatState]):
             "start": torch.stack(layout[:2], -1),
             "goal": torch.stack(layout[2:], -1),
             "bearing_offset": harbour.bearing_offset(layout),
-            "optimum": planner.best_scores(self.rules, layout, state.keymap),
+            "optimum": planner.best_scores(self.options, layout, state.keymap),
         }
         return known if self.has_choice else {**known, "controller": state.controller}
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the means of `measure_boats`."""
-        return measure_boats(played, self._controller_of_run, self.rules)
+        return measure_boats(played, self._controller_of_run, self.options)
 
     @property
     def _controller_of_run(self) -> str:
         """`chosen` if the agent chooses, otherwise the setting `controller`."""
-        return "chosen" if self.has_choice else self.rules.controller
+        return "chosen" if self.has_choice else self.options.controller
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return the figures of the ceiling and, with the two standard controllers, of people or of a recording."""
         ceiling = {**super().references(measured)["ceiling"], "success": measured.get("ceiling_success", 1.0)}
         if self.has_choice:
             ceiling["oracle_agreement"] = 1.0
-        if self.rules.boats is not None:
+        if self.options.boats is not None:
             return {"ceiling": ceiling}
         ceiling["human_normalised"] = human_normalised(ceiling["score"], self._controller_of_run)
         if self._played is not None:
@@ -273,7 +272,7 @@ class BoatDockEnv(KernelEnv[BoatState]):
     def summary_entries(self) -> dict[str, Any]:
         """Return the `controller`, `chosen` if the agent chooses, and the setting `boats`, if given."""
         values = {"controller": self._controller_of_run}
-        return values if self.rules.boats is None else {**values, "boats": list(self.rules.names)}
+        return values if self.options.boats is None else {**values, "boats": list(self.options.names)}
 
     @classmethod
     def curves(cls, summary: Mapping[str, Any]) -> tuple[Metric, ...]:
@@ -294,7 +293,7 @@ class BoatDockEnv(KernelEnv[BoatState]):
         """Return the pictures of one episode, in which the boat moves as it does in the task."""
         from hpamdp.env.boatdock import film  # only films need it
 
-        return film.film(track, fps, size, self.rules.own_boats, self.rules.switch_cost)
+        return film.film(track, fps, size, self.options.own_boats, self.options.switch_cost)
 
     def page(self, seed: int) -> BoatPage:
         """Return the page on which people dock boats.
@@ -304,7 +303,7 @@ class BoatDockEnv(KernelEnv[BoatState]):
         """
         from hpamdp.env.boatdock.play.boat_page import BoatPage
 
-        return BoatPage(seed, self.rules)
+        return BoatPage(seed, self.options)
 
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Refuse controllers, key maps, counters and outcomes that do not exist.
@@ -313,7 +312,7 @@ class BoatDockEnv(KernelEnv[BoatState]):
             ValueError: a number is invalid.
         """
         super().check_env_state(columns)
-        check_range(columns, {"controller": (-1, len(self.rules.names)), "keymap": (0, 3)})
+        check_range(columns, {"controller": (-1, len(self.options.names)), "keymap": (0, 3)})
 
     def _knowledge_specs(self) -> dict[str, TensorSpec]:
         human = {"human": human_spec(self.num_envs, self.device)} if self._has_human else {}

@@ -142,6 +142,7 @@ def _choices(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -
 
 def _in_bins(values: np.ndarray, edges: np.ndarray, *weights: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the centres of the bins with episodes, how many they have, and the sums of the weights `[N]` in them."""
+    values = np.clip(values, edges[0], edges[-1])
     num = np.histogram(values, edges)[0]
     sums = [np.histogram(values, edges, weights=each.astype(float))[0] for each in weights]
     return tuple(column[num > 0] for column in ((edges[:-1] + edges[1:]) / 2.0, num, *sums))

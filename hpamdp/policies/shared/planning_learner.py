@@ -74,7 +74,11 @@ class PlanningLearner(ReplayLearner):
         return scalars
 
     def value(self, states: States, *, is_target: bool = False) -> Tensor:
-        """Return the learned values `[B]` of states; without `end_values` there are none."""
+        """Return the values `[B]` of states that `end_values` has learned.
+
+        Raises:
+            NotImplementedError: the settings ask for no such values.
+        """
         if self.end_values is None:
             return super().value(states)
         return self.end_values.of_own(self.target_perception.of_states(states))
