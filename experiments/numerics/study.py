@@ -33,6 +33,7 @@ NUMERICS: dict[str, tuple[list[str], dict[str, str]]] = {
     ),  # MKL, which multiplies matrices, does not read PyTorch's variable
     "compiled": (["compile_updates=true"], {}),
     "bfloat16": (["update_precision=bfloat16"], {}),
+    "another seed": (["seed=502"], {}),
 }
 # Few steps with as many updates as possible.
 LEARNERS = {
