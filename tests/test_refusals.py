@@ -406,7 +406,9 @@ def test_a_setting_without_effect_is_told_once_by_both_doors(command, capsys):
 @pytest.mark.parametrize(("group", "name"), [(group, name) for group in GROUPS for name in choices(group)])
 def test_settings_that_count_with_another_one_name_a_setting_and_its_values(group, name):
     target = yaml.safe_load((CONF / group / f"{name}.yaml").read_text()).get("_target_")
-    model = None if target is None else card_named(target).options
+    card = None if target is None else card_named(target)
+    assert (card is None) == (target is None), f"{target}: its module's options.py needs a card in CARDS"
+    model = None if card is None else card.options
     if model is None:
         return
     for field in model.model_fields.values():

@@ -82,7 +82,7 @@ class PuttingEnv(BatchedEnv[Ball]):
 
     def observe(self, state: Ball) -> Tensor:
         """Return the observations `[N, 2]`."""
-        return torch.stack([state.distance / FARTHEST, 1.0 - state.steps / self.max_steps], -1)
+        return torch.stack([state.distance / FARTHEST, 1.0 - state.steps.float() / self.max_steps], -1)
 
     # What an evaluation measures beside score and success.
 

@@ -33,8 +33,8 @@ class Outcome(IntEnum):
     In this order: going on, success, the failures, the time limit. Numbers, rewards, tables, figures, files and the
     page follow from it. When an outcome occurs is written where presses are: for columns in `physics.press`, for one
     row in `kernel.press`, and in `play/page/physics.js`. `planner` knows only docking at rest: if a rule forbids some
-    of its plans, it would give a wrong ceiling without an error. tests/test_rule_copies.py compares names and
-    constants, tests/test_planner.py plays the plans.
+    of its plans, it would give a wrong ceiling without an error. A new constant also goes into `boat_page.shared_data`.
+    tests/test_rule_copies.py compares names and constants, tests/test_planner.py plays the plans.
     """
 
     words: str
