@@ -69,7 +69,8 @@ def make(name: str) -> tuple[AssembledRun, Learner, int]:
     """Return the parts of a run with the congruent controller and defaults, the learner, and the steps of a batch."""
     # The codec's first updates only delay those that are timed.
     shortened = ["low.codec_pretrain_updates=10"] if name == "hyar" else []
-    with composed(["high=none", f"low={name}", "env.controller=congruent", "eval.layouts=10", *shortened]) as cfg:
+    fixed = ["high=none", "env.controller=congruent", "eval.layouts=10", "compile_updates=false"]
+    with composed([*fixed, f"low={name}", *shortened]) as cfg:
         config = read(cfg)
     torch.manual_seed(0)
     parts = assemble(config)
@@ -86,7 +87,8 @@ def updates_of(name: str) -> tuple[Callable[[], object], int, Learner]:
     batch = next(batches)
     mask = torch.ones(batch.shape, dtype=torch.bool)
     if name == "hppo":
-        return lambda: learner.learn(batch, mask), learner.epochs * (batch.numel() // learner.minibatch_size), learner
+        num_updates = learner.options.epochs * (batch.numel() // learner.options.minibatch_size)
+        return lambda: learner.learn(batch, mask), num_updates, learner
     stored = 0
     while stored < min(STORED, 20 * batch_size):
         learner.add_demonstrations(batch, mask)
