@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 GAMMA = 0.997
 GAE_LAMBDA = 0.98
-NUM_COPIES, STEPS = 8, 256  # as many steps in a batch as the defaults have
+NUM_COPIES, STEPS = 8, 256  # as many steps in a batch as the defaults had
 
 
 class EndsAtLimit(gymnasium.Wrapper):
