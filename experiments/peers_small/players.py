@@ -220,13 +220,13 @@ def xuance(player: str, seed: int, file: str, settings: dict[str, Any]) -> None:
 def rllib(player: str, seed: int, file: str, settings: dict[str, Any]) -> None:
     """Train RLlib's PPO with the defaults, on the `Tuple` of actions."""
     from ray.rllib.algorithms.ppo import PPOConfig
-    from ray.rllib.utils.spaces.space_utils import unsquash_action
+    from ray.rllib.utils.spaces.space_utils import get_base_struct_from_space, unsquash_action
     from ray.tune.registry import register_env
 
     register_env("keys", lambda _: make())
     config = PPOConfig().environment("keys").env_runners(num_env_runners=0).debugging(seed=seed)
     algorithm = config.build_algo()
-    module, space = algorithm.get_module(), make().action_space
+    module, space = algorithm.get_module(), get_base_struct_from_space(make().action_space)
 
     def act(seen: np.ndarray) -> list[Any]:
         with torch.no_grad():
