@@ -159,17 +159,17 @@ def torchrl(player: str, seed: int, file: str, settings: dict[str, Any]) -> None
 
 
 def sb3(player: str, seed: int, file: str, settings: dict[str, Any]) -> None:
-    """Train PPO or SAC of Stable-Baselines3 with the defaults, on the flattened action."""
-    import stable_baselines3
+    """Train PPO of Stable-Baselines3 with the defaults, on the flattened action."""
+    from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback
 
-    model = getattr(stable_baselines3, player.upper())("MlpPolicy", FlatKeys(), seed=seed, device="cpu", **settings)
+    model = PPO("MlpPolicy", FlatKeys(), seed=seed, device="cpu", **settings)
     clock = Clock(f"sb3 {player}", seed, file, lambda seen: model.predict(seen, deterministic=True)[0], FlatKeys)
 
     class Scorer(BaseCallback):
         def _on_step(self) -> bool:
             # PPO has updated the agent just before the first step of its next batch.
-            return (player == "ppo" and self.num_timesteps % 2048 != 1) or not clock.after(self.num_timesteps)
+            return self.num_timesteps % 2048 != 1 or not clock.after(self.num_timesteps)
 
     model.learn(10**9, callback=Scorer())
 
@@ -217,32 +217,8 @@ def xuance(player: str, seed: int, file: str, settings: dict[str, Any]) -> None:
     agent.train(10**9)
 
 
-def rllib(player: str, seed: int, file: str, settings: dict[str, Any]) -> None:
-    """Train RLlib's PPO with the defaults, on the `Tuple` of actions."""
-    from ray.rllib.algorithms.ppo import PPOConfig
-    from ray.rllib.utils.spaces.space_utils import get_base_struct_from_space, unsquash_action
-    from ray.tune.registry import register_env
-
-    register_env("keys", lambda _: make())
-    config = PPOConfig().environment("keys").env_runners(num_env_runners=0).debugging(seed=seed)
-    algorithm = config.build_algo()
-    module, space = algorithm.get_module(), get_base_struct_from_space(make().action_space)
-
-    def act(seen: np.ndarray) -> list[Any]:
-        with torch.no_grad():
-            inputs = module.forward_inference({"obs": torch.as_tensor(seen)})["action_dist_inputs"]
-        keys, durations = module.get_inference_action_dist_cls().from_logits(inputs).to_deterministic().sample()
-        pairs = zip(keys.numpy(), *(each.numpy() for each in durations), strict=True)
-        return [unsquash_action((key, tuple(each)), space) for key, *each in pairs]
-
-    clock = Clock("rllib ppo", seed, file, act)
-    while not clock.after(algorithm.iteration * config.train_batch_size_per_learner):
-        algorithm.train()
-
-
 PLAYERS: dict[str, Callable[..., None]] = {
-    "torchrl": torchrl, "hppo": hpamdp, "pdqn": hpamdp, "hsac": hpamdp, "ppo": sb3, "sac": sb3, "xuance": xuance,
-    "rllib": rllib,
+    "torchrl": torchrl, "hppo": hpamdp, "pdqn": hpamdp, "hsac": hpamdp, "ppo": sb3, "xuance": xuance,
 }  # fmt: skip
 
 if __name__ == "__main__":
