@@ -4,8 +4,8 @@ python experiments/memory/study.py 100 101 102    trains with these seeds, and a
 python experiments/memory/study.py                tabulates results.csv
 
 Cue is in `tests/toy_memory.py`: its first observation says which action is rewarded in its last step. The best return
-is 1, and the best one without a memory 0 on average. In the selectors' version, options last one step, and only the
-last one is rewarded.
+is 1, and the best one without a memory 0 on average. In the selectors' version, `CueOfOptions`, options last one step,
+and only the last one is rewarded.
 """
 
 from __future__ import annotations
@@ -16,14 +16,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import TensorSpec
+
 import hpamdp
 from experiments.study_tables import Rows, add_to_tables, groups, markdown_table, mean_of, read_csv, with_enough_seeds
+from hpamdp import keys
 from hpamdp.analysis.statistics import spread
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent.parent / "tests"))
-from toy_memory import Cue, CueOfOptions  # noqa: E402
+from toy_memory import Cue  # noqa: E402
 
 EPISODES = 500  # of the evaluation
 RUN = ("learns", "memory", "seed")
@@ -49,6 +55,20 @@ OF_SELECTORS = {
 }
 MEMORIES = ("none", "stack", "gru")
 REFUSED = ("option_critic", "gru")  # it learns from single steps
+
+
+class CueOfOptions(Cue):
+    """The cue says which of two options is rewarded."""
+
+    option_names = ("left", "right")
+
+    def begin(self, low: float, high: float, seed: int, **observed: TensorSpec) -> None:
+        """Make the specs, with an option among the action leaves, and set the seed."""
+        super().begin(low, high, seed, has_option=True, **observed)
+
+    def earned(self, tensordict: TensorDictBase) -> Tensor:
+        """Return what the options of a last step earn, `[N]`."""
+        return torch.where(tensordict[keys.OPTION] == (self.cue > 0.0).long(), 1.0, -1.0)
 
 
 def train(name: str, memory: str, seed: int) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 import command_line
 import torch
 
-from hpamdp.config.compose import compose_words
+from hpamdp.config.outside_jobs import composed
 from hpamdp.run import train
 from hpamdp.run.state_file import StateFile, write
 
@@ -48,8 +48,8 @@ def train_agents(folder: Path) -> dict[str, Path]:
     folders = {}
     for name, words in AGENTS.items():
         folders[name] = folder / name
-        cfg = compose_words([*SMALL, *words, "total_frames=256"])
-        assert train.run(cfg, folders[name], [*SMALL, *words]) == 0
+        with composed([*SMALL, *words, "total_frames=256"]) as cfg:
+            assert train.run(cfg, folders[name], [*SMALL, *words]) == 0
     return folders
 
 
@@ -214,7 +214,8 @@ class _Resume:
         words = [f"{self.way}={folder / 'checkpoint.safetensors'}", "eval.layouts=2", "total_frames=320"]
         if self.way == "checkpoint":
             words = ["mode=eval", *words[:2]]
-        code = train.run(compose_words(words), folder / "out", words)
+        with composed(words) as cfg:
+            code = train.run(cfg, folder / "out", words)
         if code:
             return f"{SILENT}: exit code {code}"
         summary = (folder / "out" / "summary.json").read_text()
