@@ -247,3 +247,33 @@ def test_nothing_reads_a_file_by_running_code_in_it():
         for file in sorted((ROOT / folder).rglob("*.py")):
             source = file.read_text()
             assert not MAY_READ.search(source) or not unsafe_reads(source), file
+
+
+def names_in(file: Path) -> set[str]:
+    """Return what a file defines, assigns or imports outside of functions and classes."""
+    names, waiting = set[str](), list[ast.AST](ast.parse(file.read_text()).body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+            continue
+        if isinstance(node, ast.Name):
+            names.add(node.id)
+        elif isinstance(node, ast.alias):
+            names.add((node.asname or node.name).split(".")[0])
+        waiting += ast.iter_child_nodes(node)
+    return names
+
+
+def test_studies_and_examples_import_only_what_is_there():
+    for file in [each for folder in ("experiments", "examples") for each in sorted((ROOT / folder).rglob("*.py"))]:
+        for node in ast.walk(ast.parse(file.read_text())):
+            if not isinstance(node, ast.ImportFrom) or node.module is None:
+                continue
+            path = node.module.replace(".", "/")
+            endings = (".py", "/__init__.pyi", "/__init__.py")
+            sources = [ROOT / f"{path}{ending}" for ending in endings] + [ROOT / f"tests/{path}.py"]
+            for source in [each for each in sources if each.is_file()][:1]:
+                missing = {alias.name for alias in node.names} - names_in(source)
+                missing -= {each.stem for each in (ROOT / path).glob("*")}
+                assert not missing, f"{file}: {node.module} lacks {missing}"
