@@ -50,7 +50,8 @@ class Clock:
             is_new = not self.file.exists()
             with self.file.open("a", newline="") as file:
                 writer = csv.DictWriter(file, list(row), lineterminator="\n")
-                _ = is_new and writer.writeheader()
+                if is_new:
+                    writer.writeheader()
                 writer.writerow(row)
             self.left_out += sum(os.times()[:4]) - began
         return is_over
