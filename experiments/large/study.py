@@ -17,7 +17,9 @@ import numpy as np
 import torch
 
 import hpamdp
-from experiments.study_tables import Rows, read_csv, write_tables
+from experiments.study_tables import Rows, markdown_table, read_csv, write_tables
+from hpamdp import keys
+from hpamdp.env.decisions import with_decisions
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -33,25 +35,20 @@ def played(problem: str) -> dict[str, float | str]:
     The first tenth holds more short episodes than long ones, since only ended episodes count.
     """
     torch.manual_seed(SEED)
-    env = hpamdp.make(problem, num_envs=NUM_ENVS, seed=SEED)
+    env = with_decisions(hpamdp.make(problem, num_envs=NUM_ENVS, seed=SEED))
     began = time.process_time()
     td = env.reset()
     starts, returns, lengths = [td["observation"].numpy().copy()], [], []
-    total, steps = torch.zeros(NUM_ENVS), torch.zeros(NUM_ENVS)
     num = num_steps = num_unusual = 0
     while num < NUM_EPISODES:
         step, following = env.step_and_maybe_reset(env.rand_action(td))
         end = step["next"]
         is_finite = end["observation"].isfinite().all(-1) & end["reward"].squeeze(-1).isfinite()
         num_unusual += int((~is_finite).sum())
-        total += end["reward"].squeeze(-1)
-        steps += 1
         done = end["done"].squeeze(-1)
-        returns.append(total[done].numpy())
-        lengths.append(steps[done].numpy())
+        returns.append(end[keys.EPISODE_RETURN][done].squeeze(-1).numpy())
+        lengths.append(end[keys.EPISODE_STEPS][done].squeeze(-1).numpy())
         starts.append(following["observation"][done].numpy())
-        total[done] = 0.0
-        steps[done] = 0
         num, num_steps = num + int(done.sum()), num_steps + NUM_ENVS
         td = following
     seconds = time.process_time() - began
@@ -75,18 +72,14 @@ def played(problem: str) -> dict[str, float | str]:
 
 def table(rows: Rows) -> str:
     """Return a line for each problem."""
-    lines = [
-        "| problem | steps | not finite | equal starts | return, second tenth | last tenth | standard error of the "
-        "difference | steps an episode, second tenth | last tenth | CPU |",
-        "|---" * 10 + "|",
-    ]
+    head = "problem | steps | not finite | equal starts | return, second tenth | last tenth | standard error of the "
+    head += "difference | steps an episode, second tenth | last tenth | CPU"
+    lines = []
     for row in rows:
-        lines.append(
-            f"| {row['problem']} | {row['steps']:,} | {row['not_finite']} | {row['equal_starts']:,} | "
-            f"{row['return_early']} | {row['return_late']} | {row['error']} | {row['length_early']} | "
-            f"{row['length_late']} | {row['cpu_s']:.0f} s |"
-        )
-    return "\n".join(lines)
+        means = (row[name] for name in ("return_early", "return_late", "error", "length_early", "length_late"))
+        counts = (f"{row['steps']:,}", row["not_finite"], f"{row['equal_starts']:,}")
+        lines.append([row["problem"], *counts, *means, f"{row['cpu_s']:.0f} s"])
+    return markdown_table(head, lines)
 
 
 def boats(num_envs: int) -> None:

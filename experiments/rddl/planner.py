@@ -23,7 +23,7 @@ from pyRDDLGym_jax.core.planner import (
 )
 from rddlrepository.core.manager import RDDLRepoManager
 
-EPISODE_SEEDS = range(7_000_000, 7_000_020)
+EPISODE_SEEDS = range(7_000_000, 7_000_020)  # those of players.py, which needs hpamdp
 CONFIGS = Path(pyRDDLGym_jax.__file__).parent / "examples" / "configs"
 
 
