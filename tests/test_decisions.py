@@ -12,6 +12,7 @@ from toy_options import Crossing, Listener, Toll, best_value, earned, make_meta_
 from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.policies.agent import HierarchicalAgent
@@ -191,9 +192,15 @@ def test_an_environment_of_choices_closes_the_one_that_it_wraps():
     assert inner.is_closed
 
 
+def scaled_pendulums(num_envs: int) -> GymnasiumEnv:
+    settings = {"staggered": True, "observation_scaling": "running", "reward_scaling": 0.9, "max_steps": 3}
+    return GymnasiumEnv(num_envs, id="Pendulum-v1", seed=2, **settings)
+
+
 @pytest.mark.parametrize("option_length", [None, 2])
-def test_a_step_with_a_restart_returns_what_torchrls_own_does(option_length):
-    fast, slow = (with_decisions(PlatformEnv(50, seed=2, max_steps=3), 0.9, option_length) for _ in range(2))
+@pytest.mark.parametrize("make", [lambda num: PlatformEnv(num, seed=2, max_steps=3), scaled_pendulums])
+def test_a_step_with_a_restart_returns_what_torchrls_own_does(make, option_length):
+    fast, slow = (with_decisions(make(50), 0.9, option_length) for _ in range(2))
     slow.base_env.step_and_restart = lambda td: None
     one, other = fast.reset(), slow.reset()
     for _ in range(7):

@@ -448,6 +448,15 @@ class GymnasiumEnv(PAMDPEnv):
             rewards = self._reward_scaling.scaled(rewards, is_stepped)
         return self._read(self._in_float32(rewards))
 
+    def step_and_restart(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase] | None:
+        """Step and reset without TorchRL's work between them, see `PAMDPEnv.step_and_restart`."""
+        if "_step" in tensordict.keys():
+            return None
+        after = self._step(tensordict)
+        done = after.get(keys.DONE)
+        root = self._reset(TensorDict({"_reset": done}, self.batch_size)) if done.any() else after.exclude(keys.REWARD)
+        return after, root
+
     def _in_float32(self, rewards: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):
             rounded = rewards.astype(np.float32)
