@@ -1,6 +1,7 @@
 """Linear contextual bandits: features, predictions, and that they learn which option is better where."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,10 +9,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_bandits import SPECS, against_sign, by_sign, constant, due, ended, play
 
 from hpamdp import keys
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.planner import plans_of_options
 from hpamdp.policies.high_level.lin_thompson import LinThompson
 from hpamdp.policies.high_level.linucb import LinUCB
 from hpamdp.policies.shared.bandit_options import LinearBanditOptions
-from hpamdp.policies.shared.linear_bandit import ContextFeatures, LinearBandit
+from hpamdp.policies.shared.linear_bandit import ContextFeatures, LinearBandit, ProjectionFeatures
 from hpamdp.specs import PAMDPSpecs
 
 MEMORIES = ("all", "discounted", "sliding_window")
@@ -73,6 +76,32 @@ def test_random_fourier_features_approximate_the_gaussian_kernel_and_are_the_sam
 def test_features_use_only_the_inputs():
     features = ContextFeatures(wide(4), LinearBanditOptions(inputs=[2, 0]))
     assert features(torch.tensor([5.0, 6.0, 7.0, 8.0])).tolist() == [7.0, 5.0, 1.0]
+
+
+def test_projections_tell_from_few_decisions_which_boat_is_better():
+    env = BoatDockEnv(3000, seed=5)
+    observation = env.reset()[keys.OBSERVATION]
+    scores = plans_of_options(env.options, env._state).score.double()
+    bandit = LinUCB(PAMDPSpecs.from_env(env))
+    torch.manual_seed(0)
+    option = torch.randint(2, (300,))
+    reward = scores[:300].gather(-1, option.unsqueeze(-1)).squeeze(-1) + 0.5 * torch.randn(300)
+    bandit.learn(ended(due(observation[:300], option=option), reward))
+    mean, _ = bandit.predict(observation)
+    # The entries of the observation that are best for polynomials would need several thousand decisions for it.
+    assert (mean.argmax(-1) == scores.argmax(-1))[300:].float().mean() > 0.9
+
+
+def test_projections_do_not_change_if_the_plane_is_turned_with_the_actions():
+    specs, turned = (PAMDPSpecs.from_env(BoatDockEnv(2)) for _ in range(2))
+    turn = torch.tensor([[0.6, -0.8], [0.8, 0.6]])
+    geometry = specs.geometry
+    turned = replace(turned, geometry=replace(geometry, directions=geometry.directions.flip(1) @ turn.T))
+    observation = torch.randn(9, specs.observation_dim)
+    moved = observation.clone()
+    for pair in geometry.vectors:
+        moved[:, pair] = observation[:, pair] @ turn.T
+    torch.testing.assert_close(ProjectionFeatures(turned)(moved), ProjectionFeatures(specs)(observation))
 
 
 # Predictions.

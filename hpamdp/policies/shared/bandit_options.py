@@ -39,10 +39,15 @@ class LinearBanditOptions(BanditOptions):
 
     It counts about the last 500 decisions. Earlier rewards are those of weaker learners.
     """
+    features: Literal["auto", "projections", "polynomial", "random_fourier"] = "auto"
+    """What rewards are linear in.
+
+    `projections`: those of the vectors that the problem declares on the directions of each option's actions.
+    `polynomial`: monomials of the inputs up to `degree`. `random_fourier`: `degree` cosines in random directions.
+    `auto`: projections if the problem declares directions for each option, else a polynomial.
+    """
     inputs: Indices | None = None
-    """Indices of the observation entries that the features use. If null, all."""
-    features: Literal["polynomial", "random_fourier"] = "polynomial"
-    """`polynomial`: monomials of the inputs up to `degree`. `random_fourier`: `degree` cosines in random directions."""
+    """Indices of the observation entries in the polynomial or the cosines. If null, all."""
     degree: PositiveInt = 1
     """Degree of the polynomial, or number of the cosines."""
     ridge: PositiveFloat = 1.0

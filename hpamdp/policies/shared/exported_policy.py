@@ -8,7 +8,10 @@ little-endian float32. Forms of a selector or learner, by their `kind`:
   `high`;
 - `ensemble`: `members`, each a list of layers with ReLU between them; the largest mean output is the option;
 - `polynomial`: monomials of the observation's entries `inputs`, with a constant 1 after them. Each of `factors` lists
-  the entries to multiply. The option is the one whose row of `coefficients` has the largest product with the monomials.
+  the entries to multiply. The option is the one whose row of `coefficients` has the largest product with the monomials;
+- `projections`: of `vectors`, pairs of the observation's entries from their `origins` on, on the `directions` of each
+  option's actions. Those on the actions of each list in `kinds` are sorted, the largest first; all of one vector come
+  before those of the next, and a constant 1 last. `coefficients` are as above, each row for its option's own numbers.
 """
 
 from __future__ import annotations

@@ -22,6 +22,54 @@ from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 
+def make_features(specs: PAMDPSpecs, options: LinearBanditOptions) -> ContextFeatures | ProjectionFeatures:
+    """Return the features that the settings name.
+
+    Raises:
+        ValueError: the problem declares no directions, or see `ContextFeatures`.
+    """
+    geometry = specs.geometry
+    has_directions = (
+        geometry is not None and geometry.directions is not None and geometry.num_contexts == specs.num_options
+    )
+    if options.features == "projections" and not has_directions:
+        raise SettingError("features=projections: the problem does not declare where each option's actions point")
+    if options.features == "projections" or (options.features == "auto" and has_directions):
+        return ProjectionFeatures(specs)
+    return ContextFeatures(specs, options)
+
+
+class ProjectionFeatures(nn.Module):
+    """Features `[*B, num_options, num_features]` that do not change if the plane is turned with an option's actions.
+
+    They are the projections of the declared vectors on the directions of an option's actions, and a constant 1, which
+    comes last. Of actions of one kind the largest projection comes first, since they differ only in their directions.
+    Vectors that are redundant are left out.
+    """
+
+    def __init__(self, specs: PAMDPSpecs) -> None:
+        super().__init__()
+        geometry = specs.geometry
+        assert geometry is not None and geometry.directions is not None
+        origins = geometry.origins or ((0.0, 0.0),) * len(geometry.vectors)
+        kept = [number for number, (x, _) in enumerate(geometry.vectors) if x not in geometry.redundant]
+        self.vectors = nn.Buffer(torch.tensor([geometry.vectors[number] for number in kept]))
+        self.origins = nn.Buffer(torch.tensor([origins[number] for number in kept], dtype=torch.float64))
+        self.directions = nn.Buffer(geometry.directions.double())
+        num_actions = self.directions.shape[1]
+        kinds = geometry.kinds or range(num_actions)
+        self.kinds = [[action for action in range(num_actions) if kinds[action] == kind] for kind in sorted({*kinds})]
+        self.num_features = len(kept) * num_actions + 1
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the features of observations `[*B, observation_dim]`, float64."""
+        vectors = observation[..., self.vectors].double() - self.origins
+        projections = torch.einsum("...vd,oad->...ova", vectors, self.directions)
+        parts = [projections[..., actions].sort(-1, descending=True).values for actions in self.kinds]
+        features = torch.cat(parts, -1).flatten(-2)
+        return torch.cat([features, torch.ones_like(features[..., :1])], -1)
+
+
 class ContextFeatures(nn.Module):
     """Features `[*B, num_features]` of some entries of the observation, with a constant 1 among them.
 
@@ -41,7 +89,7 @@ class ContextFeatures(nn.Module):
             raise SettingError(f"inputs={inputs}: the observation has entries 0 to {last}; null: all")
         if len(set(inputs)) < len(inputs):
             raise SettingError(f"inputs={inputs}: names an entry twice")
-        self.is_polynomial = options.features == "polynomial"
+        self.is_polynomial = options.features != "random_fourier"
         self.num_features = math.comb(len(inputs) + degree, degree) if self.is_polynomial else degree + 1
         if self.num_features > 2000:
             raise SettingError(f"degree={degree}: {self.num_features} features of {len(inputs)} inputs; at most 2000")
@@ -84,7 +132,7 @@ class LinearBandit(Selector):
     def __init__(self, specs: PAMDPSpecs, options: LinearBanditOptions | None = None, **settings: Any) -> None:
         super().__init__(specs)
         self.options = self.Options.of(options, settings)
-        self.features = ContextFeatures(specs, self.options)
+        self.features = make_features(specs, self.options)
         self.statistics = RewardStatistics(specs.num_options, self.options)
         num, dim = specs.num_options, self.features.num_features
         self.gram: Tensor = nn.Buffer(torch.zeros(num, dim, dim, dtype=torch.float64))
@@ -92,19 +140,29 @@ class LinearBandit(Selector):
         size = len(self.statistics.recent_options)
         self.recent_features: Tensor = nn.Buffer(torch.zeros(size, dim, dtype=torch.float64))
 
+    def option_features(self, observation: Tensor) -> Tensor:
+        """Return the features of each option at observations `[*B, observation_dim]`.
+
+        They are float64 `[*B, num_options, num_features]`.
+        """
+        features: Tensor = self.features(observation)
+        if isinstance(self.features, ProjectionFeatures):
+            return features
+        return features.unsqueeze(-2).expand(*features.shape[:-1], self.specs.num_options, -1)
+
     def predict(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return each option's expected reward at observations `[B, observation_dim]`, and its standard deviation.
 
         Both are `[B, num_options]`. The deviation is that of the estimate, not of a single reward.
         """
-        x = self.features(observation)
+        x = self.option_features(observation)
         theta, factor, size = self._regression()
         # x' A^-1 x is the squared length of L^-1 x.
-        spread = torch.linalg.solve_triangular(factor, (x / size.unsqueeze(1)).mT, upper=False)
+        spread = torch.linalg.solve_triangular(factor, (x / size).permute(1, 2, 0), upper=False)
         total = self.statistics.counts.sum().clamp(min=1.0)
         explained = (theta * self.moment).sum() / total
         noise = (self.statistics.squares.sum() / total - explained).clamp(min=1e-12).sqrt()
-        return x @ theta.T, noise * spread.square().sum(1).sqrt().T
+        return (x * theta).sum(-1), noise * spread.square().sum(1).sqrt().T
 
     def _regression(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return each option's coefficients, the Cholesky factor of its scaled Gram matrix, and the features' scales.
@@ -121,15 +179,15 @@ class LinearBandit(Selector):
         return theta, factor, size
 
     def exported(self) -> dict[str, Any] | None:
-        """Return the polynomials, see `hpamdp.policies.shared.exported_policy`; None for other features."""
-        if not self.features.is_polynomial:
+        """Return the regressions, see `hpamdp.policies.shared.exported_policy`; None with random features."""
+        features, coefficients = self.features, self._greedy_coefficients().tolist()
+        if isinstance(features, ProjectionFeatures):
+            tables = {name: getattr(features, name).tolist() for name in ("vectors", "origins", "directions")}
+            return {"kind": "projections", **tables, "kinds": features.kinds, "coefficients": coefficients}
+        if not features.is_polynomial:
             return None
-        return {
-            "kind": "polynomial",
-            "inputs": self.features.inputs.tolist(),
-            "factors": self.features.factors.tolist(),
-            "coefficients": self._greedy_coefficients().tolist(),
-        }
+        entries = {"inputs": features.inputs.tolist(), "factors": features.factors.tolist()}
+        return {"kind": "polynomial", **entries, "coefficients": coefficients}
 
     def _greedy_coefficients(self) -> Tensor:
         """Return the coefficients of the greedy choice, `[num_options, num_features]`.
@@ -169,7 +227,7 @@ class LinearBandit(Selector):
         coefficients = self._greedy_coefficients()
 
         def choice(td: TensorDictBase) -> Tensor:
-            mean = self.features(td.get(keys.OBSERVATION)) @ coefficients.T
+            mean = (self.option_features(td.get(keys.OBSERVATION)) * coefficients).sum(-1)
             return masked_values(mean, td.get(keys.OPTION_MASK, None)).argmax(-1)
 
         return choice
@@ -182,13 +240,13 @@ class LinearBandit(Selector):
         """Add finished decisions, oldest first; return the mean reward of each option among them."""
         options = decisions.get(keys.OPTION)
         rewards = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1).double()
-        features = self.features(decisions.get(("next", keys.DECISION_OBSERVATION)))
+        features = self.option_features(decisions.get(("next", keys.DECISION_OBSERVATION)))
         scalars = {}
         for i, name in enumerate(self.specs.option_names):
             own = options == i
             if own.any():
                 scalars[f"reward_{name}"] = rewards[own].mean().item()
-        self._add(options, rewards, features)
+        self._add(options, rewards, features[torch.arange(len(options), device=options.device), options])
         return scalars
 
     def _add(self, options: Tensor, rewards: Tensor, features: Tensor) -> None:

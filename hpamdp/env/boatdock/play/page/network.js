@@ -39,12 +39,23 @@ function makeAgents(data, physics) {
     };
   }
 
+  const product = (row, features) => row.reduce((sum, c, i) => sum + c * features[i], 0);
+
   function makeSelector(form) {
+    if (form.kind === "projections") {
+      const features = (observation, directions) => form.vectors.flatMap(([i, j], number) => {
+        const [x, y] = [observation[i] - form.origins[number][0], observation[j] - form.origins[number][1]];
+        const along = (action) => x * directions[action][0] + y * directions[action][1];
+        return form.kinds.flatMap((actions) => actions.map(along).sort((one, other) => other - one));
+      });
+      return (observation) => argmax(form.coefficients.map((row, option) =>
+        product(row, [...features(observation, form.directions[option]), 1])));
+    }
     if (form.kind === "polynomial") {
       return (observation) => {
         const entries = [...form.inputs.map((i) => observation[i]), 1];
         const features = form.factors.map((factors) => factors.reduce((product, i) => product * entries[i], 1));
-        return argmax(form.coefficients.map((row) => row.reduce((sum, c, i) => sum + c * features[i], 0)));
+        return argmax(form.coefficients.map((row) => product(row, features)));
       };
     }
     const members = form.members.map((layers) => layers.map(decodeLayer));
