@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal, TypeAlias
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Transform, TransformedEnv
@@ -295,6 +296,21 @@ def _zero_where(mask: Tensor, values: Tensor) -> Tensor:
     return torch.where(mask, torch.zeros_like(values), values)
 
 
+def _zeroed(leaves: Mapping[str, Any], mask: Tensor) -> dict[str, Any]:
+    """Return leaves, tensors or tensordicts of them, with zeros where the mask `[N, 1]` is true."""
+    return {
+        name: _unchecked(_zeroed(dict(leaf.items()), mask), leaf)
+        if isinstance(leaf, TensorDictBase)
+        else leaf.masked_fill(_like(mask, leaf), 0)
+        for name, leaf in leaves.items()
+    }
+
+
+def _unchecked(leaves: dict[str, Any], like: TensorDictBase) -> TensorDict:
+    """Return leaves as a tensordict like another one, without checks, which take longer than a small problem's step."""
+    return TensorDict._new_unsafe(leaves, batch_size=like.batch_size, device=like.device)
+
+
 class DecisionEnv(TransformedEnv):
     """An environment whose decisions are tracked; its `reset` takes the same keys as the environment's own."""
 
@@ -318,11 +334,11 @@ class DecisionEnv(TransformedEnv):
             return super()._step_and_maybe_reset(tensordict)
         after, root = both
         after = tracker._step(tensordict, after)
-        root.update(tracker.restarted(root, after))
+        leaves = {**dict(root.items()), **tracker.restarted(root, after)}
         # As in TorchRL, the root keeps what the policy wrote, with zeros where an episode begins.
-        begins = after.get(keys.DONE)
-        kept = tensordict.exclude(*root.keys()).apply(lambda leaf: leaf.masked_fill(_like(begins, leaf), 0))
-        return tensordict.set("next", after), root.update(kept)
+        kept = {name: leaf for name, leaf in tensordict.items() if name not in leaves}
+        leaves |= _zeroed(kept, after.get(keys.DONE))
+        return tensordict.set("next", after), _unchecked(leaves, root)
 
     @property
     def _problem(self) -> PAMDPEnv:
