@@ -48,6 +48,7 @@ _COMMANDS = {
     "play": "hpamdp.commands.play",
     "report": "hpamdp.analysis.seed_report",
     "judge": "hpamdp.commands.judge",
+    "datasets": "hpamdp.commands.datasets",
     "tune": "hpamdp.api.tuning",
 }
 

@@ -2,25 +2,33 @@
 
 TorchRL's `MinariExperienceReplay` reads Minari data sets too, but keeps Minari's names of the actions and infos, and
 has no `is_decision`, which selectors learn from.
+
+Actions are a Dict with the names of a `MinariLayout`, or the field's nested tuple, `(discrete action, (parameters of
+action 0, ..., of action K-1))`, where the environment has that. Observations are vectors, also those of pictures, since
+Minari stores pictures as JPEG, which changes them.
 """
 
 from __future__ import annotations
 
+import hashlib
 import re
 import shutil
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium import spaces
 from tensordict import TensorDict
 
 from hpamdp import keys
 from hpamdp.data import DataError
+from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.export import check_room
+from hpamdp.data.options import CARDS, MinariOptions
 from hpamdp.data.row_checks import TRAJECTORY, check_transitions
 from hpamdp.files import read_regular
 from hpamdp.json_lines import MAX_LINE_BYTES, read_json
@@ -29,7 +37,9 @@ from hpamdp.messages import first_line
 if TYPE_CHECKING:
     import minari
 
+    from hpamdp.env.base import PAMDPEnv
 
+_LAYOUT = "hpamdp_layout"  # in the metadata
 _BYTES_AN_EPISODE = 40_000  # upper bound of the names and descriptions in HDF5
 _SPACES = ("observation_space", "action_space")  # in the metadata
 # What learners read of a state beside its observation. It is kept as an info if the transitions have it.
@@ -42,7 +52,7 @@ class MinariLayout:
 
     Attributes:
         discrete, parameters, option: the parts of the environment's Dict action; transitions without an option have
-            no such part.
+            no such part. A nested tuple has no names.
         infos: columns, at the root and under `next`, that are kept as infos. Masks, the bounds of parameters and
             `duration` are kept besides, if the transitions have them.
     """
@@ -70,6 +80,7 @@ def export(
     env_kwargs: Mapping[str, Any] | None = None,
     algorithm_name: str | None = None,
     description: str | None = None,
+    reference_scores: tuple[float, float] | None = None,
 ) -> minari.MinariDataset:
     """Write transitions as a Minari data set and return it.
 
@@ -78,10 +89,11 @@ def export(
             Options last a whole episode.
         dataset_id: such as `namespace/name-v0`; it must not exist yet.
         layout: names of the actions' parts and of the infos.
-        env_id: Gymnasium's id of the environment, whose action space is a Dict of the layout's parts.
+        env_id: Gymnasium's id of the environment, whose action space is a Dict of the layout's parts or a nested tuple.
         env_kwargs: arguments of the environment.
         algorithm_name: what acted.
         description: what a user should know of the data.
+        reference_scores: the scores that `minari.get_normalized_score` maps to 0 and to 1.
 
     Raises:
         DataError: Minari is missing or refuses the data, the data set exists, or there is no such environment. Or an
@@ -110,26 +122,46 @@ def export(
         # The library of HDF5 prints hundreds of tracebacks on a full disk.
         num_bytes = sum(values.nbytes for values in batch.values(True, True))
         check_room(get_dataset_path(), 2 * num_bytes + _BYTES_AN_EPISODE * len(lengths))
-        buffers = [EpisodeBuffer(id=i, **_episode(rows, layout)) for i, rows in enumerate(batch.split(lengths))]
+        lowest, highest = reference_scores or (None, None)
+        dims = _parameter_dims(env.action_space)
+        buffers = [EpisodeBuffer(id=i, **_episode(rows, layout, dims)) for i, rows in enumerate(batch.split(lengths))]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # asks for an author and a link
-            return library.create_dataset_from_buffers(
-                dataset_id, buffers, env=env, algorithm_name=algorithm_name, description=description
+            dataset = library.create_dataset_from_buffers(
+                dataset_id,
+                buffers,
+                env=env,
+                observation_space=spaces.flatten_space(env.observation_space),
+                algorithm_name=algorithm_name,
+                description=description,
+                ref_min_score=lowest,
+                ref_max_score=highest,
             )
+        dataset.storage.update_metadata({_LAYOUT: asdict(layout)})
+        return dataset
     except (ValueError, OSError, RuntimeError) as error:
         shutil.rmtree(get_dataset_path(dataset_id), ignore_errors=True)
         raise DataError(f"{dataset_id}: Minari refuses the data ({first_line(error)})") from error
 
 
-def _episode(rows: TensorDict, layout: MinariLayout) -> dict[str, Any]:
+def _parameter_dims(space: gymnasium.Space) -> list[int] | None:
+    """Return the number of parameters of each discrete action of a nested tuple; None if the action is a Dict."""
+    return [part.shape[0] for part in space[-1]] if isinstance(space, spaces.Tuple) else None
+
+
+def _episode(rows: TensorDict, layout: MinariLayout, dims: list[int] | None) -> dict[str, Any]:
     """Return one episode's arrays; observations and infos have one row more than the rest."""
 
     def with_last(name: str) -> np.ndarray:
         return torch.cat([rows[name], rows["next", name][-1:]]).numpy()
 
-    actions = {layout.discrete: rows[keys.DISCRETE].numpy(), layout.parameters: rows[keys.PARAMETERS].numpy()}
+    parts = {layout.discrete: rows[keys.DISCRETE].numpy(), layout.parameters: rows[keys.PARAMETERS].numpy()}
     if keys.OPTION in rows.keys():
-        actions[layout.option] = rows[keys.OPTION].numpy()
+        parts[layout.option] = rows[keys.OPTION].numpy()
+    actions: Any = parts
+    if dims is not None:
+        each = tuple(part.numpy() for part in rows[keys.PARAMETERS].split(dims, -1))
+        actions = (*([parts[layout.option]] if layout.option in parts else []), parts[layout.discrete], each)
     infos = {name: with_last(name) for name in (*layout.infos, *_OF_STATES) if name in rows.keys()}
     if keys.DURATION in rows["next"].keys():
         duration = rows["next", keys.DURATION]
@@ -144,18 +176,25 @@ def _episode(rows: TensorDict, layout: MinariLayout) -> dict[str, Any]:
     }
 
 
-def load(dataset_id: str, layout: MinariLayout) -> TensorDict:
+def load(dataset_id: str, layout: MinariLayout | None = None) -> TensorDict:
     """Return a Minari data set that `export` wrote as the transitions `[N]` that it was made of.
 
     Episodes are numbered from 0. The data set may be somebody else's, so nothing that it names is imported.
+
+    Args:
+        dataset_id: as for `export`.
+        layout: names of the actions' parts and of the infos. If None, those of `export`.
 
     Raises:
         DataError: Minari is missing, there is no such data set, it has another layout, or a value is wrong.
     """
     library = _import_minari()
     try:
-        _check_metadata(dataset_id)
+        metadata = _checked_metadata(dataset_id)
+        layout = layout or MinariLayout(**metadata.get(_LAYOUT, {}))
         episodes = list(library.load_dataset(dataset_id).iterate_episodes())
+        if not episodes:
+            raise DataError(f"has no episodes, as after an interrupted export; delete it: minari delete {dataset_id}")
         rows = torch.cat([_transitions(episode, number, layout) for number, episode in enumerate(episodes)])
         check_transitions(rows)
     except DataError as error:
@@ -165,23 +204,37 @@ def load(dataset_id: str, layout: MinariLayout) -> TensorDict:
     return rows
 
 
-def _check_metadata(dataset_id: str) -> None:
+def _checked_metadata(dataset_id: str) -> dict[str, Any]:
     """Refuse metadata without spaces: Minari would import and build the environment that they name instead."""
     from minari.storage import get_dataset_path
 
-    metadata = read_json(read_regular(get_dataset_path(dataset_id) / "data" / "metadata.json", MAX_LINE_BYTES))
+    folder = get_dataset_path(dataset_id)
+    if not folder.exists():
+        made = f"`hpamdp datasets` makes those of the package, `minari download {dataset_id}` fetches others"
+        raise DataError(f"is not in {get_dataset_path()}; {made}")
+    metadata = read_json(read_regular(folder / "data" / "metadata.json", MAX_LINE_BYTES))
     for name in _SPACES:
         if not isinstance(metadata.get(name), str):
             raise DataError(f"its metadata have no {name}")
     if metadata.get("data_format") != "hdf5":
         raise DataError(f"its format is {metadata.get('data_format')}, but must be hdf5")
+    return metadata
+
+
+def _parts(actions: object, layout: MinariLayout) -> dict[str, Any]:
+    """Return the parts of a Dict action or of a nested tuple by the names of the layout."""
+    if isinstance(actions, tuple):
+        *options, discrete, parameters = actions
+        actions = {layout.discrete: discrete, layout.parameters: np.concatenate(parameters, -1)}
+        actions |= {layout.option: options[0]} if options else {}
+    if not isinstance(actions, dict) or not {layout.discrete, layout.parameters} <= actions.keys():
+        raise DataError(f"its actions have no {layout.discrete} and {layout.parameters}")
+    return actions
 
 
 def _transitions(episode: minari.EpisodeData, number: int, layout: MinariLayout) -> TensorDict:
     """Return the transitions of one episode, the inverse of `_episode`."""
-    actions = episode.actions
-    if not isinstance(actions, dict):
-        raise TypeError("its actions have no named parts")
+    actions = _parts(episode.actions, layout)
     num = len(episode.rewards)
     rows = TensorDict(batch_size=[num])
     following = TensorDict(batch_size=[num])
@@ -207,3 +260,40 @@ def _transitions(episode: minari.EpisodeData, number: int, layout: MinariLayout)
     rows[TRAJECTORY] = torch.full((num,), number)
     rows["next"] = following
     return rows
+
+
+def is_there(dataset_id: str) -> bool:
+    """Return whether Minari's folder has a data set."""
+    _import_minari()
+    from minari.storage import get_dataset_path
+
+    return get_dataset_path(dataset_id).exists()
+
+
+def checksum(rows: TensorDict) -> str:
+    """Return a checksum of transitions `[N]`, whatever files they lie in: the first 16 digits of a SHA-256.
+
+    The numbers of the episodes do not count.
+    """
+    digest = hashlib.sha256()
+    for name in sorted(rows.exclude(TRAJECTORY).keys(True, True), key=str):
+        digest.update(f"{name}".encode() + rows[name].contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+class MinariDemonstrations(Demonstrations):
+    """The transitions of a Minari data set, see `load`.
+
+    Args:
+        env: the environment whose transitions they are.
+
+    Raises:
+        DataError: the data set is missing, is of another kind, or has a wrong value.
+    """
+
+    Options = MinariOptions
+    card = CARDS["MinariDemonstrations"]
+
+    def __init__(self, env: PAMDPEnv, options: MinariOptions | None = None, **settings: Any) -> None:
+        self.options: MinariOptions = MinariOptions.of(options, settings)
+        super().__init__(load(self.options.dataset), env.device)

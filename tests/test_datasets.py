@@ -1,0 +1,114 @@
+"""The data sets of the offline benchmark, and what a run makes of data sets of Minari."""
+
+import argparse
+import json
+
+import pytest
+import torch
+from conftest import compose_config
+
+from hpamdp import keys
+from hpamdp.commands import datasets
+from hpamdp.config.errors import ConfigError
+from hpamdp.data import minari
+from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.run.train import run
+
+library = pytest.importorskip("minari")
+h5py = pytest.importorskip("h5py")
+WORDS = ["mode=offline", "env=platform", "high=none", "low=iql", "offline.updates=20", "offline.eval_every=0"]
+WORDS += ["eval.layouts=4", "low.batch_size=16", "film=false", "data=minari"]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Return Minari's folder, for data sets of ten episodes."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    for settings in datasets.DOMAINS.values():
+        monkeypatch.setitem(settings, "episodes", 10)
+        monkeypatch.setitem(settings, "frames", 2048)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", ["platform/mixed", "goal/replay", "boatdock/medium"])
+def test_a_data_set_of_the_benchmark_is_the_same_again_and_comes_back_from_minari(name, folder):
+    domain, part = name.split("/")
+    rows = datasets.transitions(domain, part)
+    assert minari.checksum(rows) == minari.checksum(datasets.transitions(domain, part))
+    datasets.make(domain, part)
+    dataset = library.load_dataset(f"hpamdp/{name}-v0")
+    assert dataset.total_episodes == 10 and dataset.storage.metadata["ref_max_score"] > 0.8
+    assert dataset[0].observations.shape[1:] == dataset.observation_space.shape
+    env = dataset.recover_environment()
+    assert env.action_space == dataset.action_space
+    loaded = minari.load(f"hpamdp/{name}-v0").exclude("collector")
+    assert set(loaded.keys(True, True)) == set(rows.keys(True, True))
+    for key, value in rows.items(True, True):
+        assert loaded[key].dtype == value.dtype and loaded[key].equal(value), key
+
+
+def test_the_command_lists_the_data_sets_and_makes_a_named_one_once(folder, capsys, monkeypatch):
+    assert datasets.main([], argparse.ArgumentParser()) == 0
+    assert capsys.readouterr().out.splitlines() == datasets.names()
+    name = "hpamdp/platform/expert-v0"
+    assert datasets.main([name], argparse.ArgumentParser()) == 0
+    monkeypatch.setattr(datasets, "make", None)
+    assert datasets.main([name], argparse.ArgumentParser()) == 0
+    assert f"{name}: 10 episodes, 90 steps, mean return" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match=r"^hpamdp/x-v0: no data set of the package; hpamdp datasets lists them$"):
+        datasets.main(["hpamdp/x-v0"], argparse.ArgumentParser())
+
+
+def test_a_run_learns_from_a_data_set_of_minari(folder, tmp_path):
+    datasets.make("platform", "mixed")
+    words = [*WORDS, "data.dataset=hpamdp/platform/mixed-v0"]
+    assert run(compose_config(words), tmp_path / "run", words) == 0
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"] == 20
+
+
+def with_nan(group):
+    group["rewards"][0] = float("nan")
+
+
+def without_a_part(group):
+    actions = group["actions"]
+    actions.move("_index_0", "discrete")
+
+
+@pytest.mark.parametrize(
+    ("word", "spoil", "said"),
+    [
+        ("env=goal", None, r"observation is \[9\] a row, but the environment's is \[17\]"),
+        ("data.dataset=hpamdp/none-v0", None, "hpamdp/none-v0: is not in .*`hpamdp datasets` makes those"),
+        ("data.dataset=../x", None, "data=minari: ../x: "),
+        ("seed=1", with_nan, "the transitions, row 0: next.reward is nan, but must be finite"),
+        ("seed=1", without_a_part, "cannot be read as transitions"),
+    ],
+)
+def test_another_problem_and_a_wrong_or_missing_data_set_are_refused_in_one_line(word, spoil, said, folder, tmp_path):
+    datasets.make("platform", "expert")
+    if spoil is not None:
+        with h5py.File(folder / "hpamdp/platform/expert-v0/data/main_data.hdf5", "a") as file:
+            spoil(file["episode_0"])
+    words = [*WORDS, "data.dataset=hpamdp/platform/expert-v0", word]
+    with pytest.raises(ConfigError, match=said) as refused:
+        run(compose_config(words), tmp_path / "run", words)
+    assert "\n" not in str(refused.value)
+
+
+def test_pictures_are_stored_exactly(folder):
+    env = CatchPointEnv(2, observation="picture")
+    played = env.rollout(3, break_when_any_done=False)
+    rows = torch.cat([played[0], played[1]])
+    ends = torch.tensor([False, False, True] * 2).unsqueeze(1)
+    rows[keys.IS_DECISION], rows["next", keys.IS_DECISION] = ends.roll(1, 0), ends
+    rows["next", keys.DONE] = rows["next", keys.TRUNCATED] = ends
+    minari.export(
+        rows,
+        "hpamdp/pictures-v0",
+        minari.MinariLayout(),
+        env_id="hpamdp/CatchPoint-v0",
+        env_kwargs={"observation": "picture"},
+    )
+    stored = torch.from_numpy(library.load_dataset("hpamdp/pictures-v0")[1].observations)
+    assert stored.dtype == torch.uint8 and stored[:-1].equal(rows[keys.OBSERVATION][3:])
