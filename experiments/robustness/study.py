@@ -122,15 +122,16 @@ def add(runs: Sequence[tuple[Run, dict[str, Any]]]) -> None:
 
 
 def table(rows: Rows) -> str:
-    """Return a line for each agent and noise: mean and standard deviation of the score over seeds at each level."""
+    """Return a line for each agent: mean and standard deviation of the score over seeds at each level of each noise."""
+    levels = {
+        noise: sorted({row["level"] for row in of_noise} - {0.0}) for (noise,), of_noise in groups(rows, "noise").items()
+    }
     lines = []
-    cases = groups(rows, "agent", "boat", "trained_with", "noise").items()
-    for (agent, boat, trained_with, noise), of_case in cases:
-        scores = []
-        for (level,), of_level in groups(of_case, "level").items():
-            scores.append(f"{level:g}: {spread([row['score'] for row in of_level], digits=2)}")
-        lines.append([agent, boat, trained_with, noise, ", ".join(scores)])
-    return markdown_table("agent | controller | trained with | noise | level: score", lines)
+    for agent, of_agent in groups(rows, "agent", "boat", "trained_with").items():
+        at = [[spread(_scores(of_agent, noise, level), digits=2) for level in levels[noise]] for noise in levels]
+        lines.append([*agent, spread(_scores(of_agent, next(iter(levels)), 0.0), digits=2), *map(", ".join, at)])
+    heads = [f"{noise} {', '.join(f'{level:g}' for level in levels[noise])}" for noise in levels]
+    return markdown_table(f"agent | controller | trained with | no noise | {' | '.join(heads)}", lines)
 
 
 def gains_table(rows: Rows) -> str:
