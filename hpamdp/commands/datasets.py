@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -167,12 +167,12 @@ def _trained(name: str, frames: int, num_episodes: int) -> TensorDict:
     torch.manual_seed(config.run.seed)
     parts = assemble(config.with_run(mode="train", checkpoint=None))
     collection = config.collector.build(config=config, parts=parts, frames=0)
-    batches = []
+    batches: list[TensorDictBase] = []
     with closing(parts), closing(collection):
         while sum(batch.numel() for batch in batches) < frames:
             batches.append(collection.next().clone())
             parts.agent.learn(batches[-1])
-    played = torch.cat(batches, 1)
+    played = cast(TensorDictBase, torch.cat(batches, 1))
     is_last = played["next", keys.DONE].squeeze(-1)
     is_finished = is_last.flip(1).cumsum(1).flip(1) > 0
     rows = _rows(played, is_finished, parts.agent.specs)

@@ -144,9 +144,10 @@ def export(
         raise DataError(f"{dataset_id}: Minari refuses the data ({first_line(error)})") from error
 
 
-def _parameter_dims(space: gymnasium.Space) -> list[int] | None:
+def _parameter_dims(space: Any) -> list[int] | None:
     """Return the number of parameters of each discrete action of a nested tuple; None if the action is a Dict."""
-    return [part.shape[0] for part in space[-1]] if isinstance(space, spaces.Tuple) else None
+    is_tuple = isinstance(space, spaces.Tuple)
+    return [part.shape[0] for part in space[-1]] if is_tuple else None
 
 
 def _episode(rows: TensorDict, layout: MinariLayout, dims: list[int] | None) -> dict[str, Any]:
