@@ -123,9 +123,8 @@ def add(runs: Sequence[tuple[Run, dict[str, Any]]]) -> None:
 
 def table(rows: Rows) -> str:
     """Return a line for each agent: mean and standard deviation of the score over seeds at each level of each noise."""
-    levels = {
-        noise: sorted({row["level"] for row in of_noise} - {0.0}) for (noise,), of_noise in groups(rows, "noise").items()
-    }
+    by_noise = groups(rows, "noise")
+    levels = {noise: sorted({row["level"] for row in of_noise} - {0.0}) for (noise,), of_noise in by_noise.items()}
     lines = []
     for agent, of_agent in groups(rows, "agent", "boat", "trained_with").items():
         at = [[spread(_scores(of_agent, noise, level), digits=2) for level in levels[noise]] for noise in levels]
