@@ -1,0 +1,98 @@
+"""Order candidates of several kinds by `hpamdp judge`, and compare with their scores in the simulator.
+
+python experiments/offline/judge.py run FOLDER   trains, judges and scores, renews judge.csv; finished runs are kept
+python experiments/offline/judge.py              tabulates judge.csv
+
+Candidates that learn from people have the even-numbered ones. The others judge all candidates, three times without a
+third of them.
+`HPAMDP_HUMAN_DATA` points at the recording.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+import hpamdp
+from experiments.study_tables import Rows, groups, markdown_table, read_csv
+from hpamdp.messages import exit_code
+
+HERE = Path(__file__).resolve().parent
+SEED = 41
+FOLDS = [[person for person in range(1, 40, 2) if person % 6 != without] for without in (1, 3, 5)]
+LEARNING = "data.people=[" + ",".join(map(str, range(0, 40, 2))) + "]"
+OFFLINE = f"mode=offline data=human {LEARNING} offline.eval_every=0"
+ONE_PERSON = OFFLINE.replace(LEARNING, "data.people=[4]")
+CLEAN = "data.rest_to_rest=clean"
+# Words of each candidate's run; its kind is the part of its name before the hyphen.
+CANDIDATES = {
+    **{f"bc-{n}": f"{OFFLINE} high=linucb low=bc offline.updates={n}" for n in (200, 2000)},
+    "bc-clean": f"{OFFLINE} high=linucb low=bc offline.updates=2000 {CLEAN}",
+    **{f"iql-{g}": f"{OFFLINE} high=linucb low=iql offline.updates=1000 low.gamma={g}" for g in (0.8, 0.9, 0.97)},
+    "iql-clean": f"{OFFLINE} high=linucb low=iql offline.updates=1000 {CLEAN}",
+    **{f"td3_bc-{g}": f"{OFFLINE} high=linucb low=td3_bc offline.updates=1500 low.gamma={g}" for g in (0.9, 0.97)},
+    "td3_bc-clean": f"{OFFLINE} high=linucb low=td3_bc offline.updates=1500 {CLEAN}",
+    **{f"pets-{n}": f"{OFFLINE} high=value low=pets offline.updates={n} {CLEAN}" for n in (300, 1000, 3000, 8000)},
+    "pets-rest_to_rest": f"{OFFLINE} high=value low=pets offline.updates=3000",
+    "pets-caution": f"{OFFLINE} high=value low=pets offline.updates=3000 low.caution=1 {CLEAN}",
+    "pets-one_person": f"{ONE_PERSON} high=value low=pets offline.updates=3000 {CLEAN}",
+    **{f"hppo-{n}": f"high=ucb low=hppo total_frames={n} eval.every=0" for n in (60_000, 120_000, 240_000)},
+    "random-uniform": "high=uniform low=random total_frames=1000 eval.every=0",
+}
+
+
+def run(folder: Path) -> Rows:
+    """Train the candidates that are missing, judge them with each fold; return a row for each candidate and fold."""
+    for name, words in CANDIDATES.items():
+        if not (folder / name / "summary.json").exists():
+            settings = f"seed={SEED} eval.seed={SEED} film=false hydra.run.dir={folder / name}"
+            subprocess.run([sys.executable, "run.py", *words.split(), *settings.split()], check=True)
+    agents = {name: str(folder / name) for name in CANDIDATES} | {"hppo-linucb": "linucb_hppo"}
+    scores = {name: json.loads((folder / name / "summary.json").read_text())["score"] for name in CANDIDATES}
+    scores["hppo-linucb"] = hpamdp.load("linucb_hppo").evaluate(episodes=1000, seed=SEED)["score"]
+    rows: Rows = []
+    for number, people in enumerate(FOLDS):
+        settings = {"data.people": people, "data.rest_to_rest": "clean", "offline.updates": 8000, "seed": SEED}
+        for found in hpamdp.judge(*agents.values(), data="human", episodes=40, **settings):
+            name = next(name for name, path in agents.items() if path == found["agent"])
+            low, high = found["interval"]
+            judged = {"judged": found["return"], "low": low, "high": high, "coverage": found["coverage"]}
+            numbers = {column: round(value, 4) for column, value in {"score": scores[name], **judged}.items()}
+            rows.append({"candidate": name, "fold": number, **numbers})
+    return rows
+
+
+def table(rows: Rows) -> str:
+    """Return how well each fold orders the candidates, all of them and the best half."""
+    lines = []
+    for (fold,), judged in groups(rows, "fold").items():
+        line: list[str] = [str(fold)]
+        best = sorted(judged, key=lambda row: -row["score"])
+        for part in (best, best[: len(best) // 2]):
+            scores, returns = (np.array([row[name] for row in part]) for name in ("score", "judged"))
+            ranks = (np.argsort(np.argsort(values)) for values in (scores, returns))
+            chosen = part[int(returns.argmax())]
+            line += [f"{np.corrcoef(*ranks)[0, 1]:.2f}", f"{scores.max() - chosen['score']:.3f}", chosen["candidate"]]
+        lines.append(line[:5])
+    return markdown_table("fold | rank correlation | regret | chosen | rank correlation in the best half", lines)
+
+
+def main(words: Sequence[str]) -> None:
+    """Run if asked to, and tabulate."""
+    if words[:1] == ["run"]:
+        rows = run(Path(words[1]).resolve())
+        with (HERE / "judge.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+    print(table(read_csv(HERE / "judge.csv")))
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))
