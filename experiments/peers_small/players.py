@@ -160,17 +160,17 @@ def torchrl(player: str, seed: int, file: str, settings: dict[str, Any]) -> None
 
 
 def sb3(player: str, seed: int, file: str, settings: dict[str, Any]) -> None:
-    """Train PPO of Stable-Baselines3 with the defaults, on the flattened action."""
-    from stable_baselines3 import PPO
+    """Train PPO or SAC of Stable-Baselines3 with the defaults, on the flattened action."""
+    import stable_baselines3
     from stable_baselines3.common.callbacks import BaseCallback
 
-    model = PPO("MlpPolicy", FlatKeys(), seed=seed, device="cpu", **settings)
+    model = getattr(stable_baselines3, player.upper())("MlpPolicy", FlatKeys(), seed=seed, device="cpu", **settings)
     clock = Clock(f"sb3 {player}", seed, file, lambda seen: model.predict(seen, deterministic=True)[0], FlatKeys)
 
     class Scorer(BaseCallback):
         def _on_step(self) -> bool:
             # PPO has updated the agent just before the first step of its next batch.
-            return self.num_timesteps % 2048 != 1 or not clock.after(self.num_timesteps)
+            return (player == "ppo" and self.num_timesteps % 2048 != 1) or not clock.after(self.num_timesteps)
 
     model.learn(10**9, callback=Scorer())
 
@@ -218,8 +218,94 @@ def xuance(player: str, seed: int, file: str, settings: dict[str, Any]) -> None:
     agent.train(10**9)
 
 
+def ding(player: str, seed: int, file: str, settings: dict[str, Any]) -> None:
+    """Train DI-engine's H-PPO with its settings for gym-hybrid. It is scored with draws; `greedy=true`: without."""
+    from ding.config import compile_config
+    from ding.envs import BaseEnv, BaseEnvTimestep, create_env_manager
+    from ding.model import model_wrap
+    from ding.policy import create_policy
+    from ding.utils import set_pkg_seed
+    from ding.worker import BaseLearner, create_serial_collector
+    from dizoo.gym_hybrid.config.gym_hybrid_hppo_config import create_config, main_config
+    from gymnasium.spaces import Box, Discrete, Tuple
+    from tensorboardX import SummaryWriter
+
+    def press(chosen: dict[str, Any]) -> dict[str, Any]:
+        unit = (np.clip(np.asarray(chosen["action_args"]), -1.0, 1.0) + 1.0) / 2.0
+        return {"key": int(chosen["action_type"]), "durations": unit * np.array(HIGHS)}
+
+    class Env(BaseEnv):
+        observation_space, reward_space = Box(-np.inf, np.inf, (3,)), Box(-np.inf, np.inf, (1,))
+        action_space = Tuple((Discrete(3), Box(-1.0, 1.0, (3,))))
+        __repr__, close = object.__repr__, gymnasium.Env.close
+
+        def __init__(self, cfg: Any) -> None:
+            self.env = DictKeys()
+
+        def seed(self, seed: int, dynamic_seed: bool = True) -> None:
+            self.env.reset(seed=seed)
+
+        def reset(self) -> np.ndarray:
+            self.total = 0.0
+            return self.env.reset()[0]
+
+        def step(self, action: dict[str, Any]) -> Any:
+            observation, reward, terminated, truncated, _ = self.env.step(press(action))
+            self.total += reward
+            given = np.array([reward], np.float32), terminated or truncated, {"eval_episode_return": self.total}
+            return BaseEnvTimestep(observation, *given)
+
+    main_config.policy.model.update(obs_shape=3, action_shape={"action_type_shape": 3, "action_args_shape": 3})
+    create_config.env.import_names, create_config.env_manager.type = [], "base"
+    main_config.policy.cuda, create_config.policy.type = False, "ppo_command"
+    cfg = compile_config(main_config, seed=seed, env=Env, auto=True, create_cfg=create_config, save_cfg=True)
+    env = create_env_manager(cfg.env.manager, [lambda: Env(cfg.env)] * cfg.env.collector_env_num)
+    env.seed(seed)
+    set_pkg_seed(seed, use_cuda=False)
+    policy = create_policy(cfg.policy, enable_field=["learn", "collect", "eval", "command"])
+    given = {"tb_logger": SummaryWriter("log"), "exp_name": cfg.exp_name}
+    learner = BaseLearner(cfg.policy.learn.learner, policy.learn_mode, **given)
+    collector = create_serial_collector(cfg.policy.collect.collector, env=env, policy=policy.collect_mode, **given)
+    if settings.get("greedy"):
+        policy._eval_model = model_wrap(policy._model, wrapper_name="hybrid_deterministic_argmax_sample")
+
+    def act(seen: np.ndarray) -> list[Any]:
+        chosen = policy.eval_mode.forward(dict(enumerate(torch.as_tensor(seen))))
+        return [press(chosen[number]["action"]) for number in range(len(seen))]
+
+    clock = Clock(" ".join(["di-engine hppo", *settings]), seed, file, act, DictKeys)
+    while not clock.after(collector.envstep):
+        learner.train(collector.collect(train_iter=learner.train_iter), collector.envstep)
+
+
+def rllib(player: str, seed: int, file: str, settings: dict[str, Any]) -> None:
+    """Train RLlib's PPO with the defaults, on the `Tuple` of actions."""
+    import ray
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.rllib.utils.spaces.space_utils import unsquash_action
+    from ray.tune.registry import register_env
+
+    ray.init(num_cpus=1, include_dashboard=False)
+    register_env("keys", lambda _: make())
+    config = PPOConfig().environment("keys").env_runners(num_env_runners=0).debugging(seed=seed)
+    algorithm = config.training(**settings).build_algo()
+    module, space = algorithm.get_module(), (Keys().action_space[0], tuple(Keys().action_space[1]))
+
+    def act(seen: np.ndarray) -> list[Any]:
+        with torch.no_grad():
+            inputs = module.forward_inference({"obs": torch.as_tensor(seen)})["action_dist_inputs"]
+        keys, durations = module.get_inference_action_dist_cls().from_logits(inputs).to_deterministic().sample()
+        pairs = zip(keys.numpy(), *(each.numpy() for each in durations), strict=True)
+        return [unsquash_action((key, tuple(each)), space) for key, *each in pairs]
+
+    clock, steps = Clock("rllib ppo", seed, file, act), 0
+    while not clock.after(steps):
+        steps = int(algorithm.train()["num_env_steps_sampled_lifetime"])
+
+
 PLAYERS: dict[str, Callable[..., None]] = {
-    "torchrl": torchrl, "hppo": hpamdp, "pdqn": hpamdp, "hsac": hpamdp, "ppo": sb3, "xuance": xuance,
+    "torchrl": torchrl, "hppo": hpamdp, "pdqn": hpamdp, "hsac": hpamdp, "ppo": sb3, "sac": sb3, "xuance": xuance,
+    "ding": ding, "rllib": rllib,
 }  # fmt: skip
 
 if __name__ == "__main__":
