@@ -12,7 +12,7 @@ from tensor_rules import boat_rules
 
 from hpamdp import keys
 from hpamdp.env import counter_rng, kernels
-from hpamdp.env.boatdock import physics
+from hpamdp.env.boatdock import kernel, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.rng_streams import folded
 
@@ -184,4 +184,6 @@ def test_a_state_that_was_read_does_not_change_with_the_boats():
 
 def test_a_change_of_any_source_compiles_kernels_anew():
     cached = kernels.kernel(play)._cache._cache_file
-    assert cached._source_stamp == kernels.sources()
+    sources, own_file = cached._source_stamp  # the kernel `play` is outside the package
+    assert (sources,) == kernels.sources() and own_file
+    assert kernel.advance._cache._cache_file._source_stamp == kernels.sources()
