@@ -55,7 +55,7 @@ def test_polynomial_features_are_all_monomials_up_to_the_degree(num_inputs, degr
     powers = [p for p in itertools.product(range(degree + 1), repeat=num_inputs) if sum(p) <= degree]
     expected = torch.stack([(observation ** torch.tensor(p)).prod(-1) for p in powers], -1)
     features = ContextFeatures(wide(num_inputs), LinearBanditOptions(features="polynomial", degree=degree))
-    found = features(observation)
+    found = features(observation)[:, 0]
     assert features.num_features == len(powers) == found.shape[-1]
     torch.testing.assert_close(found[0].sort().values, expected[0].sort().values)
     torch.testing.assert_close(found.pow(2).sum(-1), expected.pow(2).sum(-1))
@@ -67,15 +67,15 @@ def test_random_fourier_features_approximate_the_gaussian_kernel_and_are_the_sam
     torch.manual_seed(1)
     second = ContextFeatures(wide(3), LinearBanditOptions(features="random_fourier", degree=200))
     x, y = torch.zeros(1, 3), torch.tensor([[0.6, 0.0, 0.0]])
-    assert torch.equal(first(x), second(x)) and first(x).shape == (1, 201) and first(x)[0, -1] == 1.0
+    assert torch.equal(first(x), second(x)) and first(x).shape == (1, 2, 201) and (first(x)[0, :, -1] == 1.0).all()
     # Twice the mean product of two cosines approximates the Gaussian kernel exp(-|x - y|^2 / 2).
-    kernel = (first(x)[0, :-1] * first(y)[0, :-1]).mean() * 2
+    kernel = (first(x)[0, 0, :-1] * first(y)[0, 0, :-1]).mean() * 2
     assert kernel.item() == pytest.approx(torch.tensor(-(0.6**2) / 2).exp().item(), abs=0.15)
 
 
 def test_features_use_only_the_inputs():
     features = ContextFeatures(wide(4), LinearBanditOptions(inputs=[2, 0]))
-    assert features(torch.tensor([5.0, 6.0, 7.0, 8.0])).tolist() == [7.0, 5.0, 1.0]
+    assert features(torch.tensor([5.0, 6.0, 7.0, 8.0])).tolist() == [[7.0, 5.0, 1.0]] * 2
 
 
 def test_projections_tell_from_few_decisions_which_boat_is_better():
@@ -117,7 +117,7 @@ def test_predictions_and_their_deviations_are_those_of_a_ridge_regression(memory
         weight = 0.9 ** torch.arange(59, -1, -1).double()
     if memory == "sliding_window":
         weight[:-25] = 0.0
-    x, y = bandit.features(observation), reward.double()
+    x, y = bandit.features(observation)[:, 0], reward.double()
     probe = torch.rand(9, 2) * 2 - 1
     mean, deviation = bandit.predict(probe)
     squares = 0.0
@@ -126,9 +126,10 @@ def test_predictions_and_their_deviations_are_those_of_a_ridge_regression(memory
         w = weight * (option == i)
         a = x.T @ (w.unsqueeze(-1) * x) + 0.5 * torch.eye(6).double()
         theta = torch.linalg.solve(a, x.T @ (w * y))
-        torch.testing.assert_close(mean[:, i], bandit.features(probe) @ theta)
+        of_probe = bandit.features(probe)[:, i]
+        torch.testing.assert_close(mean[:, i], of_probe @ theta)
         squares += (w * (y - x @ theta).square()).sum() + 0.5 * theta.square().sum()
-        spread.append((bandit.features(probe) @ torch.linalg.inv(a) * bandit.features(probe)).sum(-1).sqrt())
+        spread.append((of_probe @ torch.linalg.inv(a) * of_probe).sum(-1).sqrt())
     noise = (squares / weight.sum()).sqrt()
     torch.testing.assert_close(deviation, noise * torch.stack(spread, -1))
 
@@ -195,7 +196,7 @@ def test_a_greedy_choice_takes_no_untried_option_however_low_the_known_rewards_a
         assert not bandit.select(due(probe, option_mask=only_untried)).any()
     exported = bandit.exported()
     if exported is not None:  # what a page computes of it
-        numbers = bandit.features(probe) @ torch.tensor(exported["coefficients"], dtype=torch.float64).T
+        numbers = (bandit.features(probe) * torch.tensor(exported["coefficients"], dtype=torch.float64)).sum(-1)
         assert numbers.argmax(-1).all()
 
 

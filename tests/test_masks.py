@@ -180,8 +180,6 @@ def test_an_option_that_is_a_set_of_actions_takes_no_other_action(name, is_share
 SELECTORS = {
     **{high: [] for high in choices("high") if high not in ("auto", "none", "human", "oracle")},
     "fixed": ["high.option=first"],
-    "linucb": ["high.inputs=null"],
-    "lin_thompson": ["high.inputs=null"],
     "meta_critic": ["high.warmup_decisions=32", "high.batch_size=16", "high.epsilon_decisions=50"],
     "option_critic": ["high.warmup_steps=64", "high.batch_size=16", "high.epsilon_steps=100"],
     "actor": ["high.minibatch_size=32"],

@@ -191,7 +191,8 @@ def test_ten_thousand_random_presses_end_where_python_ends_them(tmp_path, page_d
 @needs_node
 def test_agents_act_in_the_page_as_they_do_in_torch(tmp_path, page_data):
     words = ["high=meta_critic", "low=hppo", "eval.layouts=20", "eval.seed=9", "film=false"]
-    for settings in (words, [*words, "agent.sharing=shared"], ["high=linucb", *words[1:]]):
+    linucb = ["high=linucb", *words[1:]]
+    for settings in (words, [*words, "agent.sharing=shared"], linucb, [*linucb, "high.features=polynomial"]):
         player = load_agent(None, settings)
         if "high=linucb" in settings:
             selector = player.agent.selector

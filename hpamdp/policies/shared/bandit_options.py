@@ -44,7 +44,8 @@ class LinearBanditOptions(BanditOptions):
 
     `projections`: those of the vectors that the problem declares on the directions of each option's actions.
     `polynomial`: monomials of the inputs up to `degree`. `random_fourier`: `degree` cosines in random directions.
-    `auto`: projections if the problem declares directions for each option, else a polynomial.
+    `auto`: projections if the problem declares directions for each option, and neither `inputs` nor `degree` is given;
+    else a polynomial.
     """
     inputs: Indices | None = None
     """Indices of the observation entries in the polynomial or the cosines. If null, all."""

@@ -22,7 +22,7 @@ from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 
-def make_features(specs: PAMDPSpecs, options: LinearBanditOptions) -> ContextFeatures | ProjectionFeatures:
+def make_features(specs: PAMDPSpecs, options: LinearBanditOptions) -> ProjectionFeatures | ContextFeatures:
     """Return the features that the settings name.
 
     Raises:
@@ -32,9 +32,14 @@ def make_features(specs: PAMDPSpecs, options: LinearBanditOptions) -> ContextFea
     has_directions = (
         geometry is not None and geometry.directions is not None and geometry.num_contexts == specs.num_options
     )
-    if options.features == "projections" and not has_directions:
-        raise SettingError("features=projections: the problem does not declare where each option's actions point")
-    if options.features == "projections" or (options.features == "auto" and has_directions):
+    is_given = options.inputs is not None or options.degree != 1
+    if options.features == "projections":
+        if not has_directions:
+            raise SettingError("features=projections: the problem does not declare where each option's actions point")
+        if is_given:
+            raise SettingError("features=projections: takes neither inputs nor degree; features=polynomial does")
+        return ProjectionFeatures(specs)
+    if options.features == "auto" and has_directions and not is_given:
         return ProjectionFeatures(specs)
     return ContextFeatures(specs, options)
 
@@ -69,9 +74,16 @@ class ProjectionFeatures(nn.Module):
         features = torch.cat(parts, -1).flatten(-2)
         return torch.cat([features, torch.ones_like(features[..., :1])], -1)
 
+    def exported(self) -> dict[str, Any] | None:
+        """Return their form, see `hpamdp.policies.shared.exported_policy`."""
+        tables = {name: getattr(self, name).tolist() for name in ("vectors", "origins", "directions")}
+        return {"kind": "projections", **tables, "kinds": self.kinds}
+
 
 class ContextFeatures(nn.Module):
-    """Features `[*B, num_features]` of some entries of the observation, with a constant 1 among them.
+    """Features `[*B, num_options, num_features]` of some entries of the observation, with a constant 1, which comes last.
+
+    They are the same for each option.
 
     The directions of random Fourier features are standard normal in the units of the entries, and the same in every
     run. Source: Rahimi and Recht 2007, *Random Features for Large-Scale Kernel Machines*.
@@ -94,6 +106,7 @@ class ContextFeatures(nn.Module):
         if self.num_features > 2000:
             raise SettingError(f"degree={degree}: {self.num_features} features of {len(inputs)} inputs; at most 2000")
         self.inputs = nn.Buffer(torch.tensor(inputs))
+        self.num_options = specs.num_options
         if self.is_polynomial:
             # A monomial is a product of `degree` factors, each an input or the constant 1, which comes last.
             monomials = itertools.combinations_with_replacement(range(len(inputs) + 1), degree)
@@ -108,9 +121,16 @@ class ContextFeatures(nn.Module):
         x = observation[..., self.inputs].double()
         one = torch.ones_like(x[..., :1])
         if self.is_polynomial:
-            return torch.cat([x, one], -1)[..., self.factors].prod(-1)
-        cosines = (x @ self.directions.double() + self.phases).cos()
-        return torch.cat([cosines, one], -1)
+            features = torch.cat([x, one], -1)[..., self.factors].prod(-1)
+        else:
+            features = torch.cat([(x @ self.directions.double() + self.phases).cos(), one], -1)
+        return features.unsqueeze(-2).expand(*features.shape[:-1], self.num_options, -1)
+
+    def exported(self) -> dict[str, Any] | None:
+        """Return the polynomial's form, see `hpamdp.policies.shared.exported_policy`; None for cosines."""
+        if not self.is_polynomial:
+            return None
+        return {"kind": "polynomial", "inputs": self.inputs.tolist(), "factors": self.factors.tolist()}
 
 
 class LinearBandit(Selector):
@@ -140,22 +160,12 @@ class LinearBandit(Selector):
         size = len(self.statistics.recent_options)
         self.recent_features: Tensor = nn.Buffer(torch.zeros(size, dim, dtype=torch.float64))
 
-    def option_features(self, observation: Tensor) -> Tensor:
-        """Return the features of each option at observations `[*B, observation_dim]`.
-
-        They are float64 `[*B, num_options, num_features]`.
-        """
-        features: Tensor = self.features(observation)
-        if isinstance(self.features, ProjectionFeatures):
-            return features
-        return features.unsqueeze(-2).expand(*features.shape[:-1], self.specs.num_options, -1)
-
     def predict(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return each option's expected reward at observations `[B, observation_dim]`, and its standard deviation.
 
         Both are `[B, num_options]`. The deviation is that of the estimate, not of a single reward.
         """
-        x = self.option_features(observation)
+        x = self.features(observation)
         theta, factor, size = self._regression()
         # x' A^-1 x is the squared length of L^-1 x.
         spread = torch.linalg.solve_triangular(factor, (x / size).permute(1, 2, 0), upper=False)
@@ -179,15 +189,9 @@ class LinearBandit(Selector):
         return theta, factor, size
 
     def exported(self) -> dict[str, Any] | None:
-        """Return the regressions, see `hpamdp.policies.shared.exported_policy`; None with random features."""
-        features, coefficients = self.features, self._greedy_coefficients().tolist()
-        if isinstance(features, ProjectionFeatures):
-            tables = {name: getattr(features, name).tolist() for name in ("vectors", "origins", "directions")}
-            return {"kind": "projections", **tables, "kinds": features.kinds, "coefficients": coefficients}
-        if not features.is_polynomial:
-            return None
-        entries = {"inputs": features.inputs.tolist(), "factors": features.factors.tolist()}
-        return {"kind": "polynomial", **entries, "coefficients": coefficients}
+        """Return features and coefficients, see `hpamdp.policies.shared.exported_policy`; None with random features."""
+        form = self.features.exported()
+        return None if form is None else {**form, "coefficients": self._greedy_coefficients().tolist()}
 
     def _greedy_coefficients(self) -> Tensor:
         """Return the coefficients of the greedy choice, `[num_options, num_features]`.
@@ -227,7 +231,7 @@ class LinearBandit(Selector):
         coefficients = self._greedy_coefficients()
 
         def choice(td: TensorDictBase) -> Tensor:
-            mean = (self.option_features(td.get(keys.OBSERVATION)) * coefficients).sum(-1)
+            mean = (self.features(td.get(keys.OBSERVATION)) * coefficients).sum(-1)
             return masked_values(mean, td.get(keys.OPTION_MASK, None)).argmax(-1)
 
         return choice
@@ -240,7 +244,7 @@ class LinearBandit(Selector):
         """Add finished decisions, oldest first; return the mean reward of each option among them."""
         options = decisions.get(keys.OPTION)
         rewards = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1).double()
-        features = self.option_features(decisions.get(("next", keys.DECISION_OBSERVATION)))
+        features = self.features(decisions.get(("next", keys.DECISION_OBSERVATION)))
         scalars = {}
         for i, name in enumerate(self.specs.option_names):
             own = options == i
