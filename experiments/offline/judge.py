@@ -10,17 +10,16 @@ third of them.
 
 from __future__ import annotations
 
-import csv
 import json
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
+from scipy import stats
 
 import hpamdp
-from experiments.study_tables import Rows, groups, markdown_table, read_csv
+from experiments.study_tables import Rows, groups, markdown_table, read_csv, write_tables
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -69,28 +68,20 @@ def run(folder: Path) -> Rows:
 
 
 def table(rows: Rows) -> str:
-    """Return how well each fold orders the candidates, all of them and the best half."""
+    """Return how well each fold orders the candidates, and what the best one for the judge loses in the simulator."""
     lines = []
     for (fold,), judged in groups(rows, "fold").items():
-        line: list[str] = [str(fold)]
-        best = sorted(judged, key=lambda row: -row["score"])
-        for part in (best, best[: len(best) // 2]):
-            scores, returns = (np.array([row[name] for row in part]) for name in ("score", "judged"))
-            ranks = (np.argsort(np.argsort(values)) for values in (scores, returns))
-            chosen = part[int(returns.argmax())]
-            line += [f"{np.corrcoef(*ranks)[0, 1]:.2f}", f"{scores.max() - chosen['score']:.3f}", chosen["candidate"]]
-        lines.append(line[:5])
-    return markdown_table("fold | rank correlation | regret | chosen | rank correlation in the best half", lines)
+        scores, returns = ([row[name] for row in judged] for name in ("score", "judged"))
+        chosen = max(judged, key=lambda row: row["judged"])
+        correlation = stats.spearmanr(scores, returns).statistic
+        lines.append([fold, f"{correlation:.2f}", f"{max(scores) - chosen['score']:.3f}", chosen["candidate"]])
+    return markdown_table("fold | rank correlation | regret | chosen", lines)
 
 
 def main(words: Sequence[str]) -> None:
     """Run if asked to, and tabulate."""
     if words[:1] == ["run"]:
-        rows = run(Path(words[1]).resolve())
-        with (HERE / "judge.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+        write_tables(HERE, {"judge": run(Path(words[1]).resolve())})
     print(table(read_csv(HERE / "judge.csv")))
 
 

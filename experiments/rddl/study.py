@@ -22,7 +22,7 @@ def table(curves: Rows, known: Rows) -> str:
     lines = []
     for each in known:
         of_domain = [row for row in curves if row["problem"] == each["problem"]]
-        best = max([row["return"] for row in of_domain], default=each["random"])
+        best = max(row["return"] for row in of_domain)
         best = best if each["planner"] == "" else max(best, each["planner"])
         played = [row for row in of_domain if row["player"] != "random"]
         for (library, player, limit), rows in groups(played, "library", "player", "limit_s").items():

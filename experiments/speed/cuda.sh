@@ -18,6 +18,6 @@ for settings in "num_envs=1024 steps_per_batch=8" "num_envs=16384 steps_per_batc
         echo "H-PPO, $settings, compile_updates=$compiled"
         timeout 70 python run.py high=none low=hppo env.controller=congruent device="$device" total_frames="$steps" \
             compile_updates=$compiled eval.every=0 film=false hydra.run.dir="$folder" overwrite=true seed=0 $settings \
-            2> "$folder.errors" | tail -12 || cat "$folder.errors"
+            2> "$folder.errors" | tail -12 || { cat "$folder.errors"; echo "failed, or not over after 70 s"; }
     done
 done

@@ -50,6 +50,8 @@ def check(device: str) -> None:
         num_other += int((~is_same).sum())
         worst = max(worst, float((after["observation"] - other_after["observation"])[is_same].abs().max()))
     print(f"boats on {device}: {num_other} of {CHECKED * STEPS:,} outcomes differ; observations by at most {worst:.1e}")
+    if num_other > CHECKED * STEPS // 1000 or worst > 1e-3:
+        sys.exit("boats on the device do not follow the kernel's rules")
 
 
 def time_boats(kind: type[BoatDockEnv], device: str, num_envs: int) -> None:

@@ -297,7 +297,7 @@ def _zero_where(mask: Tensor, values: Tensor) -> Tensor:
 
 
 def _zeroed(leaves: Mapping[str, Any], mask: Tensor) -> dict[str, Any]:
-    """Return leaves, tensors or tensordicts of them, with zeros where the mask `[N, 1]` is true."""
+    """Return entries, some of them nested, with zeros where the mask `[N, 1]` is true."""
     return {
         name: _unchecked(_zeroed(dict(leaf.items()), mask), leaf)
         if isinstance(leaf, TensorDictBase)

@@ -73,7 +73,7 @@ def kernel(function: Callable[..., Any]) -> Any:
         # NUMBA_DISABLE_JIT is set. Integers overflow silently in machine code, so NumPy must not warn either.
         return np.errstate(over="ignore")(function)
     # By default Numba reuses cached code while the function's own file is unchanged, although functions that it calls
-    # in other files may have changed. This stamp covers all files here, and the own file of a kernel from elsewhere.
+    # in other files may have changed. This stamp covers hpamdp/env. A kernel from elsewhere keeps its own file's, too.
     file = compiled._cache._cache_file
     is_here = Path(function.__code__.co_filename).is_relative_to(Path(__file__).parent)
     file._source_stamp = sources() if is_here else (*sources(), file._source_stamp)

@@ -81,9 +81,9 @@ class ProjectionFeatures(nn.Module):
 
 
 class ContextFeatures(nn.Module):
-    """Features `[*B, num_options, num_features]` of some entries of the observation, with a constant 1, which comes last.
+    """Features `[*B, num_options, num_features]` of some entries of the observation, the same for each option.
 
-    They are the same for each option.
+    A constant 1 comes last.
 
     The directions of random Fourier features are standard normal in the units of the entries, and the same in every
     run. Source: Rahimi and Recht 2007, *Random Features for Large-Scale Kernel Machines*.
