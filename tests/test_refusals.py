@@ -84,7 +84,10 @@ REFUSED = [
     ("high=none low=planner env=platform", "low=planner: env=platform has no planner to ask"),
     ("high=ucb env.controller=random", "high=ucb: env=boatdock leaves nothing to choose; use high=none or env.contr"),
     ("high=none env.controller=random low=random low.freeze=true", "low.freeze=true: there is no choice left to learn"),
-    ("high=linucb env.observation=pixels high.inputs=[14,15]", "high: inputs=[14, 15]: the observation has entries 0 to 13; null: all"),
+    (
+        "high=linucb env.observation=pixels high.inputs=[14,15]",
+        "high: inputs=[14, 15]: the observation has entries 0 to 13; null: all",
+    ),
     ("high=exp3 low=iql mode=offline data=human", "high=exp3: learns from its own choices only; use mode=train, or"),
     ("low=random low.checkpoint=/nowhere", "low.checkpoint=/nowhere: no checkpoint there; give a run's output folder"),
     (f"{CROSSING} high=actor agent.termination=learned", "high=actor does not decide where options end; use high=opt"),
