@@ -38,12 +38,13 @@ Make data sets of the offline benchmark, in Minari's folder ($MINARI_DATASETS_PA
 """
 # For each domain: `env_id` and `env_kwargs` of its environment in Gymnasium, and the `layout` of its actions; the
 # `agent` that comes with the package; `noise`, the probability of a random action of the medium player; `episodes` of a
-# data set; `frames`, the steps of the agent's training from which `replay` takes them; mean scores of random actions
-# and of the best learner; `recorded`, the words that choose recordings; `checksums`.
+# data set; `frames`, the steps of the agent's training from which `replay` takes them; mean returns of the data sets
+# `random` and `expert`; mean scores of random actions and of the best learner, for the benchmark's table; `recorded`,
+# the words that choose recordings; `checksums`.
 DOMAINS: dict[str, dict[str, Any]] = json.loads(Path(__file__).with_name("datasets.json").read_text())
 # Which part of the episodes of `mixed` comes from each of these data sets.
 _MIXED = {"random": 0.5, "medium": 0.4, "expert": 0.1}
-_SEEDS = {"random": 1, "medium": 2, "expert": 3}  # of the episodes; the evaluations' own have other generators
+_SEEDS = {"random": 1, "medium": 2, "expert": 3}  # of the episodes
 
 
 def names() -> list[str]:
@@ -63,12 +64,14 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     for name in given:
         if name not in names():
             raise ConfigError(f"{name}: no data set of the package; hpamdp datasets lists them")
-    for name in given or names():
-        say(_line(name) if given else name)
+    for name in given:
+        say(_made(name))
+    if not given:
+        say("\n".join(names()))
     return 0
 
 
-def _line(name: str) -> str:
+def _made(name: str) -> str:
     """Make a data set unless it is there, and return its figures in a line."""
     domain, part = name.removesuffix("-v0").split("/")[1:]
     try:
@@ -102,8 +105,9 @@ def make(domain: str, part: str) -> None:
         env_id=settings["env_id"],
         env_kwargs=settings.get("env_kwargs"),
         algorithm_name=players.get(part, settings["agent"]),
-        description=f"`{part}` of hpamdp's offline benchmark. Reference scores are scores of hpamdp, not returns.",
-        reference_scores=(settings["random_score"], settings["best_score"]),
+        description=f"`{part}` of hpamdp's offline benchmark. Reference scores: returns of `random` and `expert`.",
+        # Those of `human-sparse` have other rewards.
+        reference_scores=None if part == "human-sparse" else (settings["random_return"], settings["expert_return"]),
     )
 
 

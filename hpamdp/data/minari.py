@@ -206,13 +206,13 @@ def load(dataset_id: str, layout: MinariLayout | None = None) -> TensorDict:
 
 
 def _checked_metadata(dataset_id: str) -> dict[str, Any]:
-    """Refuse metadata without spaces: Minari would import and build the environment that they name instead."""
+    """Return a data set's metadata; refuse those without spaces: Minari would build the environment that they name."""
     from minari.storage import get_dataset_path
 
     folder = get_dataset_path(dataset_id)
     if not folder.exists():
-        made = f"`hpamdp datasets` makes those of the package, `minari download {dataset_id}` fetches others"
-        raise DataError(f"is not in {get_dataset_path()}; {made}")
+        advice = f"`hpamdp datasets` makes those of the package, `minari download {dataset_id}` fetches others"
+        raise DataError(f"is not in {get_dataset_path()}; {advice}")
     metadata = read_json(read_regular(folder / "data" / "metadata.json", MAX_LINE_BYTES))
     for name in _SPACES:
         if not isinstance(metadata.get(name), str):
