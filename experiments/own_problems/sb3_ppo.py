@@ -1,12 +1,12 @@
 """Train Stable-Baselines3's PPO on the flattened Box.
 
-python experiments/own_problems/sb3_ppo.py PROBLEM raw|normalised|informed SEED FILE CPU_SECONDS
+python experiments/own_problems/sb3_ppo.py PROBLEM raw|normalised|informed|same SEED FILE CPU_SECONDS
     writes the curve to a csv file.
 
 The action is one Box: a score for each choice beside all numbers; the largest score chooses. `raw` has the defaults.
 `normalised` wraps the environment in VecNormalize, which scales observations and rewards. `informed` also has what
 hpamdp's defaults know of such problems: the time limit ends the episode, a discount of 0.997, a lambda of 0.98, and
-several copies.
+several copies. `same` also has the copies, batches, epochs and networks of hpamdp's defaults.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch import nn
 
 GAMMA = 0.997
 GAE_LAMBDA = 0.98
@@ -105,9 +106,13 @@ class Scorer(BaseCallback):
 def main(problem: str, form: str, seed: int, file: Path, limit: float) -> None:
     """Train and score."""
     settings = {}
-    if form == "informed":
-        copies = DummyVecEnv([lambda: Monitor(EndsAtLimit(Flat(PROBLEMS[problem]())))] * NUM_COPIES)
+    if form in ("informed", "same"):
+        num_copies = NUM_COPIES if form == "informed" else 16
+        copies = DummyVecEnv([lambda: Monitor(EndsAtLimit(Flat(PROBLEMS[problem]())))] * num_copies)
         env, settings = VecNormalize(copies, gamma=GAMMA), {"gamma": GAMMA, "gae_lambda": GAE_LAMBDA, "n_steps": STEPS}
+        if form == "same":
+            settings |= {"n_steps": 64, "batch_size": 128, "n_epochs": 5}
+            settings["policy_kwargs"] = {"net_arch": [128, 128], "activation_fn": nn.ReLU}
     else:
         env = DummyVecEnv([lambda: Monitor(Flat(PROBLEMS[problem]()))])
         env = VecNormalize(env) if form == "normalised" else env
