@@ -10,7 +10,7 @@ from conftest import compose_config
 from hpamdp import keys
 from hpamdp.commands import datasets
 from hpamdp.config.errors import ConfigError
-from hpamdp.data import minari
+from hpamdp.data import DataError, minari
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.run.train import run
 
@@ -78,7 +78,7 @@ def without_a_part(group):
 @pytest.mark.parametrize(
     ("word", "spoil", "said"),
     [
-        ("env=goal", None, r"observation is \[9\] a row, but the environment's is \[17\]"),
+        ("env=goal", None, "was recorded in hpamdp/Platform-v0, which is another problem"),
         ("data.dataset=hpamdp/none-v0", None, "hpamdp/none-v0: is not in .*`hpamdp datasets` makes those"),
         ("data.dataset=../x", None, "data=minari: ../x: "),
         ("seed=1", with_nan, "the transitions, row 0: next.reward is nan, but must be finite"),
@@ -94,6 +94,48 @@ def test_another_problem_and_a_wrong_or_missing_data_set_are_refused_in_one_line
     with pytest.raises(ConfigError, match=said) as refused:
         run(compose_config(words), tmp_path / "run", words)
     assert "\n" not in str(refused.value)
+
+
+def test_a_data_set_of_another_problem_of_the_same_sizes_is_refused(folder, tmp_path):
+    datasets.make("platform", "expert")
+    metadata = folder / "hpamdp/platform/expert-v0/data/metadata.json"
+    metadata.write_text(metadata.read_text().replace("hpamdp/Platform-v0", "hpamdp/Moving-v0"))
+    words = [*WORDS, "data.dataset=hpamdp/platform/expert-v0"]
+    with pytest.raises(ConfigError, match="expert-v0: was recorded in hpamdp/Moving-v0, which is another problem"):
+        run(compose_config(words), tmp_path / "run", words)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda rows: rows[:-1], "their last episode has no end"),
+        (lambda rows: rows[:0], r"have shape \[0\]"),
+        (lambda rows: rows.exclude("action"), "they have no .*discrete"),
+        (
+            lambda rows: rows.clone().apply_(lambda leaf: leaf.fill_(torch.nan) if leaf.is_floating_point() else leaf),
+            "is not finite",
+        ),
+    ],
+)
+def test_what_would_not_come_back_is_not_exported(change, said, folder):
+    rows = change(datasets.transitions("platform", "expert"))
+    with pytest.raises(DataError, match=said):
+        minari.export(rows, "tt/rows-v0", minari.MinariLayout(), env_id="hpamdp/Platform-v0")
+    assert not minari.is_there("tt/rows-v0")
+
+
+def test_an_environment_that_does_not_fit_leaves_nothing_behind(folder):
+    rows = datasets.transitions("platform", "expert")
+    with pytest.raises(DataError, match="tt/cart-v0: Minari refuses the data"):
+        minari.export(rows, "tt/cart-v0", minari.MinariLayout(), env_id="CartPole-v1")
+    assert not minari.is_there("tt/cart-v0")
+
+
+def test_an_unusable_folder_is_said_in_one_line(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "file"))
+    with pytest.raises(ConfigError, match=r"^MINARI_DATASETS_PATH: Minari's folder cannot be used"):
+        datasets.main(["hpamdp/platform/random-v0"], argparse.ArgumentParser())
 
 
 def test_pictures_are_stored_exactly(folder):

@@ -16,6 +16,7 @@ import shutil
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -30,9 +31,10 @@ from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.export import check_room
 from hpamdp.data.options import CARDS, MinariOptions
 from hpamdp.data.row_checks import TRAJECTORY, check_transitions
+from hpamdp.env.registration import problem_of
 from hpamdp.files import read_regular
 from hpamdp.json_lines import MAX_LINE_BYTES, read_json
-from hpamdp.messages import first_line
+from hpamdp.messages import first_line, reason_of
 
 if TYPE_CHECKING:
     import minari
@@ -101,12 +103,13 @@ def export(
     """
     library = _import_minari()
     from minari.data_collector import EpisodeBuffer
-    from minari.storage import get_dataset_path
 
     if not re.fullmatch(r"([\w-]+/)*[\w-]+-v\d+", dataset_id):
         raise DataError(f"{dataset_id}: not a name of a Minari data set; it must be like namespace/name-v0")
-    if get_dataset_path(dataset_id).exists():
+    folder = _folder_of(dataset_id)
+    if folder.exists():
         raise DataError(f"{dataset_id}: Minari has this data set already; delete it first: minari delete {dataset_id}")
+    _check_episodes(batch, dataset_id)
     if not batch["next", keys.IS_DECISION].equal(batch["next", keys.DONE]):
         raise DataError(f"{dataset_id}: Minari has no place for options that end inside an episode")
     for name in _OF_STATES:
@@ -121,7 +124,7 @@ def export(
     try:
         # The library of HDF5 prints hundreds of tracebacks on a full disk.
         num_bytes = sum(values.nbytes for values in batch.values(True, True))
-        check_room(get_dataset_path(), 2 * num_bytes + _BYTES_AN_EPISODE * len(lengths))
+        check_room(folder.parent, 2 * num_bytes + _BYTES_AN_EPISODE * len(lengths))
         lowest, highest = reference_scores or (None, None)
         dims = _parameter_dims(env.action_space)
         buffers = [EpisodeBuffer(id=i, **_episode(rows, layout, dims)) for i, rows in enumerate(batch.split(lengths))]
@@ -139,9 +142,38 @@ def export(
             )
         dataset.storage.update_metadata({_LAYOUT: asdict(layout)})
         return dataset
-    except (ValueError, OSError, RuntimeError) as error:
-        shutil.rmtree(get_dataset_path(dataset_id), ignore_errors=True)
+    except Exception as error:  # Minari asserts what fits its environment, among others
+        shutil.rmtree(folder, ignore_errors=True)
         raise DataError(f"{dataset_id}: Minari refuses the data ({first_line(error)})") from error
+
+
+def _folder_of(dataset_id: str) -> Path:
+    """Return the folder of a data set.
+
+    Raises:
+        DataError: Minari's folder cannot be made.
+    """
+    from minari.storage import get_dataset_path
+
+    try:
+        return Path(get_dataset_path(dataset_id))
+    except OSError as error:
+        raise DataError(f"MINARI_DATASETS_PATH: Minari's folder cannot be used ({reason_of(error)})") from error
+
+
+def _check_episodes(batch: TensorDict, dataset_id: str) -> None:
+    """Refuse transitions that `load` would refuse, too, or cut."""
+    names = (keys.OBSERVATION, keys.DISCRETE, keys.PARAMETERS, ("next", keys.REWARD), ("next", keys.IS_DECISION))
+    fault = next((f"they have no {name}" for name in names if name not in batch.keys(True)), None)
+    if fault is None and (batch.ndim != 1 or len(batch) == 0):
+        fault = f"they have shape {list(batch.shape)}, but must be [N], at least one"
+    if fault is None and not batch["next", keys.DONE][-1]:
+        fault = "their last episode has no end"
+    for name, values in batch.items(True, True) if fault is None else ():
+        if values.is_floating_point() and not values.isfinite().all():
+            fault = f"{name} is not finite"
+    if fault is not None:
+        raise DataError(f"{dataset_id}: the transitions cannot be exported: {fault}")
 
 
 def _parameter_dims(space: Any) -> list[int] | None:
@@ -207,12 +239,10 @@ def load(dataset_id: str, layout: MinariLayout | None = None) -> TensorDict:
 
 def _checked_metadata(dataset_id: str) -> dict[str, Any]:
     """Return a data set's metadata; refuse those without spaces: Minari would build the environment that they name."""
-    from minari.storage import get_dataset_path
-
-    folder = get_dataset_path(dataset_id)
+    folder = _folder_of(dataset_id)
     if not folder.exists():
         advice = f"`hpamdp datasets` makes those of the package, `minari download {dataset_id}` fetches others"
-        raise DataError(f"is not in {get_dataset_path()}; {advice}")
+        raise DataError(f"is not in {folder.parent}; {advice}")
     metadata = read_json(read_regular(folder / "data" / "metadata.json", MAX_LINE_BYTES))
     for name in _SPACES:
         if not isinstance(metadata.get(name), str):
@@ -266,9 +296,7 @@ def _transitions(episode: minari.EpisodeData, number: int, layout: MinariLayout)
 def is_there(dataset_id: str) -> bool:
     """Return whether Minari's folder has a data set."""
     _import_minari()
-    from minari.storage import get_dataset_path
-
-    return get_dataset_path(dataset_id).exists()
+    return _folder_of(dataset_id).exists()
 
 
 def checksum(rows: TensorDict) -> str:
@@ -298,3 +326,8 @@ class MinariDemonstrations(Demonstrations):
     def __init__(self, env: PAMDPEnv, options: MinariOptions | None = None, **settings: Any) -> None:
         self.options: MinariOptions = MinariOptions.of(options, settings)
         super().__init__(load(self.options.dataset), env.device)
+        spec = str(_checked_metadata(self.options.dataset).get("env_spec"))
+        found = re.search(r'"id": *"(hpamdp/\w+-v0)"', spec)
+        problem = None if found is None else problem_of(found[1])
+        if found is not None and problem not in (None, f"{type(env).__module__}:{type(env).__name__}"):
+            raise DataError(f"{self.options.dataset}: was recorded in {found[1]}, which is another problem")

@@ -51,6 +51,12 @@ _OTHERS: dict[str, dict[str, Any]] = {
 }
 
 
+def problem_of(env_id: str) -> str | None:
+    """Return the class of the batched problem of an id, as `module:class`; None for other ids."""
+    name = env_id.removeprefix("hpamdp/").removesuffix("-v0")
+    return f"hpamdp.env.{_BATCHED[name][0]}" if name in _BATCHED else None
+
+
 def register() -> None:
     """Register the Gymnasium ids of all problems; calling it again changes nothing."""
     adapter = "hpamdp.env.batched_adapter:BatchedEnv"
