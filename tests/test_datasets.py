@@ -81,6 +81,7 @@ def without_a_part(group):
         ("env=goal", None, "was recorded in hpamdp/Platform-v0, which is another problem"),
         ("data.dataset=hpamdp/none-v0", None, "hpamdp/none-v0: is not in .*`hpamdp datasets` makes those"),
         ("data.dataset=../x", None, "data=minari: ../x: "),
+        ("data.dataset=", None, "data.dataset: names no data set"),
         ("seed=1", with_nan, "the transitions, row 0: next.reward is nan, but must be finite"),
         ("seed=1", without_a_part, "cannot be read as transitions"),
     ],

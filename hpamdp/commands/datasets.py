@@ -159,7 +159,7 @@ class _Noisy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         td = self.policy(td)
         other = random_action(self.specs, td.copy())
-        is_random = torch.rand(td.batch_size) < self.noise
+        is_random = torch.rand(td.batch_size, dtype=torch.float32) < self.noise
         td[keys.DISCRETE] = torch.where(is_random, other[keys.DISCRETE], td[keys.DISCRETE])
         td[keys.PARAMETERS] = torch.where(is_random.unsqueeze(-1), other[keys.PARAMETERS], td[keys.PARAMETERS])
         return td

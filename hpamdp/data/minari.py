@@ -325,6 +325,8 @@ class MinariDemonstrations(Demonstrations):
 
     def __init__(self, env: PAMDPEnv, options: MinariOptions | None = None, **settings: Any) -> None:
         self.options: MinariOptions = MinariOptions.of(options, settings)
+        if not self.options.dataset:
+            raise DataError("data.dataset: names no data set; `hpamdp datasets` lists those of the package")
         super().__init__(load(self.options.dataset), env.device)
         spec = str(_checked_metadata(self.options.dataset).get("env_spec"))
         found = re.search(r'"id": *"(hpamdp/\w+-v0)"', spec)

@@ -9,8 +9,8 @@ from hpamdp.settings import Settings
 class MinariOptions(Settings):
     """Settings of `MinariDemonstrations`."""
 
-    dataset: str
-    """Name of the data set, such as `hpamdp/platform/mixed-v0`. `hpamdp datasets` lists the package's own."""
+    dataset: str = ""
+    """Name of the data set, such as `hpamdp/platform/mixed-v0`; `hpamdp datasets` lists the package's own."""
 
 
 CARDS = {"MinariDemonstrations": DataCard(options=MinariOptions)}
