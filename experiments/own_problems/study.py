@@ -33,7 +33,6 @@ NAME = ("problem", "library", "player", "seed")
 LATENESS = 3.0  # CPU seconds by which a score may follow the time that it stands for
 LEVEL = 0.8  # of the way from random play to the best policy
 TIMES = (15.0, 30.0, 60.0, 120.0)  # columns of the table, CPU seconds
-SHARED = ", shared core"  # ends the names of players that were also measured on a quiet core
 COLOURS = {"ppo raw": FAINT, "ppo normalised": INK, "ppo informed": "#D55E00"}
 
 
@@ -101,11 +100,10 @@ def draw(curves: Rows, path: Path) -> None:
         panels = figure.subplots(2, -(-len(problems) // 2), sharex=True, sharey=True, squeeze=False).ravel()
         for axes, ((problem,), rows) in zip(panels, problems.items(), strict=False):
             for (library, player), of_player in groups(rows, "library", "player").items():
-                plain = player.removesuffix(SHARED)
-                colour = COLOURS.get(plain) or LEARNER_COLOURS[plain.split()[0]]
+                colour = COLOURS.get(player) or LEARNER_COLOURS[player]
                 for number, run in enumerate(groups(of_player, "seed").values()):
-                    label = f"{library} {player}" if number == 0 and plain == player else None
-                    style = ":" if "before" in player else "-" if library == "hpamdp" else "--"
+                    label = f"{library} {player}" if number == 0 else None
+                    style = "-" if library == "hpamdp" else "--"
                     at_s, ways = [row["cpu_s"] for row in run], [row["way"] for row in run]
                     axes.plot(at_s, ways, color=colour, linestyle=style, linewidth=1.1, label=label)
             axes.set_title(problem)
