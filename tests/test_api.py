@@ -15,6 +15,7 @@ import pytest
 import torch
 from conftest import global_generators_unmoved
 from gymnasium import spaces
+from hydra.core.config_store import ConfigStore
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
@@ -206,10 +207,12 @@ def test_a_problem_may_be_an_id_or_a_dict(env):
     assert hpamdp.train(env, low="hppo", high=None, **TINY).history[-1]["frames"] == 512
 
 
-def test_a_torchrl_problem_and_a_learners_class_are_trained():
+def test_a_torchrl_problem_and_a_learners_class_are_trained(monkeypatch):
     class OwnLearner(hpamdp.HPPO):
         pass
 
+    choices = ConfigStore.instance().repo  # later tests in this process list them
+    monkeypatch.setitem(choices, "low", {**choices.get("low", {})})
     agent = hpamdp.train(hpamdp.make("goal", num_envs=4), low=OwnLearner, **{**TINY, "num_envs": 4})
     assert "OwnLearner" in repr(agent)
     assert agent.observation_space.shape == (17,)

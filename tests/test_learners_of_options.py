@@ -73,7 +73,7 @@ def test_values_on_different_scales_are_not_compared():
         ),
         (["+low.per_option={jump: pets}", *STEPS], "low.per_option: agent.termination=steps lets learners bootstrap"),
         (["+low.per_option={fly: random}"], "low.per_option: env=platform has no option fly; it has run, jump"),
-        (["+low.per_option={jump: nothing}"], "low.per_option.jump=nothing: no such file in conf/low; it has "),
+        (["+low.per_option={jump: nothing}"], "low.per_option.jump=nothing: no such file in conf/low; it has bc, "),
         (["+low.per_option={jump: {lr: 3}}"], 'low.per_option.jump={"lr": 3}: must be the name of a learner, or its'),
         (["+low.per_option={jump: {name: random, lr: 3}}"], "low.per_option.jump.lr: no such setting of Random"),
         (["+low.per_option={jump: ../low/random}"], 'low.per_option.jump="../low/random": must be the name of a'),
