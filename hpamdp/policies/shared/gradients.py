@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Inputs: TypeAlias = Tensor | Mapping[str, Tensor] | TensorDictBase | None
 # Maps what an update sees to the loss and to scalars to log; a function or a method, which has a name.
 LossFunction = Callable[..., tuple[Tensor, dict[str, Tensor]]]
+# The largest norm of a gradient, and the places of the parameters whose gradients are clipped together.
+Limits: TypeAlias = tuple[float, tuple[tuple[int, ...], ...]]
 Gradients = Callable[..., tuple[dict[str, Tensor], tuple[Tensor | None, ...]]]
 
 
@@ -77,18 +79,16 @@ class Descent:
         """
         groups = optimizer.param_groups
         parameters = [parameter for group in groups for parameter in group["params"] if parameter.requires_grad]
+        limits = None if max_grad_norm is None else (max_grad_norm, _places_apart(parameters, clipped_apart))
         is_first = self._gradients_of is not gradients_of and loss_of.__qualname__ not in self._compiled_losses
         with self._while_compiling() if is_first else nullcontext():
-            scalars, gradients = self._gradients_of(loss_of, parameters, *inputs, precision=self.precision)
+            scalars, gradients = self._gradients_of(
+                loss_of, parameters, *inputs, precision=self.precision, limits=limits
+            )
         if is_first:
             self._compiled_losses.add(loss_of.__qualname__)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
-        if max_grad_norm is not None:
-            groups_apart = [list(group) for group in clipped_apart]
-            apart = {id(parameter) for group in groups_apart for parameter in group}
-            for part in ([each for each in parameters if id(each) not in apart], *groups_apart):
-                nn.utils.clip_grad_norm_(part, max_grad_norm)
         optimizer.step()
         return scalars
 
@@ -134,15 +134,39 @@ def matmul_precision(device: torch.device, precision: torch.dtype) -> AbstractCo
 
 
 def gradients_of(
-    loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs, precision: torch.dtype = torch.float32
+    loss_of: LossFunction,
+    parameters: Sequence[Tensor],
+    *inputs: Inputs,
+    precision: torch.dtype = torch.float32,
+    limits: Limits | None = None,
 ) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
-    """Return the scalars of a loss and its gradients, None for parameters that it does not depend on."""
+    """Return the scalars of a loss and its gradients, None for parameters that it does not depend on.
+
+    With `limits` the gradients are clipped. Compiled code then clips them, too.
+    """
     with matmul_precision(parameters[0].device, precision):
         loss, scalars = loss_of(*inputs)
     gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
     # A fused optimizer requires that gradients lie in memory as their parameters do.
     in_order = tuple(None if gradient is None else gradient.contiguous() for gradient in gradients)
+    if limits is not None:
+        largest, places = limits
+        for part in places:
+            norm = nn.utils.get_total_norm([in_order[place] for place in part if in_order[place] is not None])
+            factor = (largest / (norm + 1e-6)).clamp(max=1.0)
+            in_order = tuple(
+                each if each is None or place not in part else each * factor for place, each in enumerate(in_order)
+            )
     return {name: value.detach() for name, value in scalars.items()}, in_order
+
+
+def _places_apart(parameters: Sequence[Tensor], apart: Sequence[Iterable[Tensor]]) -> tuple[tuple[int, ...], ...]:
+    """Return the places of the parameters whose gradients are clipped together, those in no group of `apart` first."""
+    group_of = {id(parameter): number for number, group in enumerate(apart, start=1) for parameter in group}
+    groups: list[list[int]] = [[] for _ in range(len(apart) + 1)]
+    for place, parameter in enumerate(parameters):
+        groups[group_of.get(id(parameter), 0)].append(place)
+    return tuple(map(tuple, groups))
 
 
 def _kept_guards(guards: Sequence[GuardFilterEntry]) -> list[bool]:
@@ -189,10 +213,10 @@ def compiled(device: torch.device, *, any_size: bool) -> Gradients:
     fast = torch.compile(gradients_of, dynamic=any_size, fullgraph=True, options=options)
 
     def with_plain_inputs(
-        loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs, precision: torch.dtype = torch.float32
+        loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs, **given: Any
     ) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
         # A TensorDict would have to be traced, too.
         plain = (dict(each.items()) if isinstance(each, TensorDictBase) else each for each in inputs)
-        return fast(loss_of, parameters, *plain, precision=precision)
+        return fast(loss_of, parameters, *plain, **given)
 
     return with_plain_inputs
