@@ -45,6 +45,7 @@ class SingleCollection(Collection):
                 device=parts.device,
                 trust_policy=True,
                 auto_register_policy_transforms=False,
+                track_traj_ids=False,  # numbers that nothing reads would take a third of a small step's time
             )
         if selector is not None and pending is not None:
             selector.pending.copy_(pending)  # TorchRL has just tried the policy, which made no real decisions
@@ -70,7 +71,7 @@ class SingleCollection(Collection):
             return self._before
         state: dict[str, Any] = {"env": {name: column.clone() for name, column in self.env.env_state().items()}}
         if self.env.keeps_episodes:
-            state["root"] = self._collector._carrier.exclude("collector").clone().to_dict()
+            state["root"] = self._collector._carrier.clone().to_dict()
         return state
 
     def set_state(self, state: Mapping[str, Any]) -> None:

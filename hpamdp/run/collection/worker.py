@@ -11,6 +11,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -94,7 +95,10 @@ class Collected:
 
 
 class ShardCollector(Collector):
-    """TorchRL's collector of a worker's shard."""
+    """TorchRL's collector of a worker's shard; the steps have no numbers of trajectories, which nothing reads."""
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings, track_traj_ids=False)
 
     def __bool__(self) -> bool:
         """Return True. Without this method, Ray would ask for the length, which an endless collector lacks."""

@@ -266,7 +266,7 @@ class WorkerCollection(Collection):
         state = {"generator": call_worker(worker, "policy.generator_state")}
         if self._keeps_episodes:
             state["env"] = call_worker(worker, "env.env_state")
-            state["root"] = _without_ids(call_worker(worker, "_carrier.to_dict"))
+            state["root"] = call_worker(worker, "_carrier.to_dict")
         return state
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -342,8 +342,3 @@ def _side_by_side(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def _rows(columns: Mapping[str, Any]) -> TensorDict:
     """Return nested columns, all with the same first dimension, as rows."""
     return TensorDict(columns).auto_batch_size_(1)
-
-
-def _without_ids(root: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the root without the trajectory numbers of TorchRL's collector."""
-    return {name: value for name, value in root.items() if name != "collector"}
