@@ -9,7 +9,9 @@ from hpamdp.api.arguments import count, path_argument
 from hpamdp.commands.judge import DEFAULT_EPISODES, judged
 
 
-def judge(*agents: str | Path, data: str, episodes: int = DEFAULT_EPISODES, **settings: Any) -> list[dict[str, Any]]:
+def judge(
+    *agents: str | Path, data: str, episodes: int = DEFAULT_EPISODES, compare: bool = False, **settings: Any
+) -> list[dict[str, Any]]:
     """Return what recorded transitions say of trained agents, as `hpamdp judge` prints it.
 
     An ensemble (`low=pets`) learns the recorded transitions and rolls the agents out. No environment is stepped.
@@ -18,6 +20,7 @@ def judge(*agents: str | Path, data: str, episodes: int = DEFAULT_EPISODES, **se
         agents: folders of runs, or names of agents that come with the package, all of one problem.
         data: the data set, such as `human`. If the agents' runs hold out the same people, their transitions are taken.
         episodes: recorded episodes from whose starts the agents act.
+        compare: whether to estimate the returns by two other methods, too; the order stays that of the roll-outs.
         settings: further settings of `mode=offline low=pets`, such as `**{"data.held_out": [3, 4]}`.
 
     Returns:
@@ -27,7 +30,9 @@ def judge(*agents: str | Path, data: str, episodes: int = DEFAULT_EPISODES, **se
         - `between_members`: standard deviation of the mean over the members of the ensemble;
         - `coverage`: fraction of the actions that are like a recorded one in a recorded state;
         - `steps`, and `unfinished`: probability that an episode lasts longer than all recorded ones;
-        - `doubts`: what the data cannot tell.
+        - `doubts`: what the data cannot tell;
+        - with `compare` `fitted`: the mean return by fitted Q evaluation; `importance`: that by weighted importance
+          sampling; `effective`: the effective number of episodes that the latter rests on. NaN if a method cannot tell.
 
     Raises:
         ConfigError: an argument is wrong, an agent does not exist, or the data cannot judge it.
@@ -38,4 +43,4 @@ def judge(*agents: str | Path, data: str, episodes: int = DEFAULT_EPISODES, **se
     """
     count("episodes", episodes)
     paths = [str(path_argument("agents", agent)) for agent in agents]
-    return judged(paths, [f"data={data}"], list(settings.items()), episodes=episodes)
+    return judged(paths, [f"data={data}"], list(settings.items()), episodes=episodes, compare=compare)

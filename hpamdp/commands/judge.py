@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.analysis.statistics import mean_interval
+from hpamdp.commands.fitted_values import fitted_values
+from hpamdp.commands.importance import RecordedEpisodes
 from hpamdp.commands.recorded_problem import RecordedProblem, Rollout, starts_of
 from hpamdp.config.compose import choosing, read, setting_of
 from hpamdp.config.errors import ConfigError
@@ -42,6 +46,7 @@ agent gets. Let it learn from people of whom the agents know nothing:
 SETTING=VALUE are those of `mode=offline low=pets`. If the runs hold out the same people, data.held_out is theirs.
 """
 _LEAST_COVERED, _MOST_UNFINISHED = 0.8, 0.05
+_LEAST_EFFECTIVE = 30  # episodes; a mean of fewer tells little
 
 
 def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
@@ -58,16 +63,26 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
         default=DEFAULT_EPISODES,
         help=f"starts of recorded episodes ({DEFAULT_EPISODES})",
     )
+    parser.add_argument(
+        "--compare", action="store_true", help="also estimate returns by fitted Q evaluation and importance sampling"
+    )
     add_config_dir(parser)
     options = parser.parse_intermixed_args(words)
     paths, settings = paths_and_settings(options.words)
-    rows = judged(paths, with_config_dirs(settings, options.config_dir), episodes=options.episodes)
+    rows = judged(
+        paths, with_config_dirs(settings, options.config_dir), episodes=options.episodes, compare=options.compare
+    )
     say(_table(rows))
     return 0
 
 
 def judged(
-    paths: Sequence[str], words: Sequence[str], settings: Sequence[tuple[str, Any]] = (), *, episodes: int
+    paths: Sequence[str],
+    words: Sequence[str],
+    settings: Sequence[tuple[str, Any]] = (),
+    *,
+    episodes: int,
+    compare: bool = False,
 ) -> list[dict[str, Any]]:
     """Return what recorded transitions say of agents, the one with the highest return first; see `hpamdp.judge`."""
     if not paths:
@@ -102,7 +117,35 @@ def judged(
         rollout = problem.roll_out(each.agent, tracker, starts, max_steps)
         doubts = [*_doubts(rollout, max_steps), *_is_known(each, config, rows)]
         found.append({"agent": path, **_row(rollout, people), "doubts": doubts})
+    if compare:
+        recorded = RecordedEpisodes(specs, rows)
+        for row, each in zip(found, agents, strict=True):
+            _compare(row, each, problem, recorded, rows, starts, config.run.offline.updates)
     return sorted(found, key=lambda row: -row["return"])
+
+
+def _compare(
+    row: dict[str, Any],
+    loaded: LoadedAgent,
+    problem: RecordedProblem,
+    recorded: RecordedEpisodes,
+    rows: TensorDict,
+    starts: Tensor,
+    num_updates: int,
+) -> None:
+    """Add to an agent's row what fitted Q evaluation and importance sampling tell of it, and what they cannot tell."""
+    agent, doubts = loaded.agent, row["doubts"]
+    tracker = decision_tracker(loaded.env, option_length=option_length(loaded.config))
+    row |= {"fitted": math.nan, "importance": math.nan, "effective": 0.0}
+    if tracker.ends_inside or any(learner.memory_key for learner in agent.learners):
+        doubts.append("it has a memory, or options that end inside episodes, so that only roll-outs judge it")
+        return
+    row["fitted"] = float(fitted_values(problem, rows, agent, tracker, starts, num_updates).mean())
+    row["importance"], row["effective"] = recorded.estimate(agent, tracker)
+    whole, num = len(recorded.returns), recorded.num_recorded
+    if row["effective"] < _LEAST_EFFECTIVE or whole < _LEAST_COVERED * num:
+        rests = f"importance sampling rests on {row['effective']:.1f} of them"
+        doubts.append(f"{whole} of {num} episodes were recorded whole; {rests}")
 
 
 _PEOPLE = {"data.held_out", "data.people"}
@@ -171,6 +214,7 @@ def _is_known(loaded: LoadedAgent, config: Config, rows: TensorDict) -> list[str
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:
     header = ["", "return", "95 % over people", "between members", "covered", "steps"]
+    methods = ["fitted", "importance", "effective"] if "fitted" in rows[0] else []
     cells = [
         [
             row["agent"],
@@ -179,9 +223,10 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
             f"{row['between_members']:.3f}",
             f"{row['coverage']:.0%}",
             f"{row['steps']:.2f}",
+            *(f"{row[name]:.3f}" for name in methods),
         ]
         for row in rows
     ]
     return "\n".join(
-        [*aligned([header, *cells]), *(f"{row['agent']}: {doubt}" for row in rows for doubt in row["doubts"])]
+        [*aligned([header + methods, *cells]), *(f"{row['agent']}: {doubt}" for row in rows for doubt in row["doubts"])]
     )

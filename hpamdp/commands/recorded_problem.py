@@ -139,17 +139,22 @@ class RecordedProblem:
         own = joint.own(number, self.specs.to_unit(rows[keys.PARAMETERS], rows).clamp(-1.0, 1.0))
         return rows[keys.OBSERVATION][:, self.learner.entries], number, own
 
+    @torch.no_grad()
+    def inputs(self, rows: TensorDictBase) -> Tensor:
+        """Return what the model's networks see of rows `[B]`, `[B, in]`."""
+        return self.learner.model.inputs(*self._as_seen(rows))
+
     def _neighbours(self, shown: TensorDict) -> tuple[Tensor, float]:
         """Return inputs of the model in the data, `[K, *]`, and how near its neighbour most of them have."""
         some = shown[torch.randperm(len(shown), device=shown.device)[:_MOST_NEIGHBOURS]]
-        known = self.learner.model.inputs(*self._as_seen(some))
+        known = self.inputs(some)
         nearest = torch.cdist(known, known).fill_diagonal_(torch.inf).amin(-1)
         return known, float(nearest.quantile(_IN_DATA)) if len(known) > 1 else 0.0
 
     def is_covered(self, acted: TensorDictBase) -> Tensor:
         """Return whether there is such an action in such a state in the data, bool `[B]`."""
         known, most = self._known
-        return torch.cdist(self.learner.model.inputs(*self._as_seen(acted)), known).amin(-1) <= most
+        return torch.cdist(self.inputs(acted), known).amin(-1) <= most
 
     @torch.no_grad()
     def roll_out(self, agent: HierarchicalAgent, tracker: DecisionTracker, starts: Tensor, max_steps: int) -> Rollout:
@@ -183,6 +188,24 @@ class RecordedProblem:
             float(covered.sum() / steps.sum()),
             float(goes_on.mean()),
         )
+
+
+def greedy_actions(
+    agent: HierarchicalAgent, tracker: DecisionTracker, observation: Tensor, option: Tensor | None = None
+) -> TensorDictBase:
+    """Return what an agent without a memory does in states, `[B]`.
+
+    Args:
+        agent: the agent, which acts greedily.
+        tracker: of the agent.
+        observation: of the states, `[B, observation_dim]`.
+        option: the options that are held there, `[B]`. If None, an episode begins, and the agent chooses.
+    """
+    num = len(observation)
+    begins = torch.ones(num, dtype=torch.bool, device=observation.device)
+    seen = tracker.follow(TensorDict({keys.OBSERVATION: observation}, [num]), None, begins)
+    with acting(ExplorationType.DETERMINISTIC), torch.no_grad():
+        return agent.policy(seen) if option is None else agent.router(seen.set(keys.OPTION, option))
 
 
 def starts_of(rows: TensorDict, num: int, seed: int) -> tuple[Tensor, np.ndarray | None]:
