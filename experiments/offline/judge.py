@@ -5,6 +5,7 @@ python experiments/offline/judge.py              tabulates judge.csv
 
 Candidates that learn from people have the even-numbered ones. The others judge all candidates, three times without a
 third of them.
+`judged` is the return by roll-outs, `fitted` by fitted Q evaluation, `importance` by importance sampling.
 `HPAMDP_HUMAN_DATA` points at the recording.
 """
 
@@ -24,6 +25,7 @@ from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 SEED = 41
+METHODS = ["judged", "fitted", "importance"]
 FOLDS = [[person for person in range(1, 40, 2) if person % 6 != without] for without in (1, 3, 5)]
 LEARNING = "data.people=[" + ",".join(map(str, range(0, 40, 2))) + "]"
 OFFLINE = f"mode=offline data=human {LEARNING} offline.eval_every=0"
@@ -58,24 +60,30 @@ def run(folder: Path) -> Rows:
     rows: Rows = []
     for number, people in enumerate(FOLDS):
         settings = {"data.people": people, "data.rest_to_rest": "clean", "offline.updates": 8000, "seed": SEED}
-        for found in hpamdp.judge(*agents.values(), data="human", episodes=40, **settings):
+        for found in hpamdp.judge(*agents.values(), data="human", episodes=40, compare=True, **settings):
             name = next(name for name, path in agents.items() if path == found["agent"])
             low, high = found["interval"]
             judged = {"judged": found["return"], "low": low, "high": high, "coverage": found["coverage"]}
+            judged |= {column: found[column] for column in ("fitted", "importance", "effective")}
             numbers = {column: round(value, 4) for column, value in {"score": scores[name], **judged}.items()}
             rows.append({"candidate": name, "fold": number, **numbers})
     return rows
 
 
 def table(rows: Rows) -> str:
-    """Return how well each fold orders the candidates, and what the best one for the judge loses in the simulator."""
+    """Return how well each fold and method orders the candidates, and what its best one loses in the simulator."""
     lines = []
     for (fold,), judged in groups(rows, "fold").items():
-        scores, returns = ([row[name] for row in judged] for name in ("score", "judged"))
-        chosen = max(judged, key=lambda row: row["judged"])
-        correlation = stats.spearmanr(scores, returns).statistic
-        lines.append([fold, f"{correlation:.2f}", f"{max(scores) - chosen['score']:.3f}", chosen["candidate"]])
-    return markdown_table("fold | rank correlation | regret | chosen", lines)
+        for method in METHODS:
+            told = [row for row in judged if row[method] != ""]
+            if not told:
+                continue
+            scores, returns = ([row[name] for row in told] for name in ("score", method))
+            chosen = max(told, key=lambda row: row[method])
+            correlation = stats.spearmanr(scores, returns).statistic
+            regret = max(scores) - chosen["score"]
+            lines.append([fold, method, f"{correlation:.2f}", f"{regret:.3f}", chosen["candidate"]])
+    return markdown_table("fold | method | rank correlation | regret | chosen", lines)
 
 
 def main(words: Sequence[str]) -> None:
