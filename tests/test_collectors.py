@@ -11,6 +11,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from contextlib import closing, suppress
 from dataclasses import replace
@@ -29,6 +30,7 @@ from hpamdp.limits import limit_of
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.base import CollectionError, WorkerDiedError
+from hpamdp.run.collection.multi import MultiCollection
 from hpamdp.run.collection.options import WorkerOptions
 from hpamdp.run.collection.worker import (
     EnvShard,
@@ -312,7 +314,7 @@ def test_a_replaced_worker_begins_new_episodes_and_counts_no_half_ones(tmp_path,
                 sums = torch.where(is_first, 0.0, sums) + step["next", keys.REWARD].squeeze(-1)
                 torch.testing.assert_close(step["next", keys.EPISODE_RETURN].squeeze(-1), sums)
         assert starts > 8
-        name = "collector=single: worker {} of 2 died (murder); it was replaced (restart {} of 9)"
+        name = "collector=single: worker {} of 2 died (murder); starting another (restart {} of 9)"
         assert capsys.readouterr().err.splitlines() == [name.format(1, 1), name.format(0, 2), name.format(1, 3)]
         seeds = {(shard.first_env, shard.env_seed, shard.exploration_seed) for shard in collection.shards}
         assert len(seeds) == 5 and len({shard.exploration_seed for shard in collection.shards}) == 5
@@ -320,13 +322,46 @@ def test_a_replaced_worker_begins_new_episodes_and_counts_no_half_ones(tmp_path,
 
 
 @pytest.mark.parametrize("at", ["policy.generator_state", "_carrier.to_dict"])
-def test_a_worker_that_dies_while_its_state_is_read_is_replaced_as_a_whole(at, tmp_path):
+def test_a_worker_that_dies_while_its_state_is_read_is_replaced_for_the_next_batch(at, tmp_path):
     with closing(Mortal(tmp_path, 1)) as collection:
         collection.next()
-        collection.have_die(0, at)
         state = collection.state()
-        assert (state["root"][keys.EPISODE_STEPS][:4] == 0).all()
-        assert torch.equal(state["root"]["observation"][4:], collection.next()["observation"][4:, 0])
+        collection.have_die(0, at)
+        assert collection.state() is state
+        collection.have_die(0)
+        batch = collection.next()
+        assert (batch[keys.EPISODE_STEPS][:4, 0] == 0).all()
+        assert torch.equal(state["root"]["observation"][4:], batch["observation"][4:, 0])
+
+
+def test_a_run_saves_before_it_waits_for_a_replacement_and_a_signal_ends_the_wait(tmp_path, monkeypatch):
+    file, workers, seen = tmp_path / "run/checkpoint.safetensors", [], []
+
+    def start(self, shard):
+        if len(workers) == 2:  # the replacement never starts, as if Ray's node was gone
+            time.sleep(60.0)
+            raise RuntimeError("nothing ended the wait")
+        workers.append(InProcess(shard))
+        return workers[-1]
+
+    def kill_and_stop():
+        wait_until(lambda: (tmp_path / "run/metrics.csv").is_file(), seconds=60)
+        workers[0].deaths.append("collect")
+        wait_until(file.is_file, seconds=30)
+        time.sleep(0.5)
+        seen.extend([checkpoint.progress_of(file)["frames"], time.monotonic()])
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(MultiCollection, "_start", start)
+    monkeypatch.setattr(MultiCollection, "_death", Mortal._death)
+    words = ["collector=multi", "collector.max_restarts=1", "total_frames=100000000", "log_every=32", "eval.every=0"]
+    stopping = threading.Thread(target=kill_and_stop)
+    stopping.start()
+    assert run(compose_config([*SMALL, "high=ucb", *words]), tmp_path / "run") == 130
+    stopping.join()
+    frames, since = seen
+    assert time.monotonic() - since < 10.0
+    assert checkpoint.progress_of(file)["frames"] == frames > 0
 
 
 def test_the_death_after_the_last_restart_ends_the_run_with_the_last_known_state(tmp_path):
@@ -451,7 +486,7 @@ def test_a_worker_that_is_killed_is_replaced(workers, quick_workers, capsys):
     assert batch.shape == (8, 4) and (batch[keys.EPISODE_STEPS][:4, 0] == 0).all()
     assert collection.workers[0] is not first and collection.workers[1] is other
     (notice,) = capsys.readouterr().err.splitlines()
-    assert "worker 0 of 2 died (" in notice and notice.endswith("; it was replaced (restart 1 of 1)")
+    assert "worker 0 of 2 died (" in notice and notice.endswith("; starting another (restart 1 of 1)")
 
 
 MORTAL = """
@@ -471,18 +506,24 @@ class Mortal(gymnasium.Env):
     action_space = spaces.Tuple((spaces.Discrete(1), spaces.Tuple((spaces.Box(-1.0, 1.0, (1,)),))))
 
     def __init__(self, run, way):
-        self.way = way if os.getpid() != run else "none"
+        # Ray's actors are no children of multiprocessing.
+        is_worker = multiprocessing.parent_process() is not None or way in ("kill", "exit", "problem")
+        self.way = way if is_worker and os.getpid() != run else "none"
         self.steps = 0
+        if self.way == "hang" and pathlib.Path("dead").exists():
+            time.sleep(1000.0)
 
     def reset(self, *, seed=None, options=None):
         return np.zeros(1, np.float32), {}
 
     def step(self, action):
         self.steps += 1
-        if self.way == "sleep" and multiprocessing.parent_process() is not None:
+        if self.way == "sleep":
             pathlib.Path("asleep").touch()
             time.sleep(1000.0)
-        if self.steps == 70 and self.way == "kill":
+        if self.steps == 70 and self.way == "hang":
+            pathlib.Path("dead").touch()
+        if self.steps == 70 and self.way in ("kill", "hang"):
             os.kill(os.getpid(), signal.SIGKILL)
         if self.steps == 70 and self.way == "exit":
             os._exit(7)
@@ -521,7 +562,7 @@ def test_a_run_goes_on_after_its_workers_deaths_if_it_may(collector, way, mortal
     assert collector == "ray" or not multiprocessing.active_children()
 
     assert run(compose_config([*words, "collector.max_restarts=2"]), tmp_path / "goes_on") == 0
-    assert len(re.findall(r"it was replaced \(restart [12] of 2\)", capsys.readouterr().err)) == 2
+    assert len(re.findall(r"starting another \(restart [12] of 2\)", capsys.readouterr().err)) == 2
     rows = (tmp_path / "goes_on/metrics.csv").read_text().splitlines()
     column = rows[0].split(",").index("train/return")
     returns = {row.split(",")[column] for row in rows[1:]} - {""}
@@ -578,6 +619,21 @@ def test_workers_in_the_middle_of_a_step_end_when_the_run_is_killed(mortal, tmp_
         wait_until((tmp_path / "asleep").exists, seconds=240)
         process.kill()
         process.wait()
+        wait_until(lambda: not processes_of(process.pid), seconds=20)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_signal_ends_a_run_whose_replacement_hangs_as_it_starts(mortal, tmp_path):
+    words = ["collector=multi", "collector.max_restarts=2", "total_frames=6400", "hydra.run.dir=run"]
+    command = [sys.executable, str(CONF.parent / "run.py"), *mortal("hang"), *words]
+    process = subprocess.Popen(command, start_new_session=True, cwd=tmp_path)
+    try:
+        wait_until((tmp_path / "run/checkpoint.safetensors").is_file, seconds=240)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 130
         wait_until(lambda: not processes_of(process.pid), seconds=20)
     finally:
         with suppress(ProcessLookupError):

@@ -223,6 +223,7 @@ class Trainer:
             collection: Collection = self.config.collector.build(
                 config=self.config, parts=self.parts, frames=self.frames
             )
+            collection.while_replacing = partial(self._replacing, collection, request)
             try:
                 self.restore_collection(collection)
                 self._loop(collection, request)
@@ -258,6 +259,13 @@ class Trainer:
                 self.save(collection)
             finally:
                 collection.close()
+
+    @contextmanager
+    def _replacing(self, collection: Collection, request: StopRequest) -> Iterator[None]:
+        """Save, since another process may never start, and let a signal end the wait for it."""
+        self.save(collection)
+        with request.taken_at_once():
+            yield
 
     def restore_collection(self, collection: Collection) -> None:
         """Restore the saved state of the collection and the random generators, if there is one."""

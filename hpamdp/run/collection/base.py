@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
 
 import numpy as np
@@ -62,10 +63,14 @@ class Collection:
     A subclass's `__init__` takes any of `config`, `parts` and `frames` (steps so far), which the program supplies, and
     its settings as `options`. Batches of all collections have the same keys, shape and order of environments. A
     collection uses the current policy, or the policy of the previous batch if it collects ahead.
+
+    Attributes:
+        while_replacing: makes a context for the wait for another process in place of a dead one. The run sets it.
     """
 
     card: ClassVar[CollectorCard] = CollectorCard()
     cpu_s: float = 0.0  # spent collecting in other processes
+    while_replacing: Callable[[], AbstractContextManager] = nullcontext
 
     @abstractmethod
     def next(self) -> TensorDictBase:

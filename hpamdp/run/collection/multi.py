@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from multiprocessing import connection, resource_tracker
 from typing import Any
 
@@ -37,12 +38,14 @@ class MultiCollection(WorkerCollection):
         # multiprocessing unblocks the signals when it starts this helper of its own.
         with children_protected():
             resource_tracker.ensure_running()
+        self._starting: list[_Worker] = []
         super().__init__(config, parts, frames, options)
 
     def _start(self, shard: EnvShard) -> MultiSyncCollector:
         # A terminal sends Ctrl-C, and a cluster its stop signal, to every process of a run.
         with children_without(*STOP_SIGNALS):
-            return MultiSyncCollector(
+            return _Worker(
+                self._starting,
                 [shard.make_env],
                 policy_factory=[shard.make_policy],
                 frames_per_batch=shard.num_envs * self._config.run.steps_per_batch,
@@ -69,3 +72,23 @@ class MultiCollection(WorkerCollection):
         if code is None:
             return None
         return how_it_ended(code) + (f": {SHARED_MEMORY}" if code == -signal.SIGBUS else "")
+
+    def close(self) -> None:
+        """End the workers, also those that are still starting, for which the end of the run's process would wait."""
+        super().close()
+        while self._starting:
+            for worker in [*self._starting]:
+                for process in getattr(worker, "procs", ()):
+                    process.kill()
+            time.sleep(0.05)  # until the threads that start them have an error
+
+
+class _Worker(MultiSyncCollector):
+    """TorchRL's collector, which is in a list while it starts."""
+
+    def __init__(self, starting: list[_Worker], *args: Any, **settings: Any) -> None:
+        starting.append(self)
+        try:
+            super().__init__(*args, **settings)
+        finally:
+            starting.remove(self)

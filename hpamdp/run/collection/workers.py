@@ -6,7 +6,8 @@ import sys
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
+from functools import partial
 from typing import Any, ClassVar, NoReturn, TypeVar
 
 import torch
@@ -43,8 +44,9 @@ class WorkerCollection(Collection):
     With `ahead`, workers begin the next batch as soon as they have returned one. They use the policy from before the
     agent learned from that batch, so the data does not depend on timing. A checkpoint includes the unfinished batch.
 
-    Each worker has a TorchRL collector and a thread that waits for it. If a worker dies, the others keep their episodes
-    and their part of the batch. Its replacement begins new episodes, with new seeds, and collects the missing part.
+    Each worker has a TorchRL collector. Threads call it, and the main thread waits for them, where a signal reaches it.
+    If a worker dies, the others keep their episodes and their part of the batch. Its replacement begins new episodes,
+    with new seeds, and collects the missing part.
 
     A subclass starts a worker in `_start`, ends it in `kill`, and explains its death in `_death`.
     """
@@ -61,9 +63,7 @@ class WorkerCollection(Collection):
         self.name = str(config.collector)
         self._config = config
         self._frames = frames
-        self._is_closing = False
         self._restarts = 0
-        self._restarting = threading.Lock()
         self._parts = parts
         self._policy = parts.policy
         self._specs = parts.agent.specs
@@ -81,11 +81,11 @@ class WorkerCollection(Collection):
         self._cpu_s = [0.0] * num_workers
         self._cpu_s_of_dead = 0.0
         self._coming: list[Future[TensorDictBase]] = []
-        self._threads = ThreadPoolExecutor(num_workers)
+        self._collect: Callable[[int], TensorDictBase]  # gives a worker's part of what is coming
         try:
             with children_protected():
-                self._on_all(self._start_first)
-            for new in self._on_all(lambda number: call_worker(self.workers[number], "take_new_statistics")):
+                statistics = self._on_all(lambda worker: call_worker(worker, "take_new_statistics"))
+            for new in statistics:
                 self._problem.add_statistics(new)
         except BaseException:
             self.close()
@@ -126,12 +126,6 @@ class WorkerCollection(Collection):
         env_seed = fresh_seed if begins_anew else seed
         return EnvShard(self._config, self._specs, first, self._size, env_seed, exploration_seed, self._frozen)
 
-    def _start_first(self, number: int) -> None:
-        try:
-            self.workers[number] = self._start(self._shard(number))
-        except Exception as error:
-            self._raise_explained(number, error)
-
     def _raise_explained(self, number: int, error: Exception) -> NoReturn:
         """Raise an error of a worker, with a message of one line if it died or the machine reached a limit.
 
@@ -153,48 +147,59 @@ class WorkerCollection(Collection):
         raise error
 
     def _on(self, number: int, call: Callable[[Any], _Returned]) -> _Returned:
-        """Return the result of a call to a worker. If the worker dies, replace it and call again.
+        """Return the result of a call to a worker, which is started first if there is none.
 
         Raises:
-            CollectionError: the worker died and is not replaced, or this machine reached a limit.
+            CollectionError: the worker died, or this machine reached a limit.
         """
-        while True:
-            try:
-                return self._attempt(number, call)
-            except WorkerDiedError as death:
-                self._count_restart(number, death)
-
-    def _attempt(self, number: int, call: Callable[[Any], _Returned]) -> _Returned:
         try:
             if self.workers[number] is None:
-                with self._restarting, children_protected():
-                    self.workers[number] = self._start(self._shard(number, self._restarts))
+                self.workers[number] = self._start(self._shard(number, self._restarts))
             return call(self.workers[number])
         except Exception as error:
             self._raise_explained(number, error)
 
-    def _count_restart(self, number: int, death: WorkerDiedError) -> None:
-        """Count the restart of a dead worker, and remove its remains.
+    def _on_all(self, call: Callable[[Any], _Returned]) -> list[_Returned]:
+        """Return the results of a call to all workers in parallel, in their order."""
+        calls = self._in_threads(lambda number: self._on(number, call))
+        wait(calls)
+        return [each.result() for each in calls]
+
+    def _in_threads(self, call: Callable[[int], _Returned]) -> list[Future[_Returned]]:
+        """Call a function with the number of every worker in parallel."""
+        return [_in_thread(call, number) for number in range(len(self.workers))]
+
+    def _results(self, calls: list[Future[_Returned]], call: Callable[[int], _Returned]) -> list[_Returned]:
+        """Wait for calls in threads. Replace the workers that die, and call again.
+
+        Raises:
+            CollectionError: a worker died and is not replaced, or this machine reached a limit.
+        """
+        wait(calls)
+        while deaths := _deaths(calls):
+            for number, death in deaths.items():
+                self._remove(number, death)
+            with self.while_replacing(), children_protected():
+                for number in deaths:
+                    calls[number] = _in_thread(call, number)
+                wait(calls)
+        return [each.result() for each in calls]
+
+    def _remove(self, number: int, death: WorkerDiedError) -> None:
+        """Remove the remains of a dead worker, and count the restart that follows.
 
         Raises:
             WorkerDiedError: no more restarts are allowed.
         """
-        with self._restarting:
-            if self._is_closing or self._restarts >= self.options.max_restarts:
-                raise death
-            self._restarts += 1
-            line = f"{death}; it was replaced (restart {self._restarts} of {self.options.max_restarts})"
-            tqdm.write(line, file=sys.stderr)  # above the bar of the training
+        if self._restarts >= self.options.max_restarts:
+            raise death
+        self._restarts += 1
+        line = f"{death}; starting another (restart {self._restarts} of {self.options.max_restarts})"
+        tqdm.write(line, file=sys.stderr)  # above the bar of the training
         self._end(number)
         self._batches[number] = None
         self._cpu_s_of_dead += self._cpu_s[number]
         self._cpu_s[number] = 0.0
-
-    def _on_all(self, call: Callable[[int], _Returned]) -> list[_Returned]:
-        """Call a function with the number of every worker in parallel, and return the results in the workers' order."""
-        futures = [self._threads.submit(call, number) for number in range(len(self.workers))]
-        wait(futures)
-        return [future.result() for future in futures]
 
     def next(self) -> TensorDictBase:
         """Send the policy's state and collect a batch. With `ahead`, return the batch that was begun and begin another.
@@ -204,28 +209,31 @@ class WorkerCollection(Collection):
         """
         self._is_idle = False
         policy = pack_state(self._policy)
-        self._coming = self._coming or self._begin(policy)
+        if not self._coming:
+            self._begin(policy)
         batch = self._finished()
         for number, new in enumerate(self._new_statistics):
             if new:
                 self._problem.add_statistics(new)
             self._new_statistics[number] = {}
-        self._coming = self._begin(policy) if self.options.ahead else []
+        self._coming = []
+        if self.options.ahead:
+            self._begin(policy)
         if "coming" in self._state:  # the batch to return, from which a resumed run must not learn again
             self._state = {name: value for name, value in self._state.items() if name != "coming"}
         self._is_idle = True
         return batch.to(self._device)
 
-    def _begin(self, policy: bytes) -> list[Future[TensorDictBase]]:
+    def _begin(self, policy: bytes) -> None:
         """Have all workers collect their part of a batch."""
-        statistics = self._problem.statistics()
-        return [self._threads.submit(self._collect, number, policy, statistics) for number in range(len(self.workers))]
+        self._collect = partial(self._part, policy, self._problem.statistics())
+        self._coming = self._in_threads(self._collect)
 
     def _finished(self) -> TensorDictBase:
         """Wait for all parts of the batch, and return a copy of them in the workers' order."""
-        return torch.cat([part.result() for part in self._coming])
+        return torch.cat(self._results(self._coming, self._collect))
 
-    def _collect(self, number: int, policy: bytes, statistics: Mapping[str, Tensor]) -> TensorDictBase:
+    def _part(self, policy: bytes, statistics: Mapping[str, Tensor], number: int) -> TensorDictBase:
         result = self._on(number, lambda worker: call_worker(worker, "collect", policy, statistics))
         self._cpu_s[number], self._new_statistics[number] = result.cpu_s, result.statistics
         self.cpu_s = self._cpu_s_of_dead + sum(self._cpu_s)
@@ -246,8 +254,8 @@ class WorkerCollection(Collection):
         if not self._is_idle or any(part.exception() for part in self._coming):
             return self._last_known()
         try:
-            states = self._on_all(lambda number: self._on(number, self._state_of))
-        except CollectionError:  # the next batch will raise it again
+            states = self._on_all(self._state_of)
+        except CollectionError:  # the next batch replaces the worker or raises it again
             return self._last_known()
         state: dict[str, Any] = {"generators": [each["generator"] for each in states]}
         for name in states[0].keys() & {"env", "root"}:
@@ -273,6 +281,7 @@ class WorkerCollection(Collection):
         """Continue from a `state` of any collection. Exploration is the same only with the same number of workers."""
         check_state(state, self._parts.env)
         self._state = dict(state)
+        self._is_idle = False
         env, root, generators = state["env"], state.get("root"), state.get("generators", ())
         if env and not self._keeps_episodes:
             self._problem.set_env_state(env)
@@ -295,22 +304,23 @@ class WorkerCollection(Collection):
 
             self._on(number, send_to)
 
-        self._on_all(send)
+        self._results(self._in_threads(send), send)
         if "coming" in state:
             shape = state["coming"]["next"][keys.DONE].shape
             coming = TensorDict(state["coming"], batch_size=shape[:-1])
-            self._coming = [_done(rows) for rows in coming.split(self._size)]
+            self._collect = coming.split(self._size).__getitem__
+            self._coming = self._in_threads(self._collect)
+        self._is_idle = True
 
     def close(self) -> None:
-        """End the workers, after a short wait for the unfinished batch."""
-        _, running = wait(self._coming, _PATIENCE_S)
-        self._is_closing = True
+        """End the workers that have started, after a short wait for the unfinished batch."""
+        begun = [part for part, worker in zip(self._coming, self.workers, strict=False) if worker is not None]
+        wait(begun, _PATIENCE_S)
         for part, worker in zip(self._coming, self.workers, strict=False):
-            if part in running and worker is not None:
+            if worker is not None and not part.done():
                 self.kill(worker)
-        self._threads.shutdown()
-        with ThreadPoolExecutor(len(self.workers)) as threads:
-            list(threads.map(self._end, range(len(self.workers))))
+        wait(begun, _PATIENCE_S)
+        self._results(self._in_threads(self._end), self._end)
 
     def _end(self, number: int) -> None:
         worker, self.workers[number] = self.workers[number], None
@@ -325,11 +335,24 @@ def call_worker(worker: Any, method: str, *arguments: Any) -> Any:
     return returned
 
 
-def _done(batch: TensorDictBase) -> Future[TensorDictBase]:
-    """Return a batch as a finished future."""
-    future: Future[TensorDictBase] = Future()
-    future.set_result(batch)
+def _in_thread(call: Callable[[int], _Returned], number: int) -> Future[_Returned]:
+    """Call a function in a thread of its own, for which the end of the process does not wait."""
+    future: Future[_Returned] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(call(number))
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
     return future
+
+
+def _deaths(calls: Sequence[Future[Any]]) -> dict[int, WorkerDiedError]:
+    """Return the errors of the calls whose workers died, by the workers' numbers."""
+    errors = enumerate(each.exception() for each in calls)
+    return {number: error for number, error in errors if isinstance(error, WorkerDiedError)}
 
 
 def _side_by_side(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
