@@ -537,14 +537,8 @@ def mortal(tmp_path, monkeypatch):
     (tmp_path / "mortal.py").write_text(MORTAL)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
-    problem = [
-        "env=gymnasium",
-        "env.entry_point=mortal:Mortal",
-        "env.max_steps=4",
-        "env.staggered=false",
-        "high=none",
-        "eval.every=0",
-    ]
+    problem = ["env=gymnasium", "env.entry_point=mortal:Mortal", "env.max_steps=4", "env.staggered=false"]
+    problem += ["high=none", "eval.every=0"]
     yield lambda way: [*SMALL, *problem, f"env.kwargs={{run:{os.getpid()},way:{way}}}"]
     sys.modules.pop("mortal", None)
 

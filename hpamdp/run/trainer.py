@@ -210,7 +210,7 @@ class Trainer:
         """Train until `num_frames`, `eval.stop_score` or a callback ends it, and save the agent.
 
         A signal takes effect between two batches, so that the saved state equals that of an uninterrupted run. It ends
-        an evaluation at once, which a resumed run repeats.
+        an evaluation at once, which a resumed run repeats, and the wait for a new worker in place of a dead one.
 
         Returns:
             True if a signal stopped training before its end.
@@ -227,7 +227,7 @@ class Trainer:
             try:
                 self.restore_collection(collection)
                 self._loop(collection, request)
-            except KeyboardInterrupt:  # in an evaluation, or the second signal, perhaps in the middle of an update
+            except KeyboardInterrupt:  # in a block of `taken_at_once`, or the second signal, perhaps in an update
                 self.recorder.forget_evaluation()
             except CallbackError:
                 self._save_and_close(collection)
