@@ -487,6 +487,7 @@ def test_a_table_of_counts_is_saved_for_training_alone(tmp_path, monkeypatch):
 def test_a_run_with_exploration_resumes_to_the_last_bit(low, kind, tmp_path):
     given = ["high=ucb", f"low={low}", *SHORT.get(low, []), *SMALL, f"exploration={kind}"]
     given += ["exploration.epsilon=0.3", "exploration.epsilon_final=0.1"] if kind == "held" else []
+    given += ["low.augment=false"] if (low, kind) == ("pets", "counts") else []  # to predict whole observations
     stop_and_resume(given, tmp_path, signal.SIGINT)
 
 
