@@ -9,7 +9,7 @@ all turns. A ratio is the median over the turns, too, with the range of the midd
 - `SyncVectorEnv`: Gymnasium's vector environment over the same copies, which also resets them.
 - `GymnasiumEnv.step`: `env.step` and `step_mdp`, with a reset of the copies whose episode is over.
 - `GymnasiumEnv.rollout`: `env.rollout` with random actions.
-- `Collector`: a run's own collector, with tracked decisions and random actions.
+- `Collector`: a run's own collector, with tracked decisions.
 - `floor`: as `GymnasiumEnv.step`, but the environment returns constants. TorchRL itself takes this time.
 
 Actions come from a pool of eight samples, except where they are random.
@@ -23,7 +23,7 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import gymnasium
@@ -33,6 +33,7 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 
 import hpamdp
@@ -194,12 +195,12 @@ def adapter(cls: type[gymnasium.Env], copies: int, kind: type[GymnasiumEnv] = Gy
 
 def stepper(env: GymnasiumEnv) -> Callable[[], object]:
     """Return a function that makes a step, with resets."""
-    pool = itertools.cycle([env.rand_action(env.reset()).select(keys.ACTION) for _ in range(POOL)])
+    pool = actions_of(env)
     td = env.reset()
 
     def step() -> None:
         nonlocal td
-        _, td = env.step_and_maybe_reset(td.update(next(pool)))
+        _, td = env.step_and_maybe_reset(td.set(keys.ACTION, next(pool)))
 
     return step
 
@@ -210,10 +211,27 @@ def roller(env: GymnasiumEnv) -> Callable[[], object]:
 
 
 def collecting(env: GymnasiumEnv) -> Callable[[], object]:
-    """Return a function that collects `STEPS` steps of each copy."""
-    frames = env.num_envs * STEPS
-    batches = iter(Collector(with_decisions(env), None, frames_per_batch=frames, total_frames=-1))
+    """Return a function that collects `STEPS` steps of each copy, as a run does."""
+    pool = actions_of(env)
+    collector = Collector(
+        with_decisions(env),
+        TensorDictModule(lambda: next(pool), [], [keys.ACTION]),
+        frames_per_batch=env.num_envs * STEPS,
+        total_frames=-1,
+        device="cpu",
+        trust_policy=True,
+        auto_register_policy_transforms=False,
+        track_traj_ids=False,
+    )
+    batches = iter(collector)
     return lambda: next(batches)
+
+
+def actions_of(env: GymnasiumEnv) -> Iterator[TensorDictBase]:
+    """Yield actions from a pool."""
+    pool = [env.rand_action(env.reset()).get(keys.ACTION) for _ in range(POOL)]
+    while True:
+        yield from pool
 
 
 def rates(steppers: dict[str, tuple[Callable[[], object], int]], seconds: float) -> dict[str, list[float]]:

@@ -82,8 +82,10 @@ class RayCollection(WorkerCollection):
         """End the actors, and Ray itself if it was started for the run."""
         import ray
 
-        super().close()
-        ray.shutdown()
+        try:
+            super().close()
+        finally:
+            ray.shutdown()
 
 
 def _connect(address: str | None, num_workers: int) -> None:
