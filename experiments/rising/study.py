@@ -16,8 +16,6 @@ from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
 SHARE = "Share of the best split's gain over option 0 alone, if the final choice sees the context"
-PRACTICE = "Practice of each option in percent of the decisions; results.csv has the other cases"
-OF_PRACTICE = ("50 and 150", "200 and 800", "crossing", "fruitless third", "hyar")  # cases of that table
 
 
 def play(names: Sequence[str]) -> None:
@@ -46,23 +44,20 @@ def of_cases(cases: Rows) -> str:
     return markdown_table("case | decisions | option 0 alone | best split | its final value", lines)
 
 
-def table(rows: Rows, cases: Rows, column: str) -> str:
+def table(rows: Rows, cases: Rows) -> str:
     """Return a line for each policy, with a cell for each case."""
     names = [case["case"] for case in cases]
     lines = []
     for (policy,), own in groups(rows, "policy").items():
         of_case = {row["case"]: row for row in own}
-        lines.append([policy, *(cell(of_case[name], column) if name in of_case else "" for name in names)])
+        lines.append([policy, *(cell(of_case[name]) if name in of_case else "" for name in names)])
     return markdown_table(" | ".join(["policy", *names]), lines)
 
 
-def cell(row: dict, column: str) -> str:
-    """Return a share, or the practice of all options in percent."""
-    if column == "practice":
-        return ":".join(f"{100 * row[f'practice_{i}']:.0f}" for i in range(3) if row[f"practice_{i}"] != "")
-    if row[column] == "":
-        return ""
-    return f"{round(row[column], 2) + 0.0:.2f}"  # no minus before a zero
+def cell(row: dict) -> str:
+    """Return the share of a policy in a case; empty if there is nothing to gain."""
+    share = row["by_context_share"]
+    return "" if share == "" else f"{round(share, 2) + 0.0:.2f}"  # no minus before a zero
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -73,9 +68,7 @@ def main(arguments: Sequence[str]) -> None:
     if (HERE / "peers.csv").exists():
         rows += read_csv(HERE / "peers.csv")
     print(of_cases(cases))
-    print(f"\n{SHARE}\n\n{table(rows, cases, 'by_context_share')}")
-    shown = [case for case in cases if case["case"] in OF_PRACTICE]
-    print(f"\n{PRACTICE}\n\n{table(rows, shown, 'practice')}")
+    print(f"\n{SHARE}\n\n{table(rows, cases)}")
 
 
 if __name__ == "__main__":
