@@ -19,7 +19,7 @@ def judge(
     Args:
         agents: folders of runs, or names of agents that come with the package, all of one problem.
         data: the data set, such as `human`. If the agents' runs hold out the same people, their transitions are taken.
-        episodes: recorded episodes from whose starts the agents act.
+        episodes: recorded episodes from whose first transitions the agents act.
         compare: whether to estimate the returns by two other methods, too; the order stays that of the roll-outs.
         settings: further settings of `mode=offline low=pets`, such as `**{"data.held_out": [3, 4]}`.
 
@@ -31,8 +31,9 @@ def judge(
         - `coverage`: fraction of the actions that are like a recorded one in a recorded state;
         - `steps`, and `unfinished`: probability that an episode lasts longer than all recorded ones;
         - `doubts`: what the data cannot tell;
-        - with `compare` `fitted`: the mean return by fitted Q evaluation; `importance`: that by weighted importance
-          sampling; `effective`: the effective number of episodes that the latter rests on. NaN if a method cannot tell.
+        - with `compare=True`, also `fitted`: the mean return by fitted Q evaluation; `importance`: the mean return by
+          weighted importance sampling; `effective`: the effective number of episodes behind `importance`. NaN if a
+          method cannot tell.
 
     Raises:
         ConfigError: an argument is wrong, an agent does not exist, or the data cannot judge it.

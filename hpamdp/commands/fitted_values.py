@@ -10,7 +10,7 @@ Differs from the source:
 - a target network that follows slowly replaces the regression to the end for each new target;
 - two networks are fitted, and their mean counts;
 - Q sees what the ensemble of `RecordedProblem` sees. If the problem declares its geometry, states are turned until the
-  discrete action points along +x. An agent that acts differently in turned states gets the mean of their values.
+  discrete action points along +x. This biases the value of an agent that acts differently in turned states.
 
 FQE in d3rlpy and SCOPE-RL takes discrete or continuous actions, not both in one.
 """

@@ -1,11 +1,14 @@
-"""Weighted importance sampling: the mean recorded return, weighted by how likely the agent makes each episode.
+"""Weighted importance sampling: the mean recorded return, weighted by how much likelier an agent makes each episode.
 
 The weight of an episode is the product over its steps of the agent's density of the recorded action, divided by the
 density of those who acted. The effective sample size (sum w)^2 / sum w^2 says how many episodes the mean rests on.
 
 The agents act greedily and have no density. A Gaussian around their parameters stands for it, so that an episode counts
 if its discrete actions and its option are the agent's and its parameters are near. The density of those who acted is a
-clone of theirs, fitted to all transitions, times how often they chose the option, whatever the state.
+clone of theirs, fitted to all transitions, times the option's frequency. This is an approximation where those who
+acted chose by the state.
+
+Episodes that a gap or a time limit cut are left out, which favours short successes.
 
 Sources: Precup, Sutton and Singh 2000, *Eligibility Traces for Off-Policy Policy Evaluation*, section 3; Thomas 2015,
 *Safe Reinforcement Learning*, section 3.6. The Gaussian: Kallus and Zhou 2018, *Policy Evaluation and Optimization with
@@ -37,15 +40,15 @@ _LR, _WEIGHT_DECAY, _BATCH_SIZE = 1e-3, 1e-2, 512
 
 
 class RecordedEpisodes:
-    """The episodes that were recorded whole, from first to last step, and how likely those who acted made them.
+    """The episodes without a gap after their first transition that terminate, and how likely those who acted made them.
 
     Args:
         specs: of the problem, which forbids no actions.
         rows: the transitions `[M]`, as in `Demonstrations`.
 
     Attributes:
-        rows: the transitions of the whole episodes, `[W]`.
-        returns: of these episodes, `[E]`.
+        rows: the transitions of these episodes, `[W]`.
+        returns: of the episodes, `[E]`.
         num_recorded: the number of all episodes.
     """
 
@@ -101,7 +104,7 @@ class RecordedEpisodes:
 
 
 def is_whole(rows: TensorDict) -> Tensor:
-    """Return which transitions `[M]` are of episodes without a gap that terminate, bool `[M]`."""
+    """Return which transitions `[M]` are of episodes without a gap after the first one that terminate, bool `[M]`."""
     episode = rows[TRAJECTORY]
     is_fine = rows["next", keys.TERMINATED].squeeze(-1).clone()
     meets = torch.isclose(rows["next", keys.OBSERVATION][:-1], rows[keys.OBSERVATION][1:], atol=1e-4).all(-1)

@@ -46,7 +46,7 @@ agent gets. Let it learn from people of whom the agents know nothing:
 SETTING=VALUE are those of `mode=offline low=pets`. If the runs hold out the same people, data.held_out is theirs.
 """
 _LEAST_COVERED, _MOST_UNFINISHED = 0.8, 0.05
-_LEAST_EFFECTIVE = 30  # episodes; a mean of fewer tells little
+_LEAST_EFFECTIVE, _LEAST_WHOLE = 30, 0.8  # episodes; a mean of fewer tells little
 
 
 def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
@@ -138,14 +138,15 @@ def _compare(
     tracker = decision_tracker(loaded.env, option_length=option_length(loaded.config))
     row |= {"fitted": math.nan, "importance": math.nan, "effective": 0.0}
     if tracker.ends_inside or any(learner.memory_key for learner in agent.learners):
-        doubts.append("it has a memory, or options that end inside episodes, so that only roll-outs judge it")
+        why = "options that end inside episodes" if tracker.ends_inside else "a memory"
+        doubts.append(f"it has {why}, so that only roll-outs judge it")
         return
     row["fitted"] = float(fitted_values(problem, rows, agent, tracker, starts, num_updates).mean())
     row["importance"], row["effective"] = recorded.estimate(agent, tracker)
     whole, num = len(recorded.returns), recorded.num_recorded
-    if row["effective"] < _LEAST_EFFECTIVE or whole < _LEAST_COVERED * num:
+    if row["effective"] < _LEAST_EFFECTIVE or whole < _LEAST_WHOLE * num:
         rests = f"importance sampling rests on {row['effective']:.1f} of them"
-        doubts.append(f"{whole} of {num} episodes were recorded whole; {rests}")
+        doubts.append(f"{whole} of {num} episodes have no gap and end by themselves; {rests}")
 
 
 _PEOPLE = {"data.held_out", "data.people"}
@@ -223,7 +224,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
             f"{row['between_members']:.3f}",
             f"{row['coverage']:.0%}",
             f"{row['steps']:.2f}",
-            *(f"{row[name]:.3f}" for name in methods),
+            *(f"{row[name]:.{1 if name == 'effective' else 3}f}" for name in methods),
         ]
         for row in rows
     ]

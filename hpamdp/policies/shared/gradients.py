@@ -79,7 +79,7 @@ class Descent:
         """
         groups = optimizer.param_groups
         parameters = [parameter for group in groups for parameter in group["params"] if parameter.requires_grad]
-        limits = None if max_grad_norm is None else (max_grad_norm, _places_apart(parameters, clipped_apart))
+        limits = None if max_grad_norm is None else (max_grad_norm, _clipped_together(parameters, clipped_apart))
         is_first = self._gradients_of is not gradients_of and loss_of.__qualname__ not in self._compiled_losses
         with self._while_compiling() if is_first else nullcontext():
             scalars, gradients = self._gradients_of(
@@ -142,7 +142,7 @@ def gradients_of(
 ) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
     """Return the scalars of a loss and its gradients, None for parameters that it does not depend on.
 
-    With `limits` the gradients are clipped. Compiled code then clips them, too.
+    With `limits` the gradients are clipped. This is part of the function so that it is compiled with it.
     """
     with matmul_precision(parameters[0].device, precision):
         loss, scalars = loss_of(*inputs)
@@ -160,7 +160,7 @@ def gradients_of(
     return {name: value.detach() for name, value in scalars.items()}, in_order
 
 
-def _places_apart(parameters: Sequence[Tensor], apart: Sequence[Iterable[Tensor]]) -> tuple[tuple[int, ...], ...]:
+def _clipped_together(parameters: Sequence[Tensor], apart: Sequence[Iterable[Tensor]]) -> tuple[tuple[int, ...], ...]:
     """Return the places of the parameters whose gradients are clipped together, those in no group of `apart` first."""
     group_of = {id(parameter): number for number, group in enumerate(apart, start=1) for parameter in group}
     groups: list[list[int]] = [[] for _ in range(len(apart) + 1)]

@@ -84,7 +84,7 @@ class MultiCollection(WorkerCollection):
 
 
 class _Worker(MultiSyncCollector):
-    """TorchRL's collector, which is in a list while it starts."""
+    """TorchRL's collector, listed while it starts, so that `close` can kill its process."""
 
     def __init__(self, starting: list[_Worker], *args: Any, **settings: Any) -> None:
         starting.append(self)

@@ -94,7 +94,7 @@ def _connect(address: str | None, num_workers: int) -> None:
     Raises:
         CollectionError: Ray does not start, or the cluster does not answer.
     """
-    # Ray reads this as it is imported. Otherwise a call after its end, by a thread that waits for an actor, starts it.
+    # Ray reads this as it is imported. Otherwise a thread that still waits for an actor starts Ray anew after its end.
     os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
     import ray
 
