@@ -15,6 +15,7 @@ from hpamdp.run.players import load_agent
 from hpamdp.run.train import run
 
 WORDS = ["data=human", "data.checksum=null", "offline.updates=400", "low.batch_size=32"]
+SMALL_BATCH = ["num_envs=10", "steps_per_batch=1", "total_frames=100", "eval.layouts=4"]
 
 
 @pytest.fixture(scope="module")
@@ -100,3 +101,12 @@ def test_starts_are_first_observations_of_recorded_episodes(path):
     starts, people = starts_of(rows, 7, seed=0)
     firsts = rows[rows[keys.IS_DECISION].squeeze(-1)][keys.OBSERVATION]
     assert len(people) == 7 and all((firsts == start).all(-1).any() for start in starts)
+
+
+def test_a_model_that_predicts_the_whole_observation_stands_for_the_problem():
+    parts = assemble(make_config(["env=platform", "low=pets", "high=none", "low.batch_size=32", *SMALL_BATCH]))
+    learner, specs = parts.agent.learners[0], parts.agent.specs
+    torch.manual_seed(0)
+    steps = parts.env.rollout(40, break_when_any_done=False).flatten()
+    problem = RecordedProblem(learner, specs, steps, 2)
+    assert problem.rest == [] and problem.step(steps[:10])[0].shape == (10, specs.observation_dim)

@@ -120,6 +120,7 @@ def judged(
     if compare:
         recorded = RecordedEpisodes(specs, rows)
         for row, each in zip(found, agents, strict=True):
+            torch.manual_seed(config.run.seed)  # so that an agent's figures do not depend on the others
             _compare(row, each, problem, recorded, rows, starts, config.run.offline.updates)
     return sorted(found, key=lambda row: -row["return"])
 

@@ -88,7 +88,9 @@ class RecordedProblem:
         goes_on = ~rows["next", keys.TERMINATED].squeeze(-1)
         now, after = shown[keys.OBSERVATION][goes_on], shown["next", keys.OBSERVATION][goes_on]
         inputs = self._inputs_of_rest(now, after[:, self.predicted])
-        self.weight = torch.linalg.lstsq(inputs, after[:, self.rest].double(), driver="gelsd").solution
+        self.weight = inputs.new_zeros(inputs.shape[-1], 0)
+        if self.rest:
+            self.weight = torch.linalg.lstsq(inputs, after[:, self.rest].double(), driver="gelsd").solution
         self._known = self._neighbours(shown)
 
     @property

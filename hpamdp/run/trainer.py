@@ -223,9 +223,9 @@ class Trainer:
             collection: Collection = self.config.collector.build(
                 config=self.config, parts=self.parts, frames=self.frames
             )
-            collection.while_replacing = partial(self._replacing, collection, request)
             try:
                 self.restore_collection(collection)
+                collection.while_replacing = partial(self._replacing, collection, request)
                 self._loop(collection, request)
             except KeyboardInterrupt:  # in a block of `taken_at_once`, or the second signal, perhaps in an update
                 self.recorder.forget_evaluation()

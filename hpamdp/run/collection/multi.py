@@ -81,6 +81,8 @@ class MultiCollection(WorkerCollection):
                 for process in getattr(worker, "procs", ()):
                     process.kill()
             time.sleep(0.05)  # until the threads that start them have an error
+        for number in range(len(self.workers)):  # of a worker that has started meanwhile
+            self._end(number)
 
 
 class _Worker(MultiSyncCollector):

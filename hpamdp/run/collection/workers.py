@@ -177,6 +177,8 @@ class WorkerCollection(Collection):
         """
         wait(calls)
         while deaths := _deaths(calls):
+            if self._restarts + len(deaths) > self.options.max_restarts:
+                raise next(iter(deaths.values()))
             for number, death in deaths.items():
                 self._remove(number, death)
             with self.while_replacing(), children_protected():
@@ -186,13 +188,7 @@ class WorkerCollection(Collection):
         return [each.result() for each in calls]
 
     def _remove(self, number: int, death: WorkerDiedError) -> None:
-        """Remove the remains of a dead worker, and count the restart that follows.
-
-        Raises:
-            WorkerDiedError: no more restarts are allowed.
-        """
-        if self._restarts >= self.options.max_restarts:
-            raise death
+        """Remove the remains of a dead worker, and count the restart that follows."""
         self._restarts += 1
         line = f"{death}; starting another (restart {self._restarts} of {self.options.max_restarts})"
         tqdm.write(line, file=sys.stderr)  # above the bar of the training
