@@ -9,12 +9,11 @@ Differs from the sources:
 - Every discrete action has its own parameters. So the actor increases the values of all discrete actions, each weighted
   by its frequency in the data. The distance from the data is that of the recorded action's own parameters, summed over
   them; the source takes the mean. With n parameters the distance weighs n times as much.
-- The actor increases the minimum of all critics, not the first one's value. With more than two critics (`num_critics`)
-  this is the caution of SAC-N: An, Moon, Kim and Song 2021, arXiv 2110.01548. Its diversified critics gained nothing.
+- The actor increases the minimum of both critics, not the first one's value.
 - States are not normalised, as problems scale their observations.
 - By default the values weigh twice as much: `behaviour_weight`, which is 1 / alpha, is 0.2. The source has 0.4, from
   alpha = 2.5.
-- The loss of the critics is the mean over all, in the source the sum. To Adam a constant factor is nearly the same.
+- The loss of the critics is the mean over both, in the source the sum. To Adam a constant factor is nearly the same.
 - The noise in the target has a standard deviation of 0.05 and is clipped at 0.1. The source has 0.2 and 0.5.
 - The learning rates are 1e-3, not 3e-4, and the hidden layers have 128 units, not 256.
 - The model of the data's discrete actions has no penalty on its logits. In the code of discrete BCQ it has. There the
@@ -118,7 +117,7 @@ class TD3BC(ReplayLearner):
         options = self.options
         hidden_dims = options.hidden_dims
         self.actor = nn.Sequential(mlp(specs.observation_dim, hidden_dims, specs.num_parameters), nn.Tanh())
-        self.critics = HybridCritics(specs, options.num_critics, hidden_dims, is_multipass=True)
+        self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
         self.behaviour = mlp(specs.observation_dim, hidden_dims, specs.num_discrete)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)

@@ -20,8 +20,6 @@ class TD3BCOptions(ActorCriticOptions):
 
     hidden_dims: Widths = (128, 128)
     """Hidden layers of the actor, the critics and the model of the data's discrete actions."""
-    num_critics: Annotated[int, Field(ge=2)] = 2
-    """Number of critics, the lowest value of which counts. More are more careful, and take longer."""
     actor_lr: LearningRate = 1e-3
     """Learning rate of the actor and of the model of the data's discrete actions."""
     behaviour_weight: NonNegativeFloat = 0.2
