@@ -321,6 +321,16 @@ def test_a_replaced_worker_begins_new_episodes_and_counts_no_half_ones(tmp_path,
         assert [shard.env_seed for shard in collection.shards[:2]] == [0, 0]
 
 
+def test_no_worker_is_replaced_if_more_die_than_may_be_replaced(tmp_path, capsys):
+    with closing(Mortal(tmp_path, 1)) as collection:
+        collection.next()
+        for number in range(2):
+            collection.have_die(number)
+        with pytest.raises(WorkerDiedError):
+            collection.next()
+        assert capsys.readouterr().err == ""
+
+
 @pytest.mark.parametrize("at", ["policy.generator_state", "_carrier.to_dict"])
 def test_a_worker_that_dies_while_its_state_is_read_is_replaced_for_the_next_batch(at, tmp_path):
     with closing(Mortal(tmp_path, 1)) as collection:
