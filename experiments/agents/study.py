@@ -34,7 +34,7 @@ def row(folder: Path) -> list[str]:
         summary["low"],
         f"{summary['score']:.3f}",
         "" if ceiling is None else f"{ceiling:.3f}",
-        f"{100.0 * summary['success']:.1f} %" if "success" in summary else "",
+        f"{100.0 * summary['success']:.1f}%" if "success" in summary else "",
         f"{summary['steps']:.2f}",
         f"{summary['frames']:,}",
         f"{summary['cpu_s']:.0f}",

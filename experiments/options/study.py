@@ -179,7 +179,7 @@ def _column(rows: Rows, name: str) -> list[float]:
 
 
 def _percent(rows: Rows, name: str) -> str:
-    return f"{100.0 * mean_of(rows, name):.1f} %"
+    return f"{100.0 * mean_of(rows, name):.1f}%"
 
 
 def main(folders: Sequence[str]) -> None:

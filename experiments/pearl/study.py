@@ -74,7 +74,7 @@ def table(curves: Rows) -> str:
         cells += [f"{mean_of(ends, column):,.0f}" for column in ("episodes", "steps")]
         cells += [f"{mean_of(ends, 'cpu_s'):,.0f} s"]
         cells += [spread(scores, 0), interval_text(scores, ",.0f")]
-        cells += [f"{100.0 * mean_of(ends, 'success'):.1f} %", f"{len(firsts)} of {len(runs)}"]
+        cells += [f"{100.0 * mean_of(ends, 'success'):.1f}%", f"{len(firsts)} of {len(runs)}"]
         cells += [_range(firsts, "episodes"), _range(firsts, "steps"), _range(firsts, "cpu_s", " s")]
         lines.append(cells)
     head = (

@@ -210,7 +210,7 @@ def table(results: Rows, curves: Rows) -> str:
             f"{frames:,}",
             len(rows),
             spread(scores, digits),
-            f"{100.0 * mean_of(rows, 'success'):.1f} %",
+            f"{100.0 * mean_of(rows, 'success'):.1f}%",
             f"{min(scores):.{digits}f}",
             f"{bar:,.{digits}f} ({whose})",
             f"{sum(score >= bar for score in scores)} of {len(rows)}",
