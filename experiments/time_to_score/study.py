@@ -8,7 +8,6 @@ python experiments/time_to_score/study.py                      tabulates results
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 import hpamdp
+from experiments.own_problems.protocol import cpu_seconds
 from experiments.study_tables import Rows, groups, markdown_table, read_csv, write_tables
 from hpamdp.messages import exit_code
 
@@ -40,11 +40,6 @@ PLAYERS: dict[str, tuple[dict[str, Any], tuple[float, ...], int]] = {
 }  # fmt: skip
 
 
-def cpu() -> float:
-    """Return the CPU seconds of this process and its ended children so far."""
-    return sum(os.times()[:4])
-
-
 class Crossings(hpamdp.Callback):
     """Note when an evaluation first reaches each score, without the time of evaluations.
 
@@ -61,17 +56,17 @@ class Crossings(hpamdp.Callback):
 
     def on_start(self, trainer: Any) -> None:
         """Note the end of the start."""
-        self.start_s = self._before = cpu()
+        self.start_s = self._before = cpu_seconds()
 
     def on_batch(self, trainer: Any) -> None:
         """Note when an evaluation may begin."""
-        self._before = cpu()
+        self._before = cpu_seconds()
 
     def on_evaluation(self, trainer: Any, row: Mapping[str, float]) -> None:
         """Compare the score with the goals."""
-        self._evaluations += cpu() - self._before
+        seconds = self._before - self._evaluations
+        self._evaluations += cpu_seconds() - self._before
         while self.left and row[self.metric] >= self.left[0]:
-            seconds = self._before - self._evaluations + (cpu() - self._before)
             goal = self.left.pop(0)
             self.found.append({"goal": goal, "cpu_s": round(seconds, 1), "steps": int(row["frames"])})
         if not self.left:
@@ -87,7 +82,7 @@ def train(player: str, seed: int) -> Rows:
     hpamdp.train(given.pop("env"), seed=seed, progress=False, film=False, callbacks=[crossings], **given)
     shared = {"player": player, "seed": seed, "start_s": round(crossings.start_s, 1)}
     return [{**shared, **row} for row in crossings.found] + [
-        {**shared, "goal": goal, "cpu_s": None, "steps": most} for goal in crossings.left
+        {**shared, "goal": goal, "cpu_s": "", "steps": most} for goal in crossings.left
     ]
 
 
@@ -95,7 +90,7 @@ def table(rows: Rows) -> str:
     """Return the medians over seeds."""
     lines = []
     for (player, goal), runs in groups(rows, "player", "goal").items():
-        seconds = [float("inf") if run["cpu_s"] is None else run["cpu_s"] for run in runs]
+        seconds = [float("inf") if run["cpu_s"] == "" else run["cpu_s"] for run in runs]
         reached = [second for second in seconds if np.isfinite(second)]
         median = float(np.median(seconds))
         spread = f"{min(reached):.0f} to {max(reached):.0f} s" if reached else ""
