@@ -74,15 +74,14 @@ class MultiCollection(WorkerCollection):
         return how_it_ended(code) + (f": {SHARED_MEMORY}" if code == -signal.SIGBUS else "")
 
     def close(self) -> None:
-        """End the workers, also those that are still starting, for which the end of the run's process would wait."""
+        """End the workers. Kill those still starting, or the end of the run's process would wait for them."""
         super().close()
         while self._starting:
             for worker in [*self._starting]:
                 for process in getattr(worker, "procs", ()):
                     process.kill()
             time.sleep(0.05)  # until the threads that start them have an error
-        for number in range(len(self.workers)):  # of a worker that has started meanwhile
-            self._end(number)
+        self._in_parallel(self._end)  # of workers that have started meanwhile
 
 
 class _Worker(MultiSyncCollector):

@@ -94,7 +94,7 @@ def _connect(address: str | None, num_workers: int) -> None:
     Raises:
         CollectionError: Ray does not start, or the cluster does not answer.
     """
-    # Ray reads this as it is imported. Otherwise a thread that still waits for an actor starts Ray anew after its end.
+    # Ray reads this as it is imported. Otherwise a thread that still waits for an actor starts another Ray.
     os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
     import ray
 

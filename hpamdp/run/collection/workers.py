@@ -147,7 +147,7 @@ class WorkerCollection(Collection):
         raise error
 
     def _on(self, number: int, call: Callable[[Any], _Returned]) -> _Returned:
-        """Return the result of a call to a worker, which is started first if there is none.
+        """Return the result of a call to a worker. A missing worker is started first.
 
         Raises:
             CollectionError: the worker died, or this machine reached a limit.
@@ -161,7 +161,11 @@ class WorkerCollection(Collection):
 
     def _on_all(self, call: Callable[[Any], _Returned]) -> list[_Returned]:
         """Return the results of a call to all workers in parallel, in their order."""
-        calls = self._in_threads(lambda number: self._on(number, call))
+        return self._in_parallel(lambda number: self._on(number, call))
+
+    def _in_parallel(self, call: Callable[[int], _Returned]) -> list[_Returned]:
+        """Return the results of a function for the number of every worker, in their order."""
+        calls = self._in_threads(call)
         wait(calls)
         return [each.result() for each in calls]
 
@@ -316,7 +320,7 @@ class WorkerCollection(Collection):
             if worker is not None and not part.done():
                 self.kill(worker)
         wait(begun, _PATIENCE_S)
-        self._results(self._in_threads(self._end), self._end)
+        self._in_parallel(self._end)
 
     def _end(self, number: int) -> None:
         worker, self.workers[number] = self.workers[number], None
