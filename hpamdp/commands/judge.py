@@ -22,7 +22,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed
 from hpamdp.config.schema import Config
 from hpamdp.data.row_checks import PERSON
-from hpamdp.env.decisions import decision_tracker
+from hpamdp.env.decisions import DecisionTracker, decision_tracker
 from hpamdp.messages import aligned, say
 from hpamdp.run.assemble import make_data, option_length
 from hpamdp.run.players import (
@@ -113,8 +113,7 @@ def judged(
     problem = RecordedProblem(learner, specs, rows, config.run.offline.updates)
     found = []
     for path, each in zip(paths, agents, strict=True):
-        tracker = decision_tracker(each.env, option_length=option_length(each.config))
-        rollout = problem.roll_out(each.agent, tracker, starts, max_steps)
+        rollout = problem.roll_out(each.agent, _tracker_of(each), starts, max_steps)
         doubts = [*_doubts(rollout, max_steps), *_is_known(each, config, rows)]
         found.append({"agent": path, **_row(rollout, people), "doubts": doubts})
     if compare:
@@ -135,8 +134,7 @@ def _compare(
     num_updates: int,
 ) -> None:
     """Add to an agent's row what fitted Q evaluation and importance sampling tell of it, and what they cannot tell."""
-    agent, doubts = loaded.agent, row["doubts"]
-    tracker = decision_tracker(loaded.env, option_length=option_length(loaded.config))
+    agent, tracker, doubts = loaded.agent, _tracker_of(loaded), row["doubts"]
     row |= {"fitted": math.nan, "importance": math.nan, "effective": 0.0}
     if tracker.ends_inside or any(learner.memory_key for learner in agent.learners):
         why = "options that end inside episodes" if tracker.ends_inside else "a memory"
@@ -148,6 +146,10 @@ def _compare(
     if row["effective"] < _LEAST_EFFECTIVE or whole < _LEAST_WHOLE * num:
         rests = f"importance sampling rests on {row['effective']:.1f} of them"
         doubts.append(f"{whole} of {num} episodes have no gap and end by themselves; {rests}")
+
+
+def _tracker_of(loaded: LoadedAgent) -> DecisionTracker:
+    return decision_tracker(loaded.env, option_length=option_length(loaded.config))
 
 
 _PEOPLE = {"data.held_out", "data.people"}

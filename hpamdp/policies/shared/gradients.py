@@ -148,16 +148,16 @@ def gradients_of(
         loss, scalars = loss_of(*inputs)
     gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
     # A fused optimizer requires that gradients lie in memory as their parameters do.
-    in_order = tuple(None if gradient is None else gradient.contiguous() for gradient in gradients)
+    in_order = [None if gradient is None else gradient.contiguous() for gradient in gradients]
     if limits is not None:
         largest, places = limits
         for part in places:
-            norm = nn.utils.get_total_norm([in_order[place] for place in part if in_order[place] is not None])
+            own = {place: gradient for place in part if (gradient := in_order[place]) is not None}
+            norm = nn.utils.get_total_norm(list(own.values()))
             factor = (largest / (norm + 1e-6)).clamp(max=1.0)
-            in_order = tuple(
-                each if each is None or place not in part else each * factor for place, each in enumerate(in_order)
-            )
-    return {name: value.detach() for name, value in scalars.items()}, in_order
+            for place, gradient in own.items():
+                in_order[place] = gradient * factor
+    return {name: value.detach() for name, value in scalars.items()}, tuple(in_order)
 
 
 def _clipped_together(parameters: Sequence[Tensor], apart: Sequence[Iterable[Tensor]]) -> tuple[tuple[int, ...], ...]:
