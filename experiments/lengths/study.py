@@ -85,14 +85,14 @@ def table(rows: Rows) -> str:
         if not of_ends:
             continue
         shares = [100.0 * row["share"] for row in of_ends]
-        interval = f"{interval_text(shares, '.1f')} %" if len(shares) > 2 else ""
+        interval = f"{interval_text(shares, '.1f')}%" if len(shares) > 2 else ""
         length = "" if ends[0] != "chosen" else spread([row["length"] for row in of_ends], 1)
         cells = [
             title,
             how,
             f"`{ends[1]}`",
             len(of_ends),
-            f"{spread(shares, 1)} %",
+            f"{spread(shares, 1)}%",
             interval,
             f"{min(shares):.1f}%",
             f"{100.0 * mean_of(of_ends, 'success'):.1f}%",
