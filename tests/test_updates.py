@@ -13,6 +13,7 @@ import test_pdqn
 import torch
 from conftest import make_config
 from torch import Tensor, nn
+from torch._dynamo import config as dynamo_config
 from torch.utils._python_dispatch import TorchDispatchMode
 from toy_steps import SPECS, one_step_rows, sample
 
@@ -150,6 +151,22 @@ def test_compiled_updates_of_hppo_are_the_same_up_to_rounding_for_batches_of_any
         assert scalars == pytest.approx(expected, rel=1e-2, abs=1e-3)
     for key, value in learner.actor.state_dict().items():
         torch.testing.assert_close(compiled.actor.state_dict()[key], value, rtol=1e-2, atol=1e-3)
+
+
+def test_clipped_gradients_can_be_traced_without_a_compiler(monkeypatch):
+    monkeypatch.setattr(dynamo_config, "trace_autograd_ops", True)
+    torch.manual_seed(0)
+    layers = torch.nn.ModuleList([torch.nn.Linear(3, 1, dtype=torch.float32) for _ in range(3)])
+    seen, limits = torch.randn(8, 3, dtype=torch.float32), (0.01, ((0, 1, 4, 5), (2, 3)))
+
+    def loss_of(seen: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:  # the last layer has no part
+        return (layers[0](seen) * layers[1](seen)).square().mean(), {}
+
+    traced = torch.compile(gradients_of, backend="eager", fullgraph=True)
+    parameters = list(layers.parameters())
+    found, expected = (each(loss_of, parameters, seen, limits=limits)[1] for each in (traced, gradients_of))
+    torch.testing.assert_close(found[:4], expected[:4])
+    assert found[4:] == expected[4:] == (None, None)
 
 
 class Dtypes(TorchDispatchMode):

@@ -152,7 +152,7 @@ def gradients_of(
     if limits is not None:
         largest, places = limits
         for part in places:
-            own = {place: gradient for place in part if (gradient := in_order[place]) is not None}
+            own = {place: in_order[place] for place in part if in_order[place] is not None}
             norm = nn.utils.get_total_norm(list(own.values()))
             factor = (largest / (norm + 1e-6)).clamp(max=1.0)
             for place, gradient in own.items():
