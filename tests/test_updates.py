@@ -153,8 +153,8 @@ def test_compiled_updates_of_hppo_are_the_same_up_to_rounding_for_batches_of_any
         torch.testing.assert_close(compiled.actor.state_dict()[key], value, rtol=1e-2, atol=1e-3)
 
 
-def test_clipped_gradients_can_be_traced_without_a_compiler(monkeypatch):
-    monkeypatch.setattr(dynamo_config, "trace_autograd_ops", True)
+@dynamo_config.patch(trace_autograd_ops=True)
+def test_clipped_gradients_can_be_traced_without_a_compiler():
     torch.manual_seed(0)
     layers = torch.nn.ModuleList([torch.nn.Linear(3, 1, dtype=torch.float32) for _ in range(3)])
     seen, limits = torch.randn(8, 3, dtype=torch.float32), (0.01, ((0, 1, 4, 5), (2, 3)))

@@ -33,6 +33,7 @@ from hpamdp.env.kernels import OUTCOME_ROW
 from hpamdp.env.planning_oracle import PlanningOracle
 from hpamdp.env.state_columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.settings import SettingError, Settings
+from hpamdp.unchecked import unchecked
 
 # If a tensordict has only these keys and the problem's extra ones, there is nothing else to carry into its next root.
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
@@ -548,9 +549,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         if results is None:
             return super()._step_and_maybe_reset(tensordict)
         # As in TorchRL, the root keeps the action, in a tensordict of its own, since updates of the root change it.
-        action = TensorDict._new_unsafe(
-            dict(tensordict.get(keys.ACTION).items()), batch_size=self.batch_size, device=self.device
-        )
+        action = unchecked(dict(tensordict.get(keys.ACTION).items()), self)
         kept: dict[str, Any] = {keys.ACTION: action}
         if keys.OPTION in tensordict.keys():
             kept[keys.OPTION] = tensordict.get(keys.OPTION)
@@ -641,8 +640,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             leaves[keys.REWARD] = torch.from_numpy(results.rewards).unsqueeze(-1)
         if not self._is_on_cpu:
             leaves = {name: leaf.to(self.device) for name, leaf in leaves.items()}
-        # The checks of the constructor would take longer than a hundred rows.
-        return self._with_knowledge(TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=self.device))
+        return self._with_knowledge(unchecked(leaves, self))
 
     def _flags(self, done: Tensor, terminated: Tensor, truncated: Tensor) -> dict[Any, Tensor]:
         """Return the flags `[N, 1]` as leaves."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Literal, TypeAlias
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Transform, TransformedEnv
@@ -14,6 +14,7 @@ from torchrl.envs import Transform, TransformedEnv
 from hpamdp import keys
 from hpamdp.components import Components
 from hpamdp.env.base import PAMDPEnv, ProblemError
+from hpamdp.unchecked import unchecked
 
 OptionLength: TypeAlias = float | Literal["chosen"] | None
 
@@ -134,17 +135,32 @@ class DecisionTracker(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         """Add this step to the sums of its option and its episode."""
-        reward = next_tensordict.get(keys.REWARD)
-        done = next_tensordict.get(keys.DONE)
+        is_stuck = self._set_masks(tensordict, next_tensordict)
+        for name, entry in self.tracked(tensordict, next_tensordict, is_stuck).items():
+            next_tensordict.set(name, entry)
+        return next_tensordict
+
+    def tracked(
+        self, tensordict: TensorDictBase, after: TensorDictBase, is_stuck: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Return the tracked entries of what followed a step, apart from the masks.
+
+        Args:
+            tensordict: the states `[*B]` with their actions and tracked entries.
+            after: what followed.
+            is_stuck: where the held option is not possible any more, bool `[*B, 1]`. If None, nowhere.
+        """
+        reward = after.get(keys.REWARD)
+        done = after.get(keys.DONE)
         option_return = tensordict.get(keys.OPTION_RETURN)
         option_steps = tensordict.get(keys.OPTION_STEPS)
-        is_stuck = self._set_masks(tensordict, next_tensordict)
+        entries: dict[str, Tensor] = {}
         is_decision = done.clone()
         if self.ends_inside:
             # Only a reset writes zeros: an option that begins inside an episode restarts its sums here.
             is_first = tensordict.get(keys.IS_DECISION)
-            option_return = _zero_where(is_first, option_return)
-            option_steps = _zero_where(is_first, option_steps)
+            option_return = option_return.masked_fill(is_first, 0)
+            option_steps = option_steps.masked_fill(is_first, 0)
             option_ended = torch.zeros_like(done)
             if self.option_length is not None:
                 length = self.option_length
@@ -154,33 +170,34 @@ class DecisionTracker(Transform):
                 if is_stuck is not None:
                     option_ended = option_ended | is_stuck
             if self.ends_with_trips:
-                option_ended = option_ended | next_tensordict.get(keys.TRIP_ENDED)
+                option_ended = option_ended | after.get(keys.TRIP_ENDED)
             is_decision = done | option_ended
-            next_tensordict.set(keys.OPTION_ENDED, option_ended)
-        next_tensordict.set(keys.IS_DECISION, is_decision)
-        next_tensordict.set(keys.OPTION_RETURN, option_return + self.gamma ** option_steps.float() * reward)
-        next_tensordict.set(keys.OPTION_STEPS, option_steps + 1)
+            entries[keys.OPTION_ENDED] = option_ended
+        entries[keys.IS_DECISION] = is_decision
+        gained = reward if self.gamma == 1.0 else self.gamma ** option_steps.float() * reward
+        entries[keys.OPTION_RETURN] = option_return + gained
+        entries[keys.OPTION_STEPS] = option_steps + 1
         if self.keeps_observation:
-            next_tensordict.set(keys.DECISION_OBSERVATION, self._decision_observation(tensordict))
-        next_tensordict.set(keys.EPISODE_RETURN, tensordict.get(keys.EPISODE_RETURN) + reward)
-        next_tensordict.set(keys.EPISODE_STEPS, tensordict.get(keys.EPISODE_STEPS) + 1)
-        return next_tensordict
+            entries[keys.DECISION_OBSERVATION] = self._decision_observation(tensordict)
+        entries[keys.EPISODE_RETURN] = tensordict.get(keys.EPISODE_RETURN) + reward
+        entries[keys.EPISODE_STEPS] = tensordict.get(keys.EPISODE_STEPS) + 1
+        return entries
 
-    def restarted(self, root: TensorDictBase, after: TensorDictBase) -> dict[str, Tensor]:
+    def restarted(self, root: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return the tracked entries of the states to go on from.
 
         Args:
-            root: these states `[N]`, with new episodes where the step ended one.
-            after: what followed the step, with its tracked entries.
+            root: entries of these states `[N]`, with new episodes where the step ended one.
+            after: entries of what followed the step, with the tracked ones.
         """
-        done = after.get(keys.DONE)
+        done = after[keys.DONE]
         sums = (keys.OPTION_RETURN, keys.OPTION_STEPS, keys.EPISODE_RETURN, keys.EPISODE_STEPS)
-        entries = {name: _zero_where(done, after.get(name)) for name in sums}
-        entries[keys.IS_DECISION] = after.get(keys.IS_DECISION)
+        entries = {name: after[name].masked_fill(done, 0) for name in sums}
+        entries[keys.IS_DECISION] = after[keys.IS_DECISION]
         if self.ends_inside:
-            entries[keys.OPTION_ENDED] = after.get(keys.OPTION_ENDED) & ~done
+            entries[keys.OPTION_ENDED] = after[keys.OPTION_ENDED] & ~done
         if self.keeps_observation:
-            seen = root.get(keys.OBSERVATION), after.get(keys.DECISION_OBSERVATION)
+            seen = root[keys.OBSERVATION], after[keys.DECISION_OBSERVATION]
             entries[keys.DECISION_OBSERVATION] = torch.where(done, *seen)
         return entries
 
@@ -292,23 +309,14 @@ def _like(mask: Tensor, value: Tensor) -> Tensor:
     return mask.reshape(-1, *[1] * (value.ndim - 1))
 
 
-def _zero_where(mask: Tensor, values: Tensor) -> Tensor:
-    return torch.where(mask, torch.zeros_like(values), values)
-
-
 def _zeroed(leaves: Mapping[str, Any], mask: Tensor) -> dict[str, Any]:
     """Return entries, some of them nested, with zeros where the mask `[N, 1]` is true."""
     return {
-        name: _unchecked(_zeroed(dict(leaf.items()), mask), leaf)
+        name: unchecked(_zeroed(dict(leaf.items()), mask), leaf)
         if isinstance(leaf, TensorDictBase)
         else leaf.masked_fill(_like(mask, leaf), 0)
         for name, leaf in leaves.items()
     }
-
-
-def _unchecked(leaves: dict[str, Any], like: TensorDictBase) -> TensorDict:
-    """Return leaves as a tensordict like another one, without checks, which take longer than a small problem's step."""
-    return TensorDict._new_unsafe(leaves, batch_size=like.batch_size, device=like.device)
 
 
 class DecisionEnv(TransformedEnv):
@@ -332,13 +340,13 @@ class DecisionEnv(TransformedEnv):
         both = self._problem.step_and_restart(tensordict) if tracker.option_actions is None else None
         if both is None:
             return super()._step_and_maybe_reset(tensordict)
-        after, root = both
-        after = tracker._step(tensordict, after)
-        leaves = {**dict(root.items()), **tracker.restarted(root, after)}
+        after, root = (dict(each.items()) for each in both)
+        after |= tracker.tracked(tensordict, both[0])
+        root |= tracker.restarted(root, after)
         # As in TorchRL, the root keeps what the policy wrote, with zeros where an episode begins.
-        kept = {name: leaf for name, leaf in tensordict.items() if name not in leaves}
-        leaves |= _zeroed(kept, after.get(keys.DONE))
-        return tensordict.set("next", after), _unchecked(leaves, root)
+        kept = {name: leaf for name, leaf in tensordict.items() if name not in root}
+        root |= _zeroed(kept, after[keys.DONE])
+        return tensordict.set("next", unchecked(after, tensordict)), unchecked(root, tensordict)
 
     @property
     def _problem(self) -> PAMDPEnv:

@@ -36,6 +36,7 @@ from hpamdp.messages import as_code, warn
 from hpamdp.observation_entries import observation_dtype
 from hpamdp.pickling import why_unsendable
 from hpamdp.settings import SettingError, Settings
+from hpamdp.unchecked import unchecked
 
 _CPU = torch.device("cpu")
 _SUCCESS = "success"
@@ -453,9 +454,9 @@ class GymnasiumEnv(PAMDPEnv):
         if "_step" in tensordict.keys():
             return None
         after = self._step(tensordict)
-        done = after.get(keys.DONE)
-        root = self._reset(TensorDict({"_reset": done}, self.batch_size)) if done.any() else after.exclude(keys.REWARD)
-        return after, root
+        if self._is_over.any():
+            return after, self._reset(unchecked({"_reset": after.get(keys.DONE)}, self))
+        return after, unchecked({name: leaf for name, leaf in after.items() if name != keys.REWARD}, self)
 
     def _in_float32(self, rewards: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):
@@ -540,8 +541,7 @@ class GymnasiumEnv(PAMDPEnv):
         device = self.device
         if device is not None and device != _CPU:
             leaves = {name: leaf.to(device) for name, leaf in leaves.items()}
-        # Every leaf has its final shape and device. TensorDict's own check of that takes several times as long.
-        td = TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=device)
+        td = unchecked(leaves, self)
         return self.check_masks(td) if results.masks else td
 
 

@@ -21,6 +21,7 @@ from hpamdp.policies.shared.options import GreedyParameters, InitialParameters
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
+from hpamdp.unchecked import unchecked
 
 # The raw sample of the parameters, before clipping, which a learner needs for its likelihood.
 RAW = "raw_parameters"
@@ -225,7 +226,7 @@ class HybridPolicy(TensorDictModuleBase):
         if self.writes_raw:
             td.set(RAW, raw)
         parameters = self.specs.from_unit(self.bound(raw), td)
-        return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
+        return td.set(keys.ACTION, unchecked({"discrete": discrete, "parameters": parameters}, td))
 
 
 def make_small(head: nn.Linear) -> None:

@@ -109,7 +109,8 @@ class Perception(nn.Module):
     def see(self, td: TensorDictBase) -> Tensor:
         """Return the features `[*B, specs.observation_dim]` of a step, and write the memory's new state into it."""
         features, states = self.features_and_memory(td)
-        td.update(states)
+        for name, state in states.items():
+            td.set(name, state)
         return features
 
     def features_and_memory(self, td: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
