@@ -27,17 +27,12 @@ def gain(
     problem: type[OwnProblem], values: RegularGridInterpolator, time: int, state: tuple, choice: int, amount: np.ndarray
 ) -> np.ndarray:
     """Return the expected reward and value after an action in many states."""
-    total = np.zeros(np.broadcast(*state, amount).shape)
+    total = np.zeros(())
     for event in problem.events:
         (first, second), reward, is_over = problem.rules(time, state, choice, amount, event)
         after = values(np.stack(np.broadcast_arrays(first, second), -1))
-        total += reward + np.where(is_over, 0.0, after)
+        total = total + reward + np.where(is_over, 0.0, after)
     return total / len(problem.events)
-
-
-def amounts_of(limit: float, num: int) -> np.ndarray:
-    """Return amounts from 0 to the limit; 0 alone if the choice takes none."""
-    return np.linspace(0.0, limit, num) if limit else np.zeros(1)
 
 
 def solve(problem: type[OwnProblem]) -> list[RegularGridInterpolator]:
@@ -48,8 +43,8 @@ def solve(problem: type[OwnProblem]) -> list[RegularGridInterpolator]:
         following = RegularGridInterpolator(problem.grid, tables[-1], bounds_error=False, fill_value=None)
         asked = tuple(each[..., None] for each in states)
         gains = [
-            gain(problem, following, time, asked, choice, amounts_of(limit, COARSE)).max(-1)
-            for choice, limit in enumerate(problem.limits)
+            gain(problem, following, time, asked, choice, problem.amounts(choice, COARSE)).max(-1)
+            for choice in range(len(problem.limits))
         ]
         tables.append(np.max(gains, 0))
     return [RegularGridInterpolator(problem.grid, each, bounds_error=False, fill_value=None) for each in tables[::-1]]
@@ -65,15 +60,15 @@ def best_returns(problem: type[OwnProblem], values: list[RegularGridInterpolator
     returns, is_running = np.zeros(len(envs)), np.ones(len(envs), bool)
     for time in range(problem.steps):
         chosen = []
-        for choice, limit in enumerate(problem.limits):
-            amounts = amounts_of(limit, FINE)
+        for choice in range(len(problem.limits)):
+            amounts = problem.amounts(choice, FINE)
             gains = gain(problem, values[time + 1], time, (first[:, None], second[:, None]), choice, amounts)
-            chosen.append((gains.max(-1), amounts[gains.argmax(-1)]))
+            chosen.append((gains.max(-1), amounts[..., gains.argmax(-1)]))
         choices = np.argmax([gains for gains, _ in chosen], 0)
         for row in np.flatnonzero(is_running):
             env, choice = envs[row], int(choices[row])
             event = env.events[env.np_random.integers(len(env.events))]
-            amount = float(chosen[choice][1][row])
+            amount = chosen[choice][1][..., row]
             env.state, reward, is_over = env.rules(time, env.state, choice, amount, event)
             returns[row] += reward
             is_running[row] = not is_over

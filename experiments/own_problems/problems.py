@@ -1,4 +1,4 @@
-"""Seven problems of the kinds that people have at work, as Gymnasium environments in plain Python.
+"""Ten problems of the kinds that people have at work, as Gymnasium environments in plain Python.
 
 Each action is a choice together with a number: which supplier and how much, which mode and which power. Rewards and
 observations have their natural units. `optimum.py` computes the best return of each by dynamic programming.
@@ -38,7 +38,13 @@ class OwnProblem(gymnasium.Env):
     def __init__(self) -> None:
         self.action_space: Space = Tuple((Discrete(len(self.limits)), Box(0.0, 1.0, (1,))))
         self.time = 0
+        self.earned = 0.0  # in the last step
         self.state: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def amounts(cls, choice: int, num: int) -> np.ndarray:
+        """Return amounts of a choice `[M]` for the dynamic programme: `num` from 0 to its limit, or 0 alone."""
+        return np.linspace(0.0, cls.limits[choice], num) if cls.limits[choice] else np.zeros(1)
 
     @classmethod
     def start(cls, rng: np.random.Generator) -> tuple[float, float]:
@@ -72,7 +78,7 @@ class OwnProblem(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
         super().reset(seed=seed)
-        self.time = 0
+        self.time, self.earned = 0, 0.0
         self.state = self.start(self.np_random)
         return self.observe(), {}
 
@@ -80,8 +86,8 @@ class OwnProblem(gymnasium.Env):
         """Take a step."""
         event = self.events[self.np_random.integers(len(self.events))]
         self.state, reward, is_over = self.rules(self.time, self.state, *self.read(action), event)
-        self.time += 1
-        return self.observe(), float(reward), bool(is_over), self.time >= self.steps, {}
+        self.time, self.earned = self.time + 1, float(reward)
+        return self.observe(), self.earned, bool(is_over), self.time >= self.steps, {}
 
 
 class Battery(OwnProblem):
@@ -382,6 +388,141 @@ class Pricing(OwnProblem):
         return (stock, np.clip(0.95 * attention + 0.01 * spent + drift, 0.0, 4.0)), reward, stock <= 0.0
 
 
+class Machine(OwnProblem):
+    """A machine that wears unseen: produce at a speed, or repair it. What a step earned tells whether it made scrap.
+
+    State: probability that it is worn, given all that was seen, and the price in EUR. Only the price is observed,
+    beside the last speed, what the last step earned, and the time; so an agent needs a memory. Drawing scrap with this
+    probability gives the same observations and rewards as drawing the wear itself. Reward: EUR.
+    """
+
+    steps = 100
+    events = tuple((drift, (k + 0.5) / 16) for drift in (-0.1, 0.1) for k in range(16))
+    grid = (np.linspace(0.0, 1.0, 41), np.linspace(0.5, 1.5, 9))
+    limits = (1.0, 0.0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = Box(-100.0, 100.0, (4,))
+        self.speed = 0.0
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return a machine that was repaired, and a price."""
+        return 0.0, float(rng.uniform(0.5, 1.5))
+
+    @classmethod
+    def rules(cls, time, state, choice, amount, event):
+        """Return what is sold, or the cost of scrap or of a repair; speed wears the machine out."""
+        worn, price = state
+        drift, draw = event
+        if choice == 1:
+            worn, reward = 0.0 * worn, -6.0 + 0.0 * worn
+        else:
+            scrap = 0.05 + 0.55 * worn
+            is_scrap = draw < scrap
+            worn = np.where(is_scrap, 0.6 * worn / scrap, 0.4 * worn / (1.0 - scrap))
+            worn = worn + (1.0 - worn) * (0.02 + 0.08 * amount**2)
+            reward = np.where(is_scrap, -5.0 * amount, 10.0 * price * amount)
+        return (worn, np.clip(price + drift, 0.5, 1.5)), reward, False
+
+    def read(self, action: Any) -> tuple[int, float]:
+        """Return the choice and its speed, which is observed afterwards."""
+        choice, self.speed = super().read(action)
+        return choice, self.speed
+
+    def observe(self) -> np.ndarray:
+        """Return the last speed, what the last step earned, the price and the time."""
+        return np.array([self.speed if self.time else 0.0, self.earned, self.state[1], self.time], np.float32)
+
+
+class Greenhouse(OwnProblem):
+    """A greenhouse for a day of quarter hours: heating and window, each off or on with a power or an opening.
+
+    State: temperature in degrees, humidity in percent. An action has two components. Reward: EUR.
+    """
+
+    steps = 96
+    events = tuple((cloud, draught) for cloud in (0.5, 1.0) for draught in (-2.0, 2.0))
+    grid = (np.linspace(0.0, 45.0, 31), np.linspace(20.0, 100.0, 17))
+    limits = (0.0, 1.0, 1.0, 1.0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.action_space = Dict(
+            heating=Tuple((Discrete(2), Box(0.0, 1.0, (1,)))), window=Tuple((Discrete(2), Box(0.0, 1.0, (1,))))
+        )
+        self.observation_space = Box(-100.0, 100.0, (3,))
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return a cool and humid greenhouse."""
+        return float(rng.uniform(10.0, 18.0)), float(rng.uniform(60.0, 95.0))
+
+    @classmethod
+    def amounts(cls, choice: int, num: int) -> np.ndarray:
+        """Return pairs of a power and an opening `[2, M]`."""
+        heats, openings = ((super(Greenhouse, cls).amounts(is_on, num)) for is_on in (choice % 2, choice // 2))
+        return np.stack([each.reshape(-1) for each in np.meshgrid(heats, openings)])
+
+    @classmethod
+    def rules(cls, time, state, choice, amount, event):
+        """Return growth less the cost of heat; `choice` counts heating on as 1 and the window open as 2."""
+        temperature, humidity = state
+        cloud, draught = event
+        heat, opening = amount
+        heat, opening = heat * float(choice % 2), opening * float(choice // 2)
+        sun = max(0.0, math.sin(math.pi * (time - 24) / 48))
+        outside = 8.0 + 8.0 * sun + draught
+        growth = np.exp(-(((temperature - 23.0) / 5.0) ** 2)) * np.clip((100.0 - humidity) / 15.0, 0.0, 1.0)
+        reward = (0.3 + sun) * growth - 0.25 * heat - (0.02 if choice // 2 else 0.0)
+        warmed = temperature + 2.5 * heat + 2.0 * cloud * sun - (0.04 + 0.25 * opening) * (temperature - outside)
+        dried = humidity + 0.12 * temperature - 1.5 * heat - (0.01 + 0.3 * opening) * (humidity - 45.0)
+        return (np.clip(warmed, 0.0, 45.0), np.clip(dried, 20.0, 100.0)), reward, False
+
+    def read(self, action: Any) -> tuple[int, Any]:
+        """Return which of the two are on, and the pair of power and opening."""
+        (is_on, heat), (is_open, opening) = action["heating"], action["window"]
+        return int(is_on) + 2 * int(is_open), (float(heat[0]), float(opening[0]))
+
+
+class Picking(OwnProblem):
+    """Twenty things on a belt, each seen in a picture: leave it, or pick it by sucker or gripper, and at which place.
+
+    State: place and size of the thing. The sucker holds large things and the gripper small ones. Reward: things.
+    """
+
+    steps = 20
+    events = tuple(((k * 0.618034) % 1.0, (k + 0.5) / 64) for k in range(64))
+    grid = (np.linspace(0.0, 1.0, 41), np.linspace(0.0, 1.0, 41))
+    limits = (0.0, 1.0, 1.0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = Box(0, 255, (36, 36, 1), np.uint8)
+
+    @classmethod
+    def start(cls, rng: np.random.Generator) -> tuple[float, float]:
+        """Return the first thing."""
+        return float(rng.uniform()), float(rng.uniform())
+
+    @classmethod
+    def rules(cls, time, state, choice, amount, event):
+        """Return how well the thing is held, less the cost of trying, and the next thing."""
+        place, size = state
+        fits = (size > 0.5) if choice == 1 else (size <= 0.5)
+        held = np.where(fits, np.maximum(0.0, 1.0 - ((amount - place) / 0.25) ** 2), 0.0)
+        reward = held - 0.3 if choice else 0.0 * place
+        return event, reward, False
+
+    def observe(self) -> np.ndarray:
+        """Return the picture: a bright disc on a dark belt."""
+        place, size = self.state
+        across = (np.arange(36.0) - 4.0 - 28.0 * place) ** 2
+        disc = across + (np.arange(36.0)[:, None] - 18.0) ** 2 < (2.0 + 6.0 * size) ** 2
+        return (disc * 255).astype(np.uint8)[..., None]
+
+
 TUNED: dict[str, type[OwnProblem]] = {
     "battery": Battery,
     "inventory": Inventory,
@@ -389,7 +530,13 @@ TUNED: dict[str, type[OwnProblem]] = {
     "irrigation": Irrigation,
     "vehicle": Vehicle,
 }
-HELD: dict[str, type[OwnProblem]] = {"queue": Queue, "pricing": Pricing}
+HELD: dict[str, type[OwnProblem]] = {
+    "queue": Queue,
+    "pricing": Pricing,
+    "machine": Machine,
+    "greenhouse": Greenhouse,
+    "picking": Picking,
+}
 PROBLEMS = TUNED | HELD
 EPISODES = 64
 EPISODE_SEEDS = tuple(range(900_000, 900_000 + EPISODES))  # of the fixed episodes on which all players are scored

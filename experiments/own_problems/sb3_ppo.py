@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, flatten, flatten_space
+from gymnasium.spaces import Box, Dict, flatten, flatten_space
 from problems import EPISODE_SEEDS, PROBLEMS
 from protocol import Clock
 from stable_baselines3 import PPO
@@ -38,35 +39,70 @@ class EndsAtLimit(gymnasium.Wrapper):
         return observation, reward, terminated or truncated, False, info
 
 
-class Flat(gymnasium.Wrapper):
-    """Flattens observations, and takes scores of the choices beside numbers from -1 to 1, as SB3 advises."""
+class Part(NamedTuple):
+    """One choice with its numbers.
 
-    def __init__(self, env: gymnasium.Env) -> None:
-        super().__init__(env)
-        space = env.action_space
-        choice, numbers = (space["mode"], space["power"]) if "mode" in getattr(space, "spaces", ()) else space.spaces
-        self.num_choices = int(choice.n)
-        self.boxes = numbers.spaces if hasattr(numbers, "spaces") else [numbers]
-        self.is_shared = numbers is self.boxes[0]
-        num_numbers = sum(box.shape[0] for box in self.boxes)
-        self.action_space = Box(-1.0, 1.0, (self.num_choices + num_numbers,), np.float32)
-        self.observation_space = flatten_space(env.observation_space)
+    Attributes:
+        num_choices: how many there are to choose from.
+        boxes: of the numbers.
+        is_shared: whether all choices share one Box.
+    """
 
-    def reset(self, **given):
-        observation, info = self.env.reset(**given)
-        return flatten(self.env.observation_space, observation), info
+    num_choices: int
+    boxes: list[Box]
+    is_shared: bool
 
-    def step(self, action):
-        choice = int(np.argmax(action[: self.num_choices]))
+    @classmethod
+    def of(cls, space: gymnasium.Space) -> Part:
+        """Return the part that a Tuple or a Dict of a choice and of numbers makes."""
+        choice, numbers = (space["mode"], space["power"]) if isinstance(space, Dict) else space.spaces
+        is_shared = not hasattr(numbers, "spaces")
+        return cls(int(choice.n), [numbers] if is_shared else list(numbers.spaces), is_shared)
+
+    @property
+    def size(self) -> int:
+        """How many numbers an action has."""
+        return self.num_choices + sum(box.shape[0] for box in self.boxes)
+
+    def read(self, action: np.ndarray) -> tuple[int, Any]:
+        """Return the choice and its numbers."""
         numbers, start = [], self.num_choices
         for box in self.boxes:
             end = start + box.shape[0]
             numbers.append(box.low + 0.5 * (action[start:end] + 1.0) * (box.high - box.low))
             start = end
-        amount = numbers[0] if self.is_shared else tuple(numbers)
-        is_dict = isinstance(self.env.action_space, gymnasium.spaces.Dict)
-        observation, *others = self.env.step({"mode": choice, "power": amount} if is_dict else (choice, amount))
-        return flatten(self.env.observation_space, observation), *others
+        return int(np.argmax(action[: self.num_choices])), numbers[0] if self.is_shared else tuple(numbers)
+
+
+class Flat(gymnasium.Wrapper):
+    """Flattens vectors, and takes scores of the choices beside numbers from -1 to 1, as SB3 advises."""
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        space = env.action_space
+        self.names = list(space) if isinstance(space, Dict) and "mode" not in space.spaces else None
+        self.parts = [Part.of(each) for each in ([space] if self.names is None else space.values())]
+        self.action_space = Box(-1.0, 1.0, (sum(part.size for part in self.parts),), np.float32)
+        self.is_picture = len(getattr(env.observation_space, "shape", None) or ()) == 3
+        self.observation_space = env.observation_space if self.is_picture else flatten_space(env.observation_space)
+
+    def seen(self, observation):
+        return observation if self.is_picture else flatten(self.env.observation_space, observation)
+
+    def reset(self, **given):
+        observation, info = self.env.reset(**given)
+        return self.seen(observation), info
+
+    def step(self, action):
+        ends = np.cumsum([part.size for part in self.parts])[:-1]
+        chosen = [part.read(numbers) for part, numbers in zip(self.parts, np.split(action, ends), strict=True)]
+        native = chosen[0]
+        if self.names is not None:
+            native = dict(zip(self.names, chosen, strict=True))
+        elif isinstance(self.env.action_space, Dict):
+            native = {"mode": native[0], "power": native[1]}
+        observation, *others = self.env.step(native)
+        return self.seen(observation), *others
 
 
 class Scorer(BaseCallback):
@@ -106,19 +142,23 @@ class Scorer(BaseCallback):
 def main(problem: str, form: str, seed: int, file: Path, limit: float) -> None:
     """Train and score."""
     settings = {}
+    is_picture = Flat(PROBLEMS[problem]()).is_picture
     if form in ("informed", "same"):
         num_copies = NUM_COPIES if form == "informed" else 16
         copies = DummyVecEnv([lambda: Monitor(EndsAtLimit(Flat(PROBLEMS[problem]())))] * num_copies)
-        env, settings = VecNormalize(copies, gamma=GAMMA), {"gamma": GAMMA, "gae_lambda": GAE_LAMBDA, "n_steps": STEPS}
+        env = VecNormalize(copies, norm_obs=not is_picture, gamma=GAMMA)
+        settings = {"gamma": GAMMA, "gae_lambda": GAE_LAMBDA, "n_steps": STEPS}
         if form == "same":
             settings |= {"n_steps": 64, "batch_size": 128, "n_epochs": 5}
             settings["policy_kwargs"] = {"net_arch": [128, 128], "activation_fn": nn.ReLU}
     else:
         env = DummyVecEnv([lambda: Monitor(Flat(PROBLEMS[problem]()))])
-        env = VecNormalize(env) if form == "normalised" else env
+        if form == "normalised":
+            env = VecNormalize(env, norm_obs=not is_picture)
     name = {"problem": problem, "library": "sb3", "player": f"ppo {form}", "seed": seed, "limit_s": limit}
     scorer = Scorer(name, file, limit)
-    PPO("MlpPolicy", env, seed=seed, device="cpu", **settings).learn(10**9, callback=scorer)
+    model = PPO("CnnPolicy" if is_picture else "MlpPolicy", env, seed=seed, device="cpu", **settings)
+    model.learn(10**9, callback=scorer)
     scorer.end()
 
 
