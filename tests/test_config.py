@@ -273,6 +273,13 @@ def test_a_selector_gets_what_it_needs_on_a_problem():
     assert make_config(["env=rooms", "high=fixed", "recipe/high=boatdock_fixed"]).high.settings["option"] == "congruent"
 
 
+@pytest.mark.parametrize("low", [name.removeprefix("gymnasium_") for name in choices("recipe") if "gymnasium_" in name])
+def test_a_learner_on_an_unknown_problem_gets_scaled_numbers_and_expects_nothing_after_the_limit(low):
+    env = make_config(["env=gymnasium", "env.id=Any-v0", f"low={low}", "high=none"]).env.options
+    assert (env.observation_scaling, env.terminates_at_limit) == ("running", True)
+    assert env.reward_scaling is not None
+
+
 def test_gymnasium_environments_are_evaluated_on_fewer_episodes():
     words = ["env=gymnasium", "env.id=hpamdp/Goal-v0", "high=none"]
     assert make_config(words).run.eval.layouts == 20 < make_config(["env=goal", "high=none"]).run.eval.layouts
