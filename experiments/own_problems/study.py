@@ -32,8 +32,10 @@ HERE = Path(__file__).resolve().parent
 NAME = ("problem", "library", "player", "seed")
 LATENESS = 3.0  # CPU seconds by which a score may follow the time that it stands for
 LEVEL = 0.8  # of the way from random play to the best policy
-TIMES = (15.0, 30.0, 60.0, 120.0)  # columns of the table, CPU seconds
-COLOURS = {"ppo raw": FAINT, "ppo normalised": INK, "ppo informed": "#D55E00"}
+END = 60.0  # CPU seconds of a run
+COLOURS = {"ppo raw": FAINT, "ppo normalised": INK, "ppo informed": "#D55E00", "hppo low.memory=gru": "#009E73"}
+DEFAULT_FORMS = ("ppo raw", "ppo normalised")  # of PPO, with its defaults
+PLAYERS = ("hppo", "pdqn", "hsac", *DEFAULT_FORMS, "ppo informed")
 
 
 def gather(folder: Path, order: Sequence[str]) -> Rows:
@@ -69,21 +71,24 @@ def seconds_text(seconds: float) -> str:
 
 
 def table(curves: Rows, optima: Rows) -> str:
-    """Return a line for each problem and player."""
-    longest = max(row["limit_s"] for row in curves)
-    times = [time for time in TIMES if time <= longest]
-    parts = {row["problem"]: row["part"] for row in optima}
+    """Return a line for each problem: ways at the end, and CPU seconds to LEVEL of H-PPO and of default PPO.
+
+    Where neither default form of PPO gets there, its seconds count as END, so the ratio is a bound.
+    """
     lines = []
-    for (problem, library, player), rows in groups(curves, *NAME[:3]).items():
-        runs = list(groups(rows, "seed").values())
-        cells = [problem, parts[problem], f"{library} {player}", len(runs)]
-        cells += [spread([way_at(run, time) for run in runs], 2) for time in times]
-        cells.append(seconds_text(median([seconds_to(run, LEVEL) for run in runs])))
-        lines.append([*cells, f"{mean_of([run[-1] for run in runs], 'steps'):,.0f}"])
-    after = " | ".join(f"{time:g} s" for time in times)
-    return markdown_table(
-        f"problem | part | player | seeds | {after} | to {LEVEL:g} of the way | steps at the end", lines
-    )
+    for problem, part in [(row["problem"], row["part"]) for row in optima]:
+        runs: dict[str, list[Rows]] = {player: [] for player in PLAYERS}
+        for (player, _), run in groups([row for row in curves if row["problem"] == problem], "player", "seed").items():
+            runs.setdefault(player, []).append(run)
+        ways = {player: [way_at(run, END) for run in runs[player]] for player in PLAYERS}
+        cells = [f"{spread(values, 2)} ({len(values)})" if values else "" for values in ways.values()]
+        seconds = {name: median([seconds_to(run, LEVEL) for run in runs[name]]) for name in ("hppo", *DEFAULT_FORMS)}
+        best = min(seconds[form] for form in DEFAULT_FORMS)
+        bound = "more than " if best == float("inf") else ""
+        ratio = f"{bound}{min(best, END) / seconds['hppo']:.1f}"
+        lines.append([problem, part, *cells, seconds_text(seconds["hppo"]), seconds_text(best), ratio])
+    after = f"to {LEVEL:g}: hppo | PPO's better default form | ratio"
+    return markdown_table(f"problem | part | {' | '.join(PLAYERS)} | {after}", lines)
 
 
 def optima_table(optima: Rows) -> str:
@@ -96,8 +101,8 @@ def draw(curves: Rows, path: Path) -> None:
     """Draw a panel for each problem, with a line for each seed."""
     problems = groups(curves, "problem")
     with rc_context(STYLE):
-        figure = Figure(figsize=(9.2, 5.4), layout="constrained")
-        panels = figure.subplots(2, -(-len(problems) // 2), sharex=True, sharey=True, squeeze=False).ravel()
+        figure = Figure(figsize=(9.2, 7.4), layout="constrained")
+        panels = figure.subplots(3, -(-len(problems) // 3), sharex=True, sharey=True, squeeze=False).ravel()
         for axes, ((problem,), rows) in zip(panels, problems.items(), strict=False):
             for (library, player), of_player in groups(rows, "library", "player").items():
                 colour = COLOURS.get(player) or LEARNER_COLOURS[player]
@@ -112,10 +117,10 @@ def draw(curves: Rows, path: Path) -> None:
             axes.xaxis.set_major_locator(FixedLocator([5, 10, 20, 30, 60, 120]))
             axes.xaxis.set_minor_locator(NullLocator())
             axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        fullest = max(figure.axes, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
         for empty in panels[len(problems) :]:
             empty.set_axis_off()
-        panels[-1].legend(*fullest.get_legend_handles_labels(), frameon=False, fontsize=8, loc="lower right")
+        lines = {line.get_label(): line for axes in panels for line in axes.get_legend_handles_labels()[0]}
+        panels[-1].legend(lines.values(), lines.keys(), frameon=False, fontsize=8, loc="lower right")
         figure.supxlabel("CPU seconds since the start of the program")
         figure.supylabel("way from random play to the best policy")
         figure.savefig(path)

@@ -36,6 +36,8 @@ PLAYERS: dict[str, tuple[dict[str, Any], tuple[float, ...], int]] = {
         {"env": "boatdock", "high": "value", "low": "pets", "eval.every": 32}, (PEOPLE, WHOLE_GOAL), 1_024
     ),
     "platform, hppo": ({"env": "platform", "low": "hppo", "eval.every": 4_000}, (0.997,), 400_000),
+    "goal, pdqn": ({"env": "goal", "low": "pdqn", "eval.every": 10_000}, (0.809,), 400_000),
+    "catch_point, pets": ({"env": "catch_point", "low": "pets", "eval.every": 250}, (0.938,), 4_000),
     "hard_move, hppo": ({"env": "hard_move", "low": "hppo", "eval.every": 20_000}, (0.942,), 1_000_000),
 }  # fmt: skip
 
@@ -77,7 +79,7 @@ def train(player: str, seed: int) -> Rows:
     """Train until the scores are reached; return a row for each, with the largest number of steps if it is not."""
     settings, goals, most = PLAYERS[player]
     problem = settings["env"]
-    crossings = Crossings(goals, "eval/success" if problem == "hard_move" else "eval/score")
+    crossings = Crossings(goals, "eval/score" if problem in ("boatdock", "platform") else "eval/success")
     given = {"high": None, **settings, "total_frames": most, "eval.layouts": 250}
     hpamdp.train(given.pop("env"), seed=seed, progress=False, film=False, callbacks=[crossings], **given)
     shared = {"player": player, "seed": seed, "start_s": round(crossings.start_s, 1)}
