@@ -22,6 +22,7 @@ from torchrl.collectors import Collector
 from toy_environments import Toy
 
 import hpamdp
+from hpamdp.config.command_line import usual_learner
 from hpamdp.env.errors import ProblemError
 from hpamdp.run_files import CHECKPOINT_NAME, METRICS_NAME
 
@@ -89,6 +90,18 @@ def test_a_two_level_agent_holds_its_option_for_an_episode_in_gymnasium(boat_age
         assert len(options) == 1
         scores.append(info["score"])
     assert np.mean(scores) > 3.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "low"), [({}, "hppo"), ({"low": "random"}, "random"), ({"resume": "auto", "folder": "run"}, "hppo")]
+)
+def test_hppo_learns_problems_that_nobody_knows_unless_a_learner_is_chosen(settings, low, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    agent = hpamdp.train(Reach, **{**TINY, "env.max_steps": 5, **settings})
+    assert f"low={low}," in repr(agent)
+    assert usual_learner({"env": "rddl"}) == ["low=hppo"]
+    for chosen in ({"env": "boatdock"}, {"env": "rddl", "checkpoint": "run"}, {"env": "gymnasium", "mode": "offline"}):
+        assert usual_learner(chosen) == []
 
 
 def test_an_own_environment_object_is_trained_in_a_cell_and_stays_as_it_is():

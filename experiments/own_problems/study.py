@@ -19,7 +19,6 @@ from experiments.study_tables import (
     first_at,
     groups,
     markdown_table,
-    mean_of,
     read_csv,
     refuse_repeats,
     write_tables,

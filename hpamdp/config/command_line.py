@@ -30,6 +30,9 @@ GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
 SEARCH_PATH = "hydra.searchpath"
 # The folder of conf/ with what `hpamdp tune` searches for each learner.
 SEARCH = "search"
+# Problems that others write, for which H-PPO has recipes, and settings that choose a learner.
+_UNKNOWN_PROBLEMS = ("gymnasium", "rddl")
+_CHOOSE_LEARNER = {"low", "experiment", "checkpoint", "mode"}
 # Flags of Hydra, with their short forms and their arguments for argparse.
 _SWITCH: dict[str, Any] = {"action": "store_true"}
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -241,6 +244,16 @@ def saved_run(line: CommandLine) -> tuple[str, str] | None:
         return None  # the command line alone describes the run
     is_refused = where == "checkpoint" and values.get("mode") != "eval"
     return None if is_refused else (source, where)
+
+
+def usual_learner(given: Mapping[str, Any]) -> list[str]:
+    """Return the word for H-PPO where settings choose a problem that nobody knows, and neither a learner nor a run.
+
+    Args:
+        given: settings by name.
+    """
+    is_chosen = not _CHOOSE_LEARNER.isdisjoint(given) or given.get("resume") not in (None, RESUME_AUTO)
+    return [] if is_chosen or given.get("env") not in _UNKNOWN_PROBLEMS else ["low=hppo"]
 
 
 def completed(line: CommandLine, conf: Path) -> CommandLine:
