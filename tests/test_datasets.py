@@ -5,13 +5,15 @@ import json
 
 import pytest
 import torch
-from conftest import compose_config
+from conftest import compose_config, make_config
 
 from hpamdp import keys
 from hpamdp.commands import datasets
+from hpamdp.commands.judge import judged
 from hpamdp.config.errors import ConfigError
 from hpamdp.data import DataError, minari
 from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
 
 library = pytest.importorskip("minari")
@@ -64,6 +66,21 @@ def test_a_run_learns_from_a_data_set_of_minari(folder, tmp_path):
     words = [*WORDS, "data.dataset=hpamdp/platform/mixed-v0"]
     assert run(compose_config(words), tmp_path / "run", words) == 0
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"] == 20
+
+
+def test_held_out_episodes_judge_what_has_not_learned_from_them(folder, tmp_path):
+    datasets.make("platform", "mixed")
+    words = [*WORDS, "data.dataset=hpamdp/platform/mixed-v0", "data.held_out=0.4"]
+    data = assemble(make_config(words)).data
+    kept, held_out = (batch["collector", "traj_ids"].unique().tolist() for batch in (data.batch, data.held_out))
+    assert held_out == [2, 4, 7, 9] and kept == [0, 1, 3, 5, 6, 8]
+    assert run(compose_config(words), tmp_path / "run", words) == 0
+    given = ["data=minari", words[-2], "offline.updates=5", "low.batch_size=16"]
+    for more, is_doubted in ([], False), (["data.held_out=0.4"], False), (["data.held_out=0.5"], True):
+        row = judged([str(tmp_path / "run")], given + more, episodes=4)[0]
+        assert any("may have learned" in doubt for doubt in row["doubts"]) == is_doubted
+    with pytest.raises(ConfigError, match=r"data.held_out=0.05: is less than one of 10 episodes"):
+        assemble(make_config([*words[:-1], "data.held_out=0.05"]))
 
 
 def with_nan(group):

@@ -359,6 +359,16 @@ def test_behaviour_cloning_finds_the_mean_parameter_of_the_data():
     assert parameter == pytest.approx(0.55, abs=0.05)
 
 
+def test_held_out_losses_are_those_of_all_parameters_of_an_action():
+    specs = PAMDPSpecs(1, (), (2, 1), (0.0, 0.0, 0.0), (2.0, 2.0, 2.0))
+    learner, batch = BC(specs, hidden_dims=[8]), one_step_batch(20)
+    found = learner.held_out_losses(batch, torch.ones(batch.shape, dtype=torch.bool))
+    rows = batch[0]
+    unit = specs.to_unit(rows["action", "parameters"], rows)
+    sample = TensorDict({"state": rows["observation"], "discrete": rows["action", "discrete"], "unit": unit}, [20])
+    assert found["held_out_loss"] == pytest.approx(learner.loss(sample, None)[0].item())
+
+
 @pytest.mark.parametrize(("num_updates", "fraction"), [(1, 1.0), (6, 0.5), (12, 0.0)])
 def test_the_policys_learning_rate_of_iql_falls_along_a_cosine_if_told_so(num_updates, fraction):
     learner = IQL(SPECS, **{**IQL_OPTIONS, "actor_lr_updates": 10})

@@ -101,7 +101,7 @@ def test_a_space_has_the_grammar_of_sweeps_or_lists():
         ({"low": "hpo"}, r"low=hpo: no such search space; did you mean hppo\?"),
         ({"trials": 0}, "trials=0: must be a whole number of at least 1"),
         ({"callbacks": []}, "^callbacks: trials have none of their own; leave it out$"),
-        ({"objective": "data", "data": "human"}, r"^objective=data: data.held_out must name the people whose"),
+        ({"objective": "data", "data": "human"}, r"^objective=data: data.held_out must say which transitions judge"),
         ({"objective": "loss"}, "^objective=loss: must be 'score' or 'data'$"),
     ],
 )

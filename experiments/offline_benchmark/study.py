@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy import stats
 
 import hpamdp
 from experiments.study_tables import Rows, groups, markdown_table, read_csv, write_tables
@@ -37,6 +38,20 @@ ACTOR_CRITIC: dict[str, dict[str, Any]] = {
 }
 MORE: dict[tuple[str, str], dict[str, Any]] = {("iql", "goal"): {"low.expectile": 0.9}}
 OTHERS: dict[str, dict[str, Any]] = {"bc": {"offline.updates": 1500}, "pets": {"offline.updates": 4000}}
+# Candidates of the judge, the same for every domain.
+DEFAULT = {"offline.updates": 5000}
+SCALED = {"offline.updates": 3000, "low.gamma": 0.95, "low.reward_scale": 0.1, "low.augment": "auto"}
+CANDIDATES: dict[str, dict[str, dict[str, Any]]] = {
+    "iql": {
+        "default": DEFAULT,
+        "scaled": SCALED,
+        "expectile": {**SCALED, "low.expectile": 0.9},
+        "temperature": {**SCALED, "low.temperature": 3.0},
+    },
+    "td3_bc": {"default": DEFAULT, "scaled": SCALED, "weight": {**SCALED, "low.behaviour_weight": 0.4}},
+    "bc": {"short": OTHERS["bc"], "default": DEFAULT},
+    "pets": {"plain": OTHERS["pets"], "cautious": {**OTHERS["pets"], "low.caution": 1.0}},
+}
 
 
 def main(words: Sequence[str]) -> int:
@@ -45,14 +60,11 @@ def main(words: Sequence[str]) -> int:
         write_tables(HERE, {"data_sets": [described(*name.split("/")[1:]) for name in datasets.names()]})
     elif words[:1] == ["run"]:
         low, domain, *seeds = words[1:]
-        rows = read_csv(HERE / "results.csv") if (HERE / "results.csv").exists() else []
-        for seed in seeds:
-            rows.append(scored(low, domain, int(seed)))
-            write_tables(HERE, {"results": rows})
+        add_rows(low, domain, map(int, seeds), settings_of(low, domain), "simulator")
     else:
-        data, rows = read_csv(HERE / "data_sets.csv"), read_csv(HERE / "results.csv")
+        data, rows, judged = (read_csv(HERE / f"{name}.csv") for name in ("data_sets", "results", "judge"))
         draw(data)
-        print(f"{results_table(rows)}\n\n{data_table(data)}")
+        print("\n\n".join([results_table(rows, judged), judge_table(judged), data_table(data)]))
     return 0
 
 
@@ -76,29 +88,60 @@ def described(domain: str, name: str) -> dict[str, Any]:
     }
 
 
-def scored(low: str, domain: str, seed: int) -> dict[str, Any]:
-    """Train a learner on the `mixed` data set of a domain and return its row."""
-    name = f"hpamdp/{domain}/mixed-v0"
-    settings = {**(OTHERS.get(low) or ACTOR_CRITIC[domain]), **MORE.get((low, domain), {})}
+def settings_of(low: str, domain: str) -> dict[str, Any]:
+    """Return the settings of a learner that were chosen with the simulator."""
+    return {**(OTHERS.get(low) or ACTOR_CRITIC[domain]), **MORE.get((low, domain), {})}
+
+
+def candidates(low: str, domain: str) -> dict[str, dict[str, Any]]:
+    """Return the settings of the candidates by their names; `tuned`, unless it repeats others, is the simulator's."""
+    named, tuned = CANDIDATES[low], settings_of(low, domain)
+    return named if tuned in named.values() else {**named, "tuned": tuned}
+
+
+def add_rows(low: str, domain: str, seeds: Iterable[int], settings: Mapping[str, Any], chosen_by: str) -> None:
+    """Score settings with each seed, and add the rows to results.csv."""
+    for seed in seeds:
+        row = {"data_set": f"hpamdp/{domain}/mixed-v0", "learner": low, "chosen_by": chosen_by, "seed": seed}
+        row |= scored(low, domain, settings, seed=seed, eval_seed=seed)
+        write_tables(HERE, {"results": [*read_csv(HERE / "results.csv"), row]})
+
+
+def scored(
+    low: str, domain: str, settings: Mapping[str, Any], *, seed: int, eval_seed: int, **more: Any
+) -> dict[str, Any]:
+    """Train a learner on the `mixed` data set of a domain and return its figures.
+
+    Args:
+        low: the learner.
+        domain: the domain.
+        settings: of the learner and of the run.
+        seed: of the training.
+        eval_seed: of the episodes.
+        more: further arguments of `hpamdp.train`.
+    """
     began = time.process_time()
     agent = hpamdp.train(
         domain.removesuffix("_4"),
         mode="offline",
         high=None,
         low=low,
-        data={"name": "minari", "dataset": name},
         seed=seed,
         progress=False,
         film=False,
-        **{"offline.eval_every": 0, "eval.layouts": 1, **settings},
+        **{
+            "data": "minari",
+            "data.dataset": f"hpamdp/{domain}/mixed-v0",
+            "offline.eval_every": 0,
+            "eval.layouts": 1,
+            **settings,
+            **more,
+        },
     )
     seconds = time.process_time() - began
     num = 300 if low == "pets" else 1000
-    figures = agent.evaluate(episodes=num, seed=seed)
+    figures = agent.evaluate(episodes=num, seed=eval_seed)
     return {
-        "data_set": name,
-        "learner": low,
-        "seed": seed,
         "updates": settings["offline.updates"],
         "score": round(figures["score"], 4),
         "success": round(figures["success"], 4),
@@ -114,29 +157,55 @@ def normalised(row: dict[str, Any]) -> float:
     return (row["score"] - low) / (high - low)
 
 
-def results_table(rows: Rows) -> str:
-    """Return normalised scores, a line for each data set and learner, the best learner first."""
+def results_table(rows: Rows, judged: Rows) -> str:
+    """Return normalised scores, two lines for each domain: with settings by the simulator, and by the judge."""
     lines = []
-    for (name, low), runs in groups(rows, "data_set", "learner").items():
-        scores = [normalised(row) for row in runs]
-        lines.append((name, -np.mean(scores), low, runs, scores))
-    lines.sort(key=lambda line: line[:2])
-    return markdown_table(
-        "data set | learner | normalised score | score | success | updates | seeds | CPU",
-        [
-            (
-                name,
-                low,
-                spread(scores),
-                spread([row["score"] for row in runs]),
-                f"{np.mean([row['success'] for row in runs]):.1%}",
-                f"{runs[0]['updates']:,}",
-                len(runs),
-                f"{np.mean([row['cpu_s'] for row in runs]):.0f} s",
-            )
-            for name, _, low, runs, scores in lines
-        ],
-    )
+    for domain in DOMAINS:
+        for chosen_by in ("simulator", "judge"):
+            cells = (result(low, domain, chosen_by, rows, judged) for low in CANDIDATES)
+            lines.append((domain, chosen_by, *cells))
+    return markdown_table(f"domain | settings by | {' | '.join(CANDIDATES)}", lines)
+
+
+def result(low: str, domain: str, chosen_by: str, rows: Rows, judged: Rows) -> str:
+    """Return the normalised scores of a learner in words, with the number of seeds unless it is ten."""
+    same = {"data_set": f"hpamdp/{domain}/mixed-v0", "learner": low, "chosen_by": chosen_by}
+    scores = [normalised(row) for row in rows if same.items() <= row.items()]
+    if scores:
+        return f"{spread(scores)}{'' if len(scores) == 10 else f' ({len(scores)})'}"
+    name = chosen_of([row for row in judged if (row["domain"], row["learner"]) == (domain, low)])["settings"]
+    return "the same" if candidates(low, domain)[name] == settings_of(low, domain) else "not run"
+
+
+def chosen_of(judged: Rows) -> dict[str, Any]:
+    """Return the candidate that the judge chooses, without a look at those that the simulator chose."""
+    return max((row for row in judged if row["settings"] != "tuned"), key=lambda row: row["judged"])
+
+
+def judge_table(judged: Rows) -> str:
+    """Return what the judge chooses in each domain, and what its choices lose, among all and one learner's."""
+    lines = []
+    for (domain,), rows in groups(judged, "domain").items():
+        scores = [score_of(row) for row in rows]
+        correlation = stats.spearmanr(scores, [row["judged"] for row in rows]).statistic
+        best, chosen = max(rows, key=score_of), chosen_of(rows)
+        regrets = {low: regret([row for row in rows if row["learner"] == low]) for low in CANDIDATES}
+        worst = max(regrets, key=lambda low: regrets[low])
+        names = (f"{each['learner']} {each['settings']}, {score_of(each):.3f}" for each in (chosen, best))
+        most = f"{regrets[worst]:.3f} ({worst})"
+        lines.append((domain, *names, f"{correlation:.2f}", f"{regret(rows):.3f}", most))
+    head = "domain | the judge's choice | best | rank correlation | regret | largest of one learner"
+    return markdown_table(head, lines)
+
+
+def regret(judged: Rows) -> float:
+    """Return what the judge's choice loses to the best candidate."""
+    return max(map(score_of, judged)) - score_of(chosen_of(judged))
+
+
+def score_of(row: dict[str, Any]) -> float:
+    """Return the normalised score of a candidate."""
+    return normalised({"data_set": f"hpamdp/{row['domain']}/mixed-v0", **row})
 
 
 def data_table(data: Rows) -> str:

@@ -18,7 +18,7 @@ def judge(
 
     Args:
         agents: folders of runs, or names of agents that come with the package, all of one problem.
-        data: the data set, such as `human`. If the agents' runs hold out the same people, their transitions are taken.
+        data: the data set, such as `human`. If the agents' runs hold out the same transitions, these are taken.
         episodes: recorded episodes from whose first transitions the agents act.
         compare: whether to estimate the returns by two other methods, too; the order stays that of the roll-outs.
         settings: further settings of `mode=offline low=pets`, such as `**{"data.held_out": [3, 4]}`.

@@ -38,7 +38,7 @@ Words with several values are the space, all others are fixed. The same command 
 
   hpamdp tune mode=offline data=human data.held_out=[0,3,6,9] high=linucb low=iql --objective data
 
-chooses by the transitions of held-out people, as `hpamdp judge` does, and not by the environment.
+chooses by held-out transitions, as `hpamdp judge` does, and not by the environment.
 """
 Objective = Literal["score", "data"]
 TRIALS_NAME = "trials.log"
@@ -119,7 +119,7 @@ def tune(
         folder: keeps the trials, in a journal of Optuna. If it holds some already, the search goes on. Several
             processes may search in one folder at the same time. If None, nothing is written.
         objective: `score`, that of the evaluation at the end; or `data`, the return that `hpamdp.judge` predicts from
-            the transitions of the people in `data.held_out`, without the environment. Then no trial is pruned.
+            the transitions that `data.held_out` keeps apart, without the environment. Then no trial is pruned.
         seed: of the search.
         progress: whether to print a line for each trial, and the best settings at the end.
         settings: those of all trials, as for `train`.
@@ -156,7 +156,7 @@ class _Objective:
         if self.by not in get_args(Objective):
             raise ConfigError(f"objective={self.by}: must be 'score' or 'data'")
         if self.by == "data" and not self.fixed.get("data.held_out"):
-            raise ConfigError("objective=data: data.held_out must name the people whose transitions judge")
+            raise ConfigError("objective=data: data.held_out must say which transitions judge")
         for name in ("callbacks", "folder", "progress"):
             if name in {*self.fixed, *self.space}:
                 raise ConfigError(f"{name}: trials have none of their own; leave it out")

@@ -43,7 +43,8 @@ agent gets. Let it learn from people of whom the agents know nothing:
   python run.py mode=offline data=human data.held_out=[0,3,6,9,12] high=linucb low=iql    # a run, and others like it
   hpamdp judge outputs/DATE/TIME outputs/DATE/TIME data=human data.rest_to_rest=clean
 
-SETTING=VALUE are those of `mode=offline low=pets`. If the runs hold out the same people, data.held_out is theirs.
+SETTING=VALUE are those of `mode=offline low=pets`. If the runs hold out the same people, data.held_out is theirs. With
+data=minari it is a fraction of the episodes, such as data.held_out=0.5.
 """
 _LEAST_COVERED, _MOST_UNFINISHED = 0.8, 0.05
 _LEAST_EFFECTIVE, _LEAST_WHOLE = 30, 0.8  # episodes; a mean of fewer tells little
@@ -171,10 +172,10 @@ def _people_of(loaded: LoadedAgent) -> Mapping[str, Any]:
     return saved.get("data", {}) if saved.get("choices", {}).get("data", "none") != "none" else {}
 
 
-def _common(lists: Sequence[Any]) -> list[int]:
-    """Return the people that all runs with data hold out, if they are the same."""
-    given = [list(each) for each in lists if each]
-    return given[0] if given and all(each == given[0] for each in given) else []
+def _common(values: Sequence[Any]) -> Any:
+    """Return what all runs with data hold out, if it is the same; else None."""
+    given = [each for each in values if each]
+    return given[0] if given and all(each == given[0] for each in given) else None
 
 
 def _row(rollout: Rollout, people: np.ndarray | None) -> dict[str, Any]:
@@ -213,7 +214,9 @@ def _is_known(loaded: LoadedAgent, config: Config, rows: TensorDict) -> list[str
         known = judging & set(learned.get("people") or judging)
         if known <= set(learned.get("held_out") or ()):
             return []
-    return ["it may have learned from the transitions that judge it; hold people out of its data (data.held_out)"]
+    elif learned.get("held_out") and all(learned.get(name) == value for name, value in config.data.settings.items()):
+        return []
+    return ["it may have learned from the transitions that judge it; hold some out of its data (data.held_out)"]
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -317,7 +317,7 @@ class MinariDemonstrations(Demonstrations):
         env: the environment whose transitions they are.
 
     Raises:
-        DataError: the data set is missing, is of another kind, or has a wrong value.
+        DataError: the data set is missing, is of another kind, has a wrong value, or too few episodes to hold one out.
     """
 
     Options = MinariOptions
@@ -333,3 +333,14 @@ class MinariDemonstrations(Demonstrations):
         problem = None if found is None else problem_of(found[1])
         if found is not None and problem not in (None, f"{type(env).__module__}:{type(env).__name__}"):
             raise DataError(f"{self.options.dataset}: was recorded in {found[1]}, which is another problem")
+        if self.options.held_out:
+            self._hold_out(self.options.held_out)
+
+    def _hold_out(self, fraction: float) -> None:
+        """Move a fraction of the episodes, each after equally many others, from `batch` to `held_out`."""
+        rows = self.batch.squeeze(0)
+        number = rows[TRAJECTORY]
+        is_held_out = ((number + 1) * fraction).floor() > (number * fraction).floor()
+        if not is_held_out.any():
+            raise DataError(f"data.held_out={fraction}: is less than one of {int(number[-1]) + 1} episodes")
+        self.batch, self.held_out = rows[~is_held_out].unsqueeze(0), rows[is_held_out].unsqueeze(0)

@@ -25,7 +25,7 @@ from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.gradients import adam
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
 from hpamdp.policies.shared.options import ReplayOptions
-from hpamdp.policies.shared.replay import ReplayLearner, unpacked_states
+from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -68,6 +68,6 @@ class BC(ReplayLearner):
 
     def stored_losses(self) -> dict[str, Tensor]:
         """Return the negative log-likelihood of all stored actions, and its parts."""
-        rows = unpacked_states(self.buffer[:], self.specs)
+        rows = self.with_all_parameters(self.buffer[:])
         loss, parts = self.loss(rows, self.allowed(rows))
         return {"loss": loss, **parts}

@@ -276,10 +276,14 @@ class ReplayLearner(Learner):
         num = num_batches * self.options.batch_size
         drawn = self.buffer.sample(num) if self.links is None else sample_with_past(self.buffer, num, self.num_past)
         for sample in drawn.split(self.options.batch_size):
-            sample = unpacked_states(sample, self.specs)
-            if self.stores_own_parameters:
-                sample = sample.set("unit", self._all_parameters(sample["discrete"], sample["unit"]))
-            yield self.augmented(sample)
+            yield self.augmented(self.with_all_parameters(sample))
+
+    def with_all_parameters(self, rows: TensorDictBase) -> TensorDictBase:
+        """Return stored rows `[B]` with the entries of their states and the parameters of all actions."""
+        rows = unpacked_states(rows, self.specs)
+        if self.stores_own_parameters:
+            rows["unit"] = self._all_parameters(rows["discrete"], rows["unit"])
+        return rows
 
     def augmented(self, sample: TensorDictBase) -> TensorDictBase:
         """Return a sample `[N, *]` with each row mapped by a random symmetry of the problem, if `augment` is set."""
