@@ -93,13 +93,19 @@ def test_a_two_level_agent_holds_its_option_for_an_episode_in_gymnasium(boat_age
 
 
 @pytest.mark.parametrize(
-    ("settings", "low"), [({}, "hppo"), ({"low": "random"}, "random"), ({"resume": "auto", "folder": "run"}, "hppo")]
+    ("settings", "low"),
+    [
+        ({}, "hppo"),
+        ({"low": {"lr": 1e-3}, "mode": "train", "checkpoint": None}, "hppo"),
+        ({"low": "random"}, "random"),
+        ({"resume": "auto", "folder": "run"}, "hppo"),
+    ],
 )
 def test_hppo_learns_problems_that_nobody_knows_unless_a_learner_is_chosen(settings, low, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     agent = hpamdp.train(Reach, **{**TINY, "env.max_steps": 5, **settings})
     assert f"low={low}," in repr(agent)
-    assert usual_learner({"env": "rddl"}) == ["low=hppo"]
+    assert usual_learner({"env": "rddl", "mode": "train", "resume": None}) == ["low=hppo"]
     for chosen in ({"env": "boatdock"}, {"env": "rddl", "checkpoint": "run"}, {"env": "gymnasium", "mode": "offline"}):
         assert usual_learner(chosen) == []
 

@@ -144,7 +144,7 @@ def _given(
         settings = {"num_envs": problem.num_envs, **settings}
     choices, own = choices_and_settings(settings)
     words = [*problem.words, *choices]
-    words += usual_learner({**settings, **dict(word.split("=", 1) for word in words)})
+    words += usual_learner({**dict(own), **dict(word.split("=", 1) for word in words)})
     words = [*searching(config_dirs), *words]
     if settings.get("resume") is not None:
         resumed, trust = str(settings["resume"]), ["trust=true"] if settings.get("trust") is True else []

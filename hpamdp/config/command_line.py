@@ -30,9 +30,8 @@ GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
 SEARCH_PATH = "hydra.searchpath"
 # The folder of conf/ with what `hpamdp tune` searches for each learner.
 SEARCH = "search"
-# Problems that others write, for which H-PPO has recipes, and settings that choose a learner.
+# Problems that users write themselves. H-PPO has recipes for them.
 _UNKNOWN_PROBLEMS = ("gymnasium", "rddl")
-_CHOOSE_LEARNER = {"low", "experiment", "checkpoint", "mode"}
 # Flags of Hydra, with their short forms and their arguments for argparse.
 _SWITCH: dict[str, Any] = {"action": "store_true"}
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -247,12 +246,15 @@ def saved_run(line: CommandLine) -> tuple[str, str] | None:
 
 
 def usual_learner(given: Mapping[str, Any]) -> list[str]:
-    """Return the word for H-PPO where settings choose a problem that nobody knows, and neither a learner nor a run.
+    """Return the word for H-PPO if a run trains on a problem that users write, and settings choose no learner.
+
+    An experiment and a saved run have a learner.
 
     Args:
         given: settings by name.
     """
-    is_chosen = not _CHOOSE_LEARNER.isdisjoint(given) or given.get("resume") not in (None, RESUME_AUTO)
+    is_saved = given.get("checkpoint") is not None or given.get("resume") not in (None, RESUME_AUTO)
+    is_chosen = is_saved or "low" in given or "experiment" in given or given.get("mode", "train") != "train"
     return [] if is_chosen or given.get("env") not in _UNKNOWN_PROBLEMS else ["low=hppo"]
 
 
