@@ -279,7 +279,7 @@ class ReplayLearner(Learner):
             yield self.augmented(self.with_all_parameters(sample))
 
     def with_all_parameters(self, rows: TensorDictBase) -> TensorDictBase:
-        """Return stored rows `[B]` with the entries of their states and the parameters of all actions."""
+        """Return stored rows `[B]` with their states as observations and all actions' parameters, changed in place."""
         rows = unpacked_states(rows, self.specs)
         if self.stores_own_parameters:
             rows["unit"] = self._all_parameters(rows["discrete"], rows["unit"])
