@@ -392,7 +392,7 @@ class Machine(OwnProblem):
     """A machine that wears unseen: produce at a speed, or repair it. What a step earned tells whether it made scrap.
 
     State: probability that it is worn, given all that was seen, and the price in EUR. Only the price is observed,
-    beside the last speed, what the last step earned, and the time; so an agent needs a memory. Drawing scrap with this
+    beside the last speed, what the last step earned, and the time; so a memory may help. Drawing scrap with this
     probability gives the same observations and rewards as drawing the wear itself. Reward: EUR.
     """
 

@@ -3,7 +3,7 @@
 #
 #   experiments/own_problems/queue.sh FOLDER HPAMDP_PYTHON SB3_PYTHON CPU_SECONDS SEED...
 #
-# A curve that is in the folder already is not made again. If they are set, $PROBLEMS and $LEARNERS name some of them.
+# A curve that is in the folder already is not made again. If they are set, $PROBLEMS, $LEARNERS and $FORMS name some of them.
 set -u
 here=$(cd "$(dirname "$0")" && pwd)
 mkdir -p "$1"
@@ -18,7 +18,7 @@ run() {  # run NAME PYTHON SCRIPT PROBLEM PLAYER SEED
 }
 
 for seed in "$@"; do
-    for problem in ${PROBLEMS:-queue pricing irrigation vehicle battery inventory heating}; do
+    for problem in ${PROBLEMS:-queue pricing machine greenhouse picking irrigation vehicle battery inventory heating}; do
         for learner in ${LEARNERS:-hppo pdqn hsac}; do
             run "${problem}_${learner}_$seed" "$hpamdp" hpamdp_learner.py "$problem" "$learner" "$seed"
         done

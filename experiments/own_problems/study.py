@@ -6,6 +6,7 @@ python experiments/own_problems/study.py           tabulates the stored csv file
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -72,7 +73,7 @@ def seconds_text(seconds: float) -> str:
 def table(curves: Rows, optima: Rows) -> str:
     """Return a line for each problem: ways at the end, and CPU seconds to LEVEL of H-PPO and of default PPO.
 
-    Where neither default form of PPO gets there, its seconds count as END, so the ratio is a bound.
+    If neither default form of PPO gets there, its seconds count as END. Then the ratio is a lower bound, rounded down.
     """
     lines = []
     for problem, part in [(row["problem"], row["part"]) for row in optima]:
@@ -80,11 +81,12 @@ def table(curves: Rows, optima: Rows) -> str:
         for (player, _), run in groups([row for row in curves if row["problem"] == problem], "player", "seed").items():
             runs.setdefault(player, []).append(run)
         ways = {player: [way_at(run, END) for run in runs[player]] for player in PLAYERS}
-        cells = [f"{spread(values, 2)} ({len(values)})" if values else "" for values in ways.values()]
+        cells = [f"{spread(values, 2)} ({len(values)})" if values else "not run" for values in ways.values()]
         seconds = {name: median([seconds_to(run, LEVEL) for run in runs[name]]) for name in ("hppo", *DEFAULT_FORMS)}
         best = min(seconds[form] for form in DEFAULT_FORMS)
-        bound = "more than " if best == float("inf") else ""
-        ratio = f"{bound}{min(best, END) / seconds['hppo']:.1f}"
+        ratio = f"{best / seconds['hppo']:.1f}"
+        if best == float("inf"):
+            ratio = f"more than {math.floor(10 * END / seconds['hppo']) / 10:.1f}"
         lines.append([problem, part, *cells, seconds_text(seconds["hppo"]), seconds_text(best), ratio])
     after = f"to {LEVEL:g}: hppo | PPO's better default form | ratio"
     return markdown_table(f"problem | part | {' | '.join(PLAYERS)} | {after}", lines)
