@@ -51,7 +51,7 @@ class Demonstrations:
     Attributes:
         batch: the transitions `[1, M]`, with the sums that `with_option_sums` adds.
         decisions: `[1, K]` or None.
-        held_out: the transitions of held-out people, `[1, H]`; None if there are none.
+        held_out: the transitions that nothing learns from, `[1, H]`; None if there are none.
 
     Raises:
         SettingError: this machine does not have the device.
