@@ -153,6 +153,7 @@ def gradients_of(
         largest, places = limits
         for part in places:
             own = {place: in_order[place] for place in part if in_order[place] is not None}
+            # The compiler has no code for a foreach norm; it would call PyTorch's, with a warning.
             norm = nn.utils.get_total_norm(list(own.values()), foreach=False)
             factor = (largest / (norm + 1e-6)).clamp(max=1.0)
             for place, gradient in own.items():
