@@ -31,6 +31,8 @@ MISTAKES = [
     (["+seed=3"], "Could not append to config. An item is already at 'seed'"),
     (["high=ucb,fixed"], "high=ucb,fixed: several values; add --multirun"),
     (["--sed", "3"], "unrecognized arguments: --sed; see --help"),
+    (["--total-timesteps", "64", "low=hppo"], "; settings have no dashes, write total_timesteps=64"),
+    (["--low", "hppo", "--seed", "1"], "; settings have no dashes, write low=hppo seed=1"),
     (["hydra.run.dir=/proc/nowhere/x"], "/proc/nowhere: No such file or directory"),
     # A value that cannot be.
     (["seed=-1"], "seed=-1: must be greater than or equal to 0 (conf/config.yaml)"),
