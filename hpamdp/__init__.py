@@ -17,11 +17,13 @@ Importing this package registers the Gymnasium ids of its problems. It loads nei
 names is used.
 """
 
+import sys
 from typing import Any
 
 import lazy_loader
 
 from hpamdp.imports import collector_paused
+from hpamdp.renamed import no_member
 from hpamdp.search_path import is_command_line, put_working_directory_last
 
 __version__ = "0.3.0"
@@ -30,6 +32,8 @@ _imported, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise no_member(sys.modules[__name__], name)
     with collector_paused():
         value = _imported(name)
     globals()[name] = value  # so that it is looked up once

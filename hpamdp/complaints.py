@@ -44,10 +44,11 @@ def no_such(
 
 
 def close_names(name: str, known: Sequence[str]) -> list[str]:
-    """Return the known names that are closest to a name, best first; several if they are about as close."""
-    close = difflib.get_close_matches(name, known, n=_MOST_GUESSES)
-    similarity = [difflib.SequenceMatcher(None, each, name).ratio() for each in close]
-    return [each for each, ratio in zip(close, similarity, strict=True) if ratio >= similarity[0] - _ABOUT_AS_CLOSE]
+    """Return the known names that are closest to a name in any case, best first; several if they are about as close."""
+    name, by_lower = name.lower(), {each.lower(): each for each in known}
+    close = difflib.get_close_matches(name, by_lower, n=_MOST_GUESSES)
+    ratios = [difflib.SequenceMatcher(None, each, name).ratio() for each in close]
+    return [by_lower[each] for each, ratio in zip(close, ratios, strict=True) if ratio >= ratios[0] - _ABOUT_AS_CLOSE]
 
 
 def complaints(

@@ -43,6 +43,8 @@ _ELSEWHERE: dict[str, tuple[str, ...]] = {
     "n_eval_episodes": ("eval.layouts",),
     "policy_kwargs": ("hidden_dims",),
     "tensorboard_log": ("logger",),
+    "verbose": ("hpamdp.train(..., progress=True)",),
+    "deterministic": ("agent.act(observation, greedy=True)",),
 }
 # Arguments of other libraries' evaluations, and those of `Agent.evaluate`.
 OF_EVALUATION = {
@@ -53,16 +55,20 @@ OF_EVALUATION = {
     "return_episode_rewards": "per_episode",
     "deterministic": "act, as evaluate is always greedy",
 }
-# Methods of other libraries' agents, and what to use here.
+# Methods of other libraries' agents, their algorithms, and what to use here.
 _MEMBERS_ELSEWHERE = {
     "predict": "act(observation)",
     "get_action": "act(observation)",
     "get_action_and_value": "act(observation)",
     "learn": "hpamdp.train",
     "load": "hpamdp.load",
+    "PPO": 'hpamdp.train(env, low="hppo") or hpamdp.HPPO',
+    "DQN": 'hpamdp.train(env, low="pdqn") or hpamdp.PDQN',
+    "SAC": 'hpamdp.train(env, low="hsac") or hpamdp.HSAC',
 }
-# Names that stand for values of the run, which a group does not have.
+# Names that stand for values of the run and for arguments of functions, which a group does not have.
 _OF_RUN = ("steps_per_batch", "total_frames", "num_envs", "eval.every", "eval.layouts", "logger")
+_OF_PYTHON = _ELSEWHERE["verbose"] + _ELSEWHERE["deterministic"]
 
 
 def renamed(setting: str, known: Iterable[str]) -> str | None:
@@ -72,16 +78,17 @@ def renamed(setting: str, known: Iterable[str]) -> str | None:
 
 
 def elsewhere(name: str, known: Iterable[str]) -> list[str]:
-    """Return our names for a setting of another library: those among the known names, or values of the run."""
+    """Return our names for a setting of another library: those among the known names, and those outside groups."""
     known = set(known)
-    return [ours for ours in _ELSEWHERE.get(name, ()) if ours in known or ours in _OF_RUN]
+    return [ours for ours in _ELSEWHERE.get(name, ()) if ours in known or ours in _OF_RUN + _OF_PYTHON]
 
 
 def no_member(owner: object, name: str) -> AttributeError:
     """Return the error for a missing attribute, which names ours for one of another library."""
     ours = _MEMBERS_ELSEWHERE.get(name)
     hint = "" if ours is None else f"; use {ours} (docs/coming-from.md)"
-    return AttributeError(f"{type(owner).__name__!r} object has no attribute {name!r}{hint}", name=name, obj=owner)
+    title = getattr(owner, "__name__", type(owner).__name__)  # of a module or of the class
+    return AttributeError(f"{title!r} object has no attribute {name!r}{hint}", name=name, obj=owner)
 
 
 def with_new_names(group: str, settings: Mapping[str, Any], known: Collection[str]) -> dict[str, Any]:

@@ -708,6 +708,9 @@ def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
         (lambda: hpamdp.HPPO("platform"), r"specs='platform': must be PAMDPSpecs.from_env\(env\)"),
         (lambda: hpamdp.UCB(policy="MlpPolicy", env=3), r"specs='MlpPolicy': .* hpamdp.train\(env, low=...\) trains"),
         (lambda: hpamdp.load("hppo_platform").evaluate(n_eval_episodes=3), "no such argument; use episodes"),
+        (lambda: hpamdp.load("hppo_platform").act(None, deterministic=True), r"did you mean agent.act\(.*greedy"),
+        (lambda: hpamdp.train("platform", policy_kwargs={}), r"policy_kwargs: .* did you mean low\.hidden_dims\?"),
+        (lambda: hpamdp.BestAgent("x.pt"), "'x.pt': no such argument; its file is always best.safetensors"),
         (lambda: hpamdp.PAMDPSpecs.from_env("platform"), "'platform' is no PAMDPEnv; hpamdp.make makes one"),
     ],
 )
@@ -715,6 +718,11 @@ def test_wrong_arguments_are_one_line(make, message):
     with pytest.raises(ValueError, match=message) as raised:
         make()
     assert "\n" not in str(raised.value)
+
+
+def test_a_class_of_another_library_names_ours():
+    with pytest.raises(AttributeError, match=r'^.hpamdp. .* use hpamdp.train\(env, low="hppo"\) or hpamdp.HPPO '):
+        hpamdp.PPO  # noqa: B018
 
 
 @pytest.mark.parametrize("name", ["platform", "lunar_lander"])

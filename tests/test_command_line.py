@@ -10,6 +10,7 @@ from hpamdp.run import train
 MISTAKES = [
     # A choice that isn't there, a group that isn't there.
     (["high=foo"], "high=foo: no such choice; conf/high has actor, "),
+    (["low=PPO"], "low=PPO: no such choice; did you mean hppo? conf/low has "),
     (["experiment=domains/foo"], "experiment=domains/foo: no such choice; did you mean domains/goal or "),
     # A key that isn't there.
     (["sed=3"], "sed: no such group or value of the run (conf/config.yaml); did you mean seed? It has "),
@@ -20,6 +21,8 @@ MISTAKES = [
     (["+low=hppo"], "Multiple values for low. To override a value use 'override low: hppo'"),
     (["low=hppo", "low.learning_rate=1"], "no such setting of HPPO; did you mean lr or critic_lr? It has "),
     (["total_timesteps=64"], "did you mean total_frames? It has "),
+    (["deterministic=true"], "did you mean agent.act(observation, greedy=True)? It has "),
+    (["low=hppo", "low.verbose=1"], "did you mean hpamdp.train(..., progress=True)? It has "),
     (["hydra.run.dri=x"], "hydra.run.dri: no such value of hydra.run; did you mean dir? It has dir"),
     (["low=3"], "low=3: Config group override must be a string or a list. Got int"),
     (["hydra=null"], "hydra=null: not understood"),
@@ -28,6 +31,8 @@ MISTAKES = [
     (["+seed=3"], "Could not append to config. An item is already at 'seed'"),
     (["high=ucb,fixed"], "high=ucb,fixed: several values; add --multirun"),
     (["--sed", "3"], "unrecognized arguments: --sed; see --help"),
+    (["--total-timesteps", "64", "low=hppo"], "; settings have no dashes, write total_timesteps=64"),
+    (["--low", "hppo", "--seed", "1"], "; settings have no dashes, write low=hppo seed=1"),
     (["hydra.run.dir=/proc/nowhere/x"], "/proc/nowhere: No such file or directory"),
     # A value that cannot be.
     (["seed=-1"], "seed=-1: must be greater than or equal to 0 (conf/config.yaml)"),

@@ -9,6 +9,7 @@ import pytest
 import torch
 from conftest import TRAINED, assert_same, compose_config, forked, parts_of, rows_of, signal_after
 from test_grid import SHORT, SHORT_SELECTORS
+from tqdm import tqdm
 
 import hpamdp
 from hpamdp.run import checkpoint
@@ -63,6 +64,17 @@ def stop_and_resume(given: list[str], tmp_path: Path, *numbers: int, on_resuming
         for rng in (whole["rng"], parts["rng"]):
             rng.pop("python", None), rng.pop("numpy", None)  # which no part of a run uses
         assert_same(parts, whole)
+
+
+def test_the_bar_of_a_resumed_run_shows_the_last_evaluation_as_that_of_the_stopped_run(tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(tqdm, "set_postfix_str", lambda bar, text, refresh: shown.append(text))
+    given = {"low": "random", "film": False, "num_envs": 8, "eval.layouts": 2, "steps_per_batch": 4, "eval.every": 0}
+    hpamdp.train("platform", folder=tmp_path / "run", total_frames=64, **given)
+    last = shown[-1].partition("score")[2]
+    shown.clear()
+    hpamdp.train(resume=tmp_path / "run", total_frames=128)
+    assert last.endswith(" at 64 steps") and shown[0].endswith(f"score{last}")
 
 
 def interrupt(given: list[str], folder: Path) -> None:

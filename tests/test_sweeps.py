@@ -53,7 +53,8 @@ def jobs(monkeypatch):
             return messages.DIVERGED
         frames = 5 if cfg.seed == 5 or (cfg.seed == 3 and stopped_at is None) else cfg.total_frames
         (folder / "checkpoint.safetensors").touch()
-        summary = {"score": float(cfg.seed), "frames": frames, "finished": cfg.seed == 5 or frames > 5}
+        score = float(cfg.seed + cfg.checkpoint_every)
+        summary = {"score": score, "frames": frames, "finished": cfg.seed == 5 or frames > 5}
         (folder / "summary.json").write_text(json.dumps(summary))
         return 0 if summary["finished"] else 130
 
@@ -69,8 +70,13 @@ def test_a_failing_job_loses_no_other_and_is_named_at_the_end(command, jobs, tmp
         "seed=2 high=fixed: ZeroDivisionError: a bug (sweep/2/error.txt)",
     ]
     assert "Traceback" in (tmp_path / "sweep/2/error.txt").read_text()
-    assert out.endswith("4 jobs: 2 finished; 1 refused; 1 failed\nBest score 4.000: seed=4 high=fixed (sweep/3)\n")
+    assert out.endswith("4 jobs: 2 finished; 1 refused; 1 failed\n"), "there is no best one of one configuration"
     assert {path.name for path in (tmp_path / "sweep").iterdir()} == {"0", "1", "2", "3", "multirun.yaml", "report.csv"}
+
+
+def test_the_best_score_is_the_highest_mean_over_seeds(command, jobs):
+    _, out, _ = command("-m", "checkpoint_every=3,5,0", "seed=0,4,9", "hydra.sweep.dir=sweep")
+    assert out.endswith("9 jobs: 9 finished\nBest score 9.333, the mean over 3 seeds: checkpoint_every=5\n")
 
 
 def test_a_job_that_diverges_is_named_with_the_reason(command, jobs):
@@ -129,7 +135,8 @@ def test_a_sweep_over_experiments_of_one_study_lies_in_its_folder_and_is_told_at
     words = ["-m", "experiment=domains/moving,domains/sliding", "low=random", "seed=4"]
     code, out, err = command(*words)
     assert (code, err) == (0, "") and [seed for seed, _ in jobs] == [4, 4]
-    assert "2 jobs: 2 finished\n" in out and "(multirun/domains/moving_random_4)" in out
+    best = f"{words[1].partition(',')[0]} low=random seed=4 (multirun/domains/moving_random_4)"
+    assert out.endswith(f"2 jobs: 2 finished\nBest score 4.000: {best}\n")
     assert [path.name for path in (tmp_path / "multirun").iterdir()] == ["domains"]
     jobs.clear()
     assert command(*words)[0] == 0 and not jobs

@@ -19,7 +19,7 @@ from hpamdp import keys
 from hpamdp.acting import acting
 from hpamdp.api.arguments import flag, path_argument, problem_of, without_env_prefix
 from hpamdp.api.export import export_onnx
-from hpamdp.complaints import as_json
+from hpamdp.complaints import as_json, no_such
 from hpamdp.config.components import TARGET, Component, component, name_of_passed
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
@@ -96,7 +96,9 @@ class Agent:
         """Number of weights of all networks."""
         return sum(each.numel() for each in self._agent.parameters())
 
-    def act(self, observation: Any, info: Mapping[str, Any] | None = None, *, greedy: bool = True) -> Any:
+    def act(
+        self, observation: Any, info: Mapping[str, Any] | None = None, *, greedy: bool = True, **unknown: Any
+    ) -> Any:
         """Return the action for an observation, in Gymnasium's form.
 
         The agent holds its option, and what its policy remembers, until `reset` says that a new episode begins. Agents
@@ -108,6 +110,7 @@ class Agent:
             info: the info of the same step. Its masks count if the problem gives them there, and its `trip_ended` if
                 options end with trips.
             greedy: whether to take the best action. Otherwise the agent explores as in training.
+            unknown: refused, with the name that was probably meant.
 
         Raises:
             ValueError: an argument is wrong; the agent chooses by rewards, which `act` does not get; an agent that
@@ -121,6 +124,8 @@ class Agent:
             >>> observation, info = env.reset(seed=0)
             >>> discrete, parameters = agent.act(observation)
         """
+        for name in unknown:
+            raise ValueError(f"act: {name}: {no_such('argument', name, ('observation', 'info', 'greedy'))}")
         flag("act: greedy", greedy)
         if info is not None and not isinstance(info, Mapping):
             raise ValueError(f"act: info={as_code(info)}: must be a dict")

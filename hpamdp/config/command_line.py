@@ -7,6 +7,8 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -123,7 +125,7 @@ def parse(argv: Sequence[str], conf: Path) -> CommandLine:
     Raises:
         ConfigError: a flag or a setting does not exist, or a word is not in Hydra's grammar.
     """
-    arguments = vars(_parser().parse_args(argv))
+    arguments = vars(_parser(argv).parse_args(argv))
     words = arguments.pop("overrides")
     flags = {name: arguments[name.replace("-", "_")] for name in _FLAGS}
     line = CommandLine(flags, parsed_words(words))
@@ -167,9 +169,9 @@ def search_word(paths: Sequence[str]) -> str:
     return f"{SEARCH_PATH}=[{','.join(for_hydra(completed_path(path)) for path in paths)}]"
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(add_help=False)
-    parser.error = _refuse  # type: ignore[method-assign]  # the parser's own prints two lines
+    parser.error = partial(_refuse, argv)  # type: ignore[method-assign]  # the parser's own prints two lines
     parser.add_argument("--version", action="version", version=f"hpamdp {__version__}, Hydra {hydra.__version__}")
     parser.add_argument("overrides", nargs="*")
     for name, (short, arguments) in _FLAGS.items():
@@ -177,7 +179,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _refuse(message: str) -> NoReturn:
+def _refuse(argv: Sequence[str], message: str) -> NoReturn:
     # argparse finds settings on one side of a flag only.
     split = re.fullmatch(r"unrecognized arguments: ([^-].*=.*)", message)
     if split:
@@ -186,7 +188,13 @@ def _refuse(message: str) -> NoReturn:
     if dashed:
         word = dashed.group(1)
         raise ConfigError(f"--{word}: settings have no dashes, write {word}; a wandb sweep ${{args_no_hyphens}}")
-    raise ConfigError(f"{message}; see --help")
+    spaced = [
+        f"{flag[2:].replace('-', '_')}={value}"
+        for flag, value in pairwise(argv)
+        if flag in message.split() and flag.startswith("--") and value[:1] != "-" and "=" not in flag + value
+    ]
+    hint = f"; settings have no dashes, write {' '.join(spaced)}" if spaced else ""
+    raise ConfigError(f"{message}; see --help{hint}")
 
 
 def parsed_words(words: Sequence[str]) -> tuple[Override, ...]:

@@ -118,10 +118,11 @@ def _change(cfg: DictConfig, settings: Iterable[tuple[str, Any]], conf: Path) ->
             name = f"env.{name}"
         plain = plain_value(name, value)
         singles = dict(_single_values(name, plain))
-        for single, each in singles.items():
+        for single in singles or [name]:
             wrong = None if is_new else missing_setting(cfg, single, conf)
             if wrong is not None:
                 raise ConfigError(wrong)
+        for single, each in singles.items():
             _check_once(single, each, given)
         given |= singles
         before = OmegaConf.select(cfg, name, throw_on_resolution_failure=False)

@@ -88,7 +88,9 @@ class BestAgent(Callback):
 
     card = CARDS["BestAgent"]
 
-    def __init__(self) -> None:
+    def __init__(self, *unknown: Any) -> None:
+        if unknown:
+            raise SettingError(f"BestAgent: {as_code(unknown[0])}: no such argument; its file is always {BEST_NAME}")
         self.best_score: float | None = None
         self.best_frames: int | None = None
         self._file: Path | None = None

@@ -11,18 +11,19 @@ import sys
 import threading
 import time
 import traceback
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any, ClassVar
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from hpamdp.config.compose import job_overrides
+from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.files import replacing
@@ -71,10 +72,11 @@ def _own_folder(config: DictConfig, name: str) -> Path:
 
 @dataclass
 class Job:
-    """State of one job."""
+    """State of one job. `settings` are its overrides without the seed."""
 
     number: int
     overrides: str
+    settings: str
     folder: str
     state: str = _RUNNING
     score: float | None = None
@@ -111,7 +113,8 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     """
     hydra = HydraConfig.get()
     folder, overrides = Path(hydra.runtime.output_dir), job_overrides()
-    job = Job(hydra.job.num, " ".join(overrides), str(folder))
+    settings = " ".join(word for word in overrides if setting_of(word) != "seed")
+    job = Job(hydra.job.num, " ".join(overrides), settings, str(folder))
     records = _records(Path(hydra.runtime.cwd, hydra.sweep.dir), start)
     if hydra.runtime.choices["hydra/launcher"] != "basic":
         os.environ.setdefault("TQDM_DISABLE", "1")  # the bars of jobs side by side overwrite each other
@@ -251,10 +254,17 @@ def _print_tally(jobs: list[Job]) -> None:
     counts = Counter(job.state for job in jobs)
     tally = "; ".join(f"{count} {state}" for state, count in counts.items())
     say(f"{len(jobs)} job{'' if len(jobs) == 1 else 's'}: {tally}")
-    scored = [(job.score, job) for job in jobs if job.score is not None]
-    if len(scored) > 1:
-        score, best = max(scored, key=lambda entry: entry[0])
-        say(f"Best score {score:.3f}: {best.overrides} ({_shown(Path(best.folder))})")
+    scores = defaultdict[str, list[float]](list)
+    for job in jobs:
+        if job.score is not None:
+            scores[job.settings].append(job.score)
+    if len(scores) > 1:
+        settings, of_seeds = max(scores.items(), key=lambda entry: fmean(entry[1]))
+        what = f", the mean over {len(of_seeds)} seeds: {settings}"
+        if len(of_seeds) == 1:
+            best = next(job for job in jobs if job.settings == settings and job.score is not None)
+            what = f": {best.overrides} ({_shown(Path(best.folder))})"
+        say(f"Best score {fmean(of_seeds):.3f}{what}")
 
 
 def _shown(path: Path) -> Path:

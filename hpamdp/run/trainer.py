@@ -105,8 +105,6 @@ class Trainer:
         self.cpu_s = progress["cpu_s"]
         self.recorder.eval_cpu_s = progress.get("eval_cpu_s", 0.0)
         self.last_score = progress["last_score"]
-        if self.last_score is not None:
-            self._last_evaluation = f"score {self.last_score:.2f}"
         self.is_evaluation_due = progress.get("evaluation_due", False)
         if not is_training:
             saved.set_statistics(self.parts.env)
@@ -115,6 +113,8 @@ class Trainer:
         # An evaluation that is due writes the row of these frames again.
         frames = self.frames - 1 if self.is_evaluation_due else self.frames
         self.recorder.resume_from(source.parent, frames)
+        for row in self.recorder.metrics.rows():
+            self._note_evaluation(row)
         try:
             self.recorder.set_state(saved.states["recorder"])
             self._restore_callbacks(saved.states["callbacks"])
@@ -332,6 +332,12 @@ class Trainer:
         texts = [f"return {seen:.2f}"] if seen is not None else []
         bar.set_postfix_str(", ".join([*texts, self._last_evaluation]), refresh=False)
 
+    def _note_evaluation(self, row: Mapping[str, float]) -> None:
+        """Note a row's evaluation for the bar, if it has one. The untrained agent's says nothing of what is learned."""
+        if "eval/score" in row and row["frames"]:
+            success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
+            self._last_evaluation = f"score {row['eval/score']:.2f}{success} at {row['frames']:,.0f}{self.unit}"
+
     def _learn(self, collection: Collection) -> int:
         """Let the agent learn from a batch of steps or from the data set, and return the number of frames.
 
@@ -379,10 +385,8 @@ class Trainer:
         with request.taken_at_once():
             self.recorder.play()
         row = self.recorder.log(self.frames, self.wall_s, self.cpu_s, is_evaluated=True, own=own)
-        success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
         self.last_score = row["eval/score"]
-        if self.frames:  # the untrained agent's score says nothing of what is learned
-            self._last_evaluation = f"score {self.last_score:.2f}{success} at {self.frames:,}{self.unit}"
+        self._note_evaluation(row)
         self._show(bar)
         self._call(lambda callback: callback.on_evaluation(self, row))
         self.is_evaluation_due = False
