@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 from typing import ClassVar
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -24,6 +25,7 @@ from toy_environments import Toy
 import hpamdp
 from hpamdp.config.command_line import usual_learner
 from hpamdp.env.errors import ProblemError
+from hpamdp.run.evaluate import Evaluation
 from hpamdp.run_files import CHECKPOINT_NAME, METRICS_NAME
 
 TINY = {"total_frames": 512, "num_envs": 32, "steps_per_batch": 8, "eval.layouts": 4, "film": False, "progress": False}
@@ -191,6 +193,12 @@ def test_an_interrupted_training_in_a_folder_goes_on_with_resume_auto(tmp_path):
     assert hpamdp.train("platform", resume="auto", **arguments).history[-1]["frames"] == 512
     again = hpamdp.train("platform", resume="auto", **arguments)  # nothing is left to do
     assert again.history[-1]["frames"] == 512
+
+
+def test_training_that_is_interrupted_in_its_first_evaluation_returns_an_agent_without_history(monkeypatch):
+    monkeypatch.setattr(Evaluation, "run_agent", mock.Mock(side_effect=[KeyboardInterrupt]))
+    agent = hpamdp.train("platform", low="hppo", **TINY)
+    assert agent.history == [] and "untrained" in repr(agent)
 
 
 def test_a_resumed_run_in_a_new_folder_keeps_its_rows_even_if_it_ends_before_its_first_own_one(tmp_path):

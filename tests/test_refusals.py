@@ -407,6 +407,14 @@ def test_a_setting_without_effect_is_told_once_by_both_doors(command, capsys):
     assert capsys.readouterr().err.count(line) == 1
 
 
+@pytest.mark.parametrize("word", ["total_frames=10", "low.budget.total_frames=10"])
+def test_a_length_below_a_batch_is_told_unless_the_learner_recommends_it(word, command):
+    words = ["env=platform", "low=random", "num_envs=4", "steps_per_batch=4", "eval.layouts=4", "film=false", word]
+    code, _, err = command(*words)
+    line = "total_frames=10: less than a batch of num_envs=4 x steps_per_batch=4; the run has 16 frames\n"
+    assert code == 0 and err.count(line) == (word == "total_frames=10")
+
+
 @pytest.mark.parametrize(("group", "name"), [(group, name) for group in GROUPS for name in choices(group)])
 def test_settings_that_count_with_another_one_name_a_setting_and_its_values(group, name):
     target = yaml.safe_load((CONF / group / f"{name}.yaml").read_text()).get("_target_")

@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import time
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -144,6 +145,29 @@ def test_ctrl_c_ends_an_evaluation_at_once_and_resuming_repeats_it(tmp_path, mon
     assert run(compose_config(more), tmp_path / "resumed", more) == 0
     rows = [[(row["frames"], row["eval/score"]) for row in rows_of(tmp_path / name)] for name in ("whole", "resumed")]
     assert rows[0] == rows[1]
+
+
+def test_a_run_that_is_stopped_in_its_first_evaluation_plays_no_other(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(Evaluation, "run_agent", mock.Mock(side_effect=[KeyboardInterrupt]))
+    assert start(tmp_path, "low=random") == 130
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["frames"] == 0 and not summary["finished"] and not {"score", "evaluated_frames"} & {*summary}
+    assert "Stopped at 0 steps; to go on: " in capsys.readouterr().out
+
+
+def test_a_resumed_run_that_is_stopped_before_its_first_evaluation_tells_the_last_one(tmp_path, monkeypatch, capsys):
+    start(tmp_path / "run", "low=random")
+    before = json.loads((tmp_path / "run" / "summary.json").read_text())
+    monkeypatch.setattr(Evaluation, "run_agent", lambda *_: pytest.fail("an evaluation was played"))
+    words = [f"resume={tmp_path / 'run'}", "total_frames=100_000_000", "eval.every=0"]
+    with signal_after(2):
+        assert run(compose_config(words), tmp_path / "more", words) == 130
+    assert "these figures are of the agent after 1,024 frames" in capsys.readouterr().out
+    after = json.loads((tmp_path / "more" / "summary.json").read_text())
+    assert after["frames"] > after["evaluated_frames"] == before["frames"]
+    assert {name: after[name] for name in ("score", "steps", "references")} == {
+        name: before[name] for name in ("score", "steps", "references")
+    }
 
 
 def test_a_signal_in_the_batch_before_an_evaluation_leaves_it_to_the_resumed_run():

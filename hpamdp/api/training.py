@@ -42,8 +42,8 @@ def train(
     """Train an agent, as `hpamdp SETTING=VALUE ...` does, and return it.
 
     Ctrl-C ends training after the current batch, and an evaluation at once. Then the agent with what it has learned so
-    far is returned. If several trainings run at once in threads, they share torch's random numbers, so no seed
-    reproduces them.
+    far is returned. Its `history` is empty if the first evaluation was not over. If several trainings run at once in
+    threads, they share torch's random numbers, so no seed reproduces them.
 
     Args:
         env: the problem. If None, the default of the command line. Otherwise one of these:

@@ -150,6 +150,15 @@ def settings_without_effect(config: Config, words: Sequence[str]) -> list[str]:
     ]
 
 
+def length_below_a_batch(config: Config, words: Sequence[str]) -> list[str]:
+    """Return a warning if a word sets a length of training that is shorter than the first batch."""
+    run, batch = config.run, config.run.num_envs * config.run.steps_per_batch
+    if batch <= run.total_frames or "total_frames" not in map(setting_of, words):
+        return []
+    sizes = f"num_envs={run.num_envs} x steps_per_batch={run.steps_per_batch}"
+    return [f"total_frames={run.total_frames}: less than a batch of {sizes}; the run has {batch:,} frames"]
+
+
 def _component_and_setting(config: Config, name: str) -> tuple[Component | None, str]:
     """Return the component that a setting such as `low.memory_size` belongs to, if any, and its name there."""
     group, _, setting = name.partition(".")

@@ -18,7 +18,7 @@ from hpamdp.analysis import film
 from hpamdp.config.schema import Config
 from hpamdp.files import replacing
 from hpamdp.messages import warn
-from hpamdp.metrics_file import CPU_SECONDS, FRAMES, WALL_SECONDS, Metrics, rows_up_to
+from hpamdp.metrics_file import CPU_SECONDS, EVALUATION, FRAMES, WALL_SECONDS, Metrics, rows_up_to
 from hpamdp.policies.base import Learner
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
@@ -68,9 +68,10 @@ class Recorder:
         self._ended: list[TensorDictBase] = []
         self._scalars: dict[str, float] = {}
         self.eval_cpu_s = 0.0
-        self._played: dict[str, np.ndarray] | None = None  # the last evaluation
+        self._played: dict[str, np.ndarray] | None = None  # the last evaluation of this process
         self._is_current = False  # whether the agent is as it was then
-        self._evaluated_frames = 0  # frames of training before the last evaluation
+        self._measured: dict[str, float] = {}  # means of the last evaluation, also if it was before a resumption
+        self._evaluated_frames: float | None = None  # frames of training before it
         self._action_counts: Tensor | None = None  # steps with each discrete action, since the last row
         self._callback_metrics: Mapping[str, float] = {}  # the last metrics of callbacks
         self._option_scores: dict[str, float] = {}  # scores with each option held, at the last evaluation
@@ -84,6 +85,10 @@ class Recorder:
         if not rows and frames > 0:
             warn(f"{source}: is missing or damaged; the run goes on without the rows up to {FRAMES}={frames}")
         self.metrics = Metrics(self.metrics.path, rows)
+        for row in rows:
+            measured = {name.removeprefix(EVALUATION): row[name] for name in row if name.startswith(EVALUATION)}
+            if measured:
+                self._measured, self._evaluated_frames = measured, row[FRAMES]
         self._resumed_from = folder
 
     def start(self) -> None:
@@ -188,9 +193,9 @@ class Recorder:
             row |= own
             self._callback_metrics = own
         if is_evaluated:
-            measured = self.parts.evaluation.measure(self.play())
-            self._evaluated_frames = frames
-            row |= {f"eval/{name}": value for name, value in (measured | self._drift(measured)).items()}
+            self._measure(frames)
+            measured = self._measured | self._drift(self._measured)
+            row |= {f"{EVALUATION}{name}": value for name, value in measured.items()}
         self.metrics.append(row)
         self._pass_on(lambda logger: logger.log(row, frames))
         self._ended = []
@@ -200,7 +205,8 @@ class Recorder:
     def finish(self, frames: int, wall_s: float, cpu_s: float, ending: Mapping[str, Any], *, is_finished: bool) -> str:
         """Write the summary and the figures, close the logger, and return the closing table as text.
 
-        If training was interrupted, the figures are those of the last evaluation, otherwise of the agent as it is.
+        The figures are of the agent as it is. If training was interrupted, nothing is played: the figures are those of
+        the last evaluation, if there was one.
 
         Args:
             frames: frames of training.
@@ -213,27 +219,24 @@ class Recorder:
             wall_before, cpu_before = time.perf_counter(), time.process_time()
             self.play()
             wall_s, cpu_s = time.perf_counter() - wall_before, time.process_time() - cpu_before
-        if self._played is None or is_finished:
-            self.play()
-            self._evaluated_frames = frames
-        assert self._played is not None
-        played = self._played
-        measured = self.parts.evaluation.measure(played)
+        if is_finished:
+            self._measure(frames)
+        measured = self._measured
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s, "eval_cpu_s": self.eval_cpu_s}
-        if self._evaluated_frames != frames:
+        if self._evaluated_frames not in (None, frames):
             effort[EVALUATED_FRAMES] = self._evaluated_frames
         env = self.parts.evaluation.problem
         summary = summarise(self.config, env, measured, self._random_scores, effort, is_finished=is_finished)
         summary |= {**self._callback_metrics, **ending}
         if self.config.run.mode != "eval":
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
-            summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])
+            summary[SHORT_SIGHT] = short_sight(self.config.learners, measured.get("steps", 0.0))
             summary[ONE_OPTION] = self._one_option()
             summary[ONE_ACTION] = self.parts.evaluation.one_action
             summary["practised"] = self.parts.agent.practised()
         self.summary = summary
         if self.output_dir is not None:
-            self._write(self.output_dir, played)
+            self._write(self.output_dir)
         return closing_table(summary, env.table_metrics)
 
     def _one_option(self) -> list[str]:
@@ -248,13 +251,21 @@ class Recorder:
         better = "high=value" if have_value else "high=meta_critic"
         return [f"{self.config.high} holds the option that is best on average; {better} chooses one for each episode"]
 
-    def _write(self, folder: Path, played: Mapping[str, np.ndarray]) -> None:
-        """Write the last evaluation, the summary, the figures and the film, and close the logger."""
-        arrays: dict[str, Any] = dict(played)
-        with replacing(folder / EVALUATION_NAME) as partial:
-            np.savez_compressed(partial, **arrays)
+    def _write(self, folder: Path) -> None:
+        """Write the summary, and the last evaluation with its pictures if this process played one. Close the logger."""
+        played: dict[str, Any] | None = self._played
+        if played is not None:
+            with replacing(folder / EVALUATION_NAME) as partial:
+                np.savez_compressed(partial, **played)
         with replacing(folder / SUMMARY_NAME) as partial:
             partial.write_text(json.dumps(self.summary, indent=2) + "\n")
+        if played is not None:
+            self._draw(folder, played)
+        self._pass_on(lambda logger: logger.summary(self.summary))
+        self._pass_on(lambda logger: logger.close())
+
+    def _draw(self, folder: Path, played: Mapping[str, np.ndarray]) -> None:
+        """Draw the figures and the film of the last evaluation."""
         from hpamdp.analysis import figures  # takes a third of a second, which a loaded agent need not wait for
 
         images = figures.draw_all(folder, type(self.parts.evaluation.problem), self.summary, played)
@@ -262,8 +273,6 @@ class Recorder:
         self._pass_on(lambda logger: logger.images(images))
         if filmed is not None:
             self._pass_on(lambda logger: logger.film(filmed))
-        self._pass_on(lambda logger: logger.summary(self.summary))
-        self._pass_on(lambda logger: logger.close())
 
     def _pass_on(self, act: Callable[[Logger], None]) -> None:
         if self._logger is not None:
@@ -289,6 +298,10 @@ class Recorder:
             self.eval_cpu_s += time.process_time() - cpu_before
             self._is_current = True
         return self._played
+
+    def _measure(self, frames: int) -> None:
+        """Note the means of an evaluation of the agent after these frames of training."""
+        self._measured, self._evaluated_frames = self.parts.evaluation.measure(self.play()), frames
 
     def _drift(self, measured: dict[str, float]) -> dict[str, float]:
         """Return, for each option, how much the score with that option held has changed since the last evaluation."""

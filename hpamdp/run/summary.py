@@ -40,7 +40,7 @@ def summarise(
     Args:
         config: config of the run.
         env: the problem, which has the references.
-        measured: means of the agent's final evaluation, from `Evaluation.measure`.
+        measured: means of the agent's final evaluation, from `Evaluation.measure`; empty if there was none.
         random: the same means for the uniformly random agent.
         effort: `frames` of training, and `wall_s` and `cpu_s` of this run. With `mode=eval`, they are the times of
             the evaluation, otherwise of training with its evaluations, which took `eval_cpu_s`.
@@ -53,7 +53,7 @@ def summarise(
         "env": config.env.name,
         **env.summary_entries(),
         **measured,
-        "references": {"random": dict(random), **env.references(measured)},
+        "references": {"random": dict(random), **(env.references(measured) if measured else {})},
         "episodes": config.run.eval.layouts,
         "finished": is_finished,
         **effort,

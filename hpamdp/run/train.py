@@ -22,7 +22,7 @@ from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.callbacks import BestAgent, Callback, CallbackError
 from hpamdp.run.collection.base import CollectionError
-from hpamdp.run.compatibility import need_of_evaluations, settings_without_effect
+from hpamdp.run.compatibility import length_below_a_batch, need_of_evaluations, settings_without_effect
 from hpamdp.run.folder import check_no_training, check_unused, remove_error
 from hpamdp.run.resume import check_saved_options, resolve, rest_of
 from hpamdp.run.stopping import ProgramExitError, exits_explained
@@ -158,7 +158,8 @@ def begin(
             check_unused(output_dir, may_overwrite=may_overwrite or config.run.overwrite)
     torch.set_num_threads(config.run.threads)
     torch.manual_seed(config.run.seed)
-    for warning in settings_without_effect(config, overrides):
+    of_length = [] if source is not None else length_below_a_batch(config, overrides)
+    for warning in [*settings_without_effect(config, overrides), *of_length]:
         warn(warning)
     parts = assemble(config)
     try:
