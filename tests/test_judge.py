@@ -6,6 +6,7 @@ from conftest import compose_config, make_config
 
 import hpamdp
 from hpamdp import keys
+from hpamdp.commands import judge
 from hpamdp.commands.judge import judged
 from hpamdp.commands.recorded_problem import RecordedProblem, starts_of
 from hpamdp.config.errors import ConfigError
@@ -66,6 +67,17 @@ def test_agents_are_ordered_as_their_environment_orders_them(path, clone):
 def test_an_agent_that_learned_from_the_steps_that_judge_it_is_doubted(path, clone):
     rows = hpamdp.judge(clone, data="human", episodes=5, **_settings(path), **{"data.people": [0, 2]})
     assert any("may have learned from the transitions that judge it" in doubt for doubt in rows[0]["doubts"])
+
+
+def test_what_agents_held_out_of_other_data_is_not_held_out_here(path, clone, monkeypatch):
+    def of_other_data(*arguments):
+        loaded = load_agent(*arguments)
+        loaded.progress["config"] |= {"data": {"held_out": 0.5}, "choices": {"data": "minari"}}
+        return loaded
+
+    monkeypatch.setattr(judge, "load_agent", of_other_data)
+    rows = hpamdp.judge(clone, data="human", episodes=5, **_settings(path))
+    assert not any("learned" in doubt for doubt in rows[0]["doubts"])
 
 
 def _settings(path):

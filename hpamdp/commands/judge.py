@@ -95,9 +95,10 @@ def judged(
         if other.config.env != first.config.env:
             raise ConfigError(f"judge: {path} is of another problem than {paths[0]}; judge them one by one")
         _check_reads_observations(path, other)
-    held_out = _common([_people_of(each).get("held_out") for each in agents])
+    chosen = dict(word.split("=", 1) for word in words).get("data")
+    held_out = _common([_data_settings_of(each).get("held_out") for each in agents if _data_of(each) == chosen])
     given = {setting_of(word) for word in words} | {name for name, _ in settings}
-    more = [f"data.held_out={held_out}".replace(" ", "")] if held_out and not given & _PEOPLE else []
+    more = [f"data.held_out={held_out}".replace(" ", "")] if held_out and not given & _HELD_OUT_SETTINGS else []
     with composed(["mode=offline", "low=pets", choosing("env", first.config.env.name), *words, *more], settings) as cfg:
         config = read(cfg)
     if config.data.target is None:
@@ -153,7 +154,7 @@ def _tracker_of(loaded: LoadedAgent) -> DecisionTracker:
     return decision_tracker(loaded.env, option_length=option_length(loaded.config))
 
 
-_PEOPLE = {"data.held_out", "data.people"}
+_HELD_OUT_SETTINGS = {"data.held_out", "data.people"}
 
 
 def _check_reads_observations(path: str, loaded: LoadedAgent) -> None:
@@ -166,10 +167,14 @@ def _check_reads_observations(path: str, loaded: LoadedAgent) -> None:
         raise ConfigError(f"judge: {path}: {loaded.config.high} chooses by the rewards of earlier trips")
 
 
-def _people_of(loaded: LoadedAgent) -> Mapping[str, Any]:
+def _data_of(loaded: LoadedAgent) -> str:
+    """Return the name of the data that an agent learned from, or `none`."""
+    return str(loaded.progress.get("config", {}).get("choices", {}).get("data", "none"))
+
+
+def _data_settings_of(loaded: LoadedAgent) -> Mapping[str, Any]:
     """Return the settings of the data that an agent learned from; empty if it learned from none."""
-    saved = loaded.progress.get("config", {})
-    return saved.get("data", {}) if saved.get("choices", {}).get("data", "none") != "none" else {}
+    return {} if _data_of(loaded) == "none" else loaded.progress["config"].get("data", {})
 
 
 def _common(values: Sequence[Any]) -> Any:
@@ -205,9 +210,12 @@ def _doubts(rollout: Rollout, max_steps: int) -> list[str]:
 
 
 def _is_known(loaded: LoadedAgent, config: Config, rows: TensorDict) -> list[str]:
-    """Return a doubt if an agent may have learned from the transitions `[M]` that judge it."""
-    learned = _people_of(loaded)
-    if not learned or loaded.progress["config"]["choices"]["data"] != config.data.name:
+    """Return a doubt if an agent may have learned from the transitions `[M]` that judge it.
+
+    Without persons it is known to have not only if it held out the same part of the same data.
+    """
+    learned = _data_settings_of(loaded)
+    if not learned or _data_of(loaded) != config.data.name:
         return []
     if PERSON in rows.keys():
         judging = set(rows[PERSON].unique().tolist())
