@@ -126,7 +126,7 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         return _run_job(cfg, start)
 
     try:
-        line = line.with_words(usual_learner({name: str(each.value()) for name, each in line.given().items()}))
+        line = line.with_words(usual_learner({name: each.value() for name, each in line.given().items()}))
         line = completed(_with_saved_choices(line), conf)
         sys.argv[1:] = line.argv()  # which Hydra parses
         hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()

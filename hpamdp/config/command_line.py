@@ -30,9 +30,9 @@ GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
 SEARCH_PATH = "hydra.searchpath"
 # The folder of conf/ with what `hpamdp tune` searches for each learner.
 SEARCH = "search"
-# Problems that others write, for which H-PPO has recipes, and settings that choose a learner.
+# Problems that others write, for which H-PPO has recipes, and settings that choose a learner, with values that do not.
 _UNKNOWN_PROBLEMS = ("gymnasium", "rddl")
-_CHOOSE_LEARNER = {"low", "experiment", "checkpoint", "mode"}
+_CHOOSE_LEARNER = {"low": None, "experiment": None, "checkpoint": None, "mode": "train", "resume": RESUME_AUTO}
 # Flags of Hydra, with their short forms and their arguments for argparse.
 _SWITCH: dict[str, Any] = {"action": "store_true"}
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -252,7 +252,7 @@ def usual_learner(given: Mapping[str, Any]) -> list[str]:
     Args:
         given: settings by name.
     """
-    is_chosen = not _CHOOSE_LEARNER.isdisjoint(given) or given.get("resume") not in (None, RESUME_AUTO)
+    is_chosen = any((given.get(name) or usual) != usual for name, usual in _CHOOSE_LEARNER.items())
     return [] if is_chosen or given.get("env") not in _UNKNOWN_PROBLEMS else ["low=hppo"]
 
 
