@@ -107,7 +107,10 @@ def test_hppo_learns_problems_that_nobody_knows_unless_a_learner_is_chosen(setti
     monkeypatch.chdir(tmp_path)
     agent = hpamdp.train(Reach, **{**TINY, "env.max_steps": 5, **settings})
     assert f"low={low}," in repr(agent)
-    assert usual_learner({"env": "rddl", "mode": "train", "resume": None}) == ["low=hppo"]
+    named = hpamdp.train("gymnasium", **{**TINY, "env.id": "hpamdp/Goal-v0", **settings, "folder": "named"})
+    assert f"low={low}," in repr(named)
+    for usual in ({}, {"mode": "train"}, {"checkpoint": None, "resume": None}, {"resume": ""}, {"resume": "auto"}):
+        assert usual_learner({"env": "rddl", **usual}) == ["low=hppo"]
     for chosen in ({"env": "boatdock"}, {"env": "rddl", "checkpoint": "run"}, {"env": "gymnasium", "mode": "offline"}):
         assert usual_learner(chosen) == []
 

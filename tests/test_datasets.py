@@ -79,6 +79,8 @@ def test_held_out_episodes_judge_what_has_not_learned_from_them(folder, tmp_path
     for more, is_doubted in ([], False), (["data.held_out=0.4"], False), (["data.held_out=0.5"], True):
         row = judged([str(tmp_path / "run")], given + more, episodes=4)[0]
         assert any("may have learned" in doubt for doubt in row["doubts"]) == is_doubted
+    almost_all = assemble(make_config([*words[:-1], "data.held_out=0.99999999"])).data
+    assert almost_all.batch["collector", "traj_ids"].unique().tolist() == [0]
     with pytest.raises(ConfigError, match=r"data.held_out=0.05: is less than one of 10 episodes"):
         assemble(make_config([*words[:-1], "data.held_out=0.05"]))
 

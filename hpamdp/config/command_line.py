@@ -261,8 +261,8 @@ def usual_learner(given: Mapping[str, Any]) -> list[str]:
     Args:
         given: settings by name.
     """
-    is_saved = given.get("checkpoint") is not None or given.get("resume") not in (None, RESUME_AUTO)
-    is_chosen = is_saved or "low" in given or "experiment" in given or given.get("mode", "train") != "train"
+    is_saved = bool(given.get("checkpoint")) or (given.get("resume") or RESUME_AUTO) != RESUME_AUTO
+    is_chosen = is_saved or "low" in given or given.get("experiment") or (given.get("mode") or "train") != "train"
     return [] if is_chosen or given.get("env") not in _UNKNOWN_PROBLEMS else ["low=hppo"]
 
 

@@ -339,7 +339,7 @@ class MinariDemonstrations(Demonstrations):
     def _hold_out(self, fraction: float) -> None:
         """Move a fraction of the episodes, each after equally many others, from `batch` to `held_out`."""
         rows = self.batch.squeeze(0)
-        number = rows[TRAJECTORY]
+        number = rows[TRAJECTORY].double()
         is_held_out = ((number + 1) * fraction).floor() > (number * fraction).floor()
         if not is_held_out.any():
             raise DataError(f"data.held_out={fraction}: is less than one of {int(number[-1]) + 1} episodes")
