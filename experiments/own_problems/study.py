@@ -33,7 +33,7 @@ NAME = ("problem", "library", "player", "seed")
 LATENESS = 3.0  # CPU seconds by which a score may follow the time that it stands for
 LEVEL = 0.8  # of the way from random play to the best policy
 END = 60.0  # CPU seconds of a run
-COLOURS = {"ppo raw": FAINT, "ppo normalised": INK, "ppo informed": "#D55E00", "hppo low.memory=gru": "#009E73"}
+COLOURS = {"ppo raw": FAINT, "ppo normalised": INK, "ppo informed": "#D55E00", "hppo low.memory=gru": "#56B4E9"}
 DEFAULT_FORMS = ("ppo raw", "ppo normalised")  # of PPO, with its defaults
 PLAYERS = ("hppo", "pdqn", "hsac", *DEFAULT_FORMS, "ppo informed")
 
