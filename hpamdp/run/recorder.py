@@ -54,6 +54,8 @@ class Recorder:
         summary: see `summarise`; empty before `finish`.
         training_return: mean return of the exploring episodes in the last batch in which some ended; None before.
         eval_cpu_s: CPU time of the evaluations so far.
+        measured: means of the last evaluation, also if it was before a resumption; empty before the first one.
+        evaluated_frames: frames of training before it; None before the first one.
     """
 
     def __init__(self, config: Config, parts: AssembledRun, output_dir: Path | None) -> None:
@@ -70,8 +72,8 @@ class Recorder:
         self.eval_cpu_s = 0.0
         self._played: dict[str, np.ndarray] | None = None  # the last evaluation of this process
         self._is_current = False  # whether the agent is as it was then
-        self._measured: dict[str, float] = {}  # means of the last evaluation, also if it was before a resumption
-        self._evaluated_frames: float | None = None  # frames of training before it
+        self.measured: dict[str, float] = {}
+        self.evaluated_frames: int | None = None
         self._action_counts: Tensor | None = None  # steps with each discrete action, since the last row
         self._callback_metrics: Mapping[str, float] = {}  # the last metrics of callbacks
         self._option_scores: dict[str, float] = {}  # scores with each option held, at the last evaluation
@@ -86,9 +88,10 @@ class Recorder:
             warn(f"{source}: is missing or damaged; the run goes on without the rows up to {FRAMES}={frames}")
         self.metrics = Metrics(self.metrics.path, rows)
         for row in rows:
-            measured = {name.removeprefix(EVALUATION): row[name] for name in row if name.startswith(EVALUATION)}
-            if measured:
-                self._measured, self._evaluated_frames = measured, row[FRAMES]
+            if f"{EVALUATION}score" in row:
+                evaluated = {name: value for name, value in row.items() if name.startswith(EVALUATION)}
+                self.measured = {name.removeprefix(EVALUATION): value for name, value in evaluated.items()}
+                self.evaluated_frames = int(row[FRAMES])
         self._resumed_from = folder
 
     def start(self) -> None:
@@ -194,7 +197,7 @@ class Recorder:
             self._callback_metrics = own
         if is_evaluated:
             self._measure(frames)
-            measured = self._measured | self._drift(self._measured)
+            measured = self.measured | self._drift(self.measured)
             row |= {f"{EVALUATION}{name}": value for name, value in measured.items()}
         self.metrics.append(row)
         self._pass_on(lambda logger: logger.log(row, frames))
@@ -221,10 +224,10 @@ class Recorder:
             wall_s, cpu_s = time.perf_counter() - wall_before, time.process_time() - cpu_before
         if is_finished:
             self._measure(frames)
-        measured = self._measured
+        measured = self.measured
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s, "eval_cpu_s": self.eval_cpu_s}
-        if self._evaluated_frames not in (None, frames):
-            effort[EVALUATED_FRAMES] = self._evaluated_frames
+        if self.evaluated_frames not in (None, frames):
+            effort[EVALUATED_FRAMES] = self.evaluated_frames
         env = self.parts.evaluation.problem
         summary = summarise(self.config, env, measured, self._random_scores, effort, is_finished=is_finished)
         summary |= {**self._callback_metrics, **ending}
@@ -301,7 +304,7 @@ class Recorder:
 
     def _measure(self, frames: int) -> None:
         """Note the means of an evaluation of the agent after these frames of training."""
-        self._measured, self._evaluated_frames = self.parts.evaluation.measure(self.play()), frames
+        self.measured, self.evaluated_frames = self.parts.evaluation.measure(self.play()), frames
 
     def _drift(self, measured: dict[str, float]) -> dict[str, float]:
         """Return, for each option, how much the score with that option held has changed since the last evaluation."""

@@ -86,7 +86,6 @@ class Trainer:
         self.compile_cpu_s = 0.0
         self.last_score: float | None = None
         self.is_evaluation_due = False
-        self._last_evaluation = "no evaluation yet"  # in the words of the bar
         self._kept: dict[str, Any] = {}  # progress of the best agent, if the run ended with it
         self._saved: checkpoint.Saved | None = None  # what a resumed run continues from
         self.unit = " steps"
@@ -113,8 +112,6 @@ class Trainer:
         # An evaluation that is due writes the row of these frames again.
         frames = self.frames - 1 if self.is_evaluation_due else self.frames
         self.recorder.resume_from(source.parent, frames)
-        for row in self.recorder.metrics.rows():
-            self._note_evaluation(row)
         try:
             self.recorder.set_state(saved.states["recorder"])
             self._restore_callbacks(saved.states["callbacks"])
@@ -330,13 +327,15 @@ class Trainer:
         """Show the last batch's return and the last evaluation behind the bar, from its next refresh on."""
         seen = self.recorder.training_return
         texts = [f"return {seen:.2f}"] if seen is not None else []
-        bar.set_postfix_str(", ".join([*texts, self._last_evaluation]), refresh=False)
+        bar.set_postfix_str(", ".join([*texts, self._last_evaluation()]), refresh=False)
 
-    def _note_evaluation(self, row: Mapping[str, float]) -> None:
-        """Note a row's evaluation for the bar, if it has one. The untrained agent's says nothing of what is learned."""
-        if "eval/score" in row and row["frames"]:
-            success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
-            self._last_evaluation = f"score {row['eval/score']:.2f}{success} at {row['frames']:,.0f}{self.unit}"
+    def _last_evaluation(self) -> str:
+        """Return the last evaluation in the words of the bar. The untrained agent's says nothing of what is learned."""
+        measured, frames = self.recorder.measured, self.recorder.evaluated_frames
+        if not frames:
+            return "no evaluation yet"
+        success = f", success {measured['success']:.1%}" if "success" in measured else ""
+        return f"score {measured['score']:.2f}{success} at {frames:,}{self.unit}"
 
     def _learn(self, collection: Collection) -> int:
         """Let the agent learn from a batch of steps or from the data set, and return the number of frames.
@@ -386,7 +385,6 @@ class Trainer:
             self.recorder.play()
         row = self.recorder.log(self.frames, self.wall_s, self.cpu_s, is_evaluated=True, own=own)
         self.last_score = row["eval/score"]
-        self._note_evaluation(row)
         self._show(bar)
         self._call(lambda callback: callback.on_evaluation(self, row))
         self.is_evaluation_due = False
