@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import hpamdp
-from experiments.offline_benchmark.study import CANDIDATES, DOMAINS, add_rows, candidates, chosen_of, scored
+from experiments.offline_benchmark.study import CANDIDATES, DOMAINS, add_rows, candidates, chosen_of, mixed, scored
 from experiments.study_tables import Rows, read_csv, write_tables
 from hpamdp.data import minari
 from hpamdp.messages import exit_code
@@ -40,7 +40,7 @@ def run(folder: Path, domain: str) -> Rows:
             kept.write_text(json.dumps(scored(low, domain, settings, seed=SEED, eval_seed=7, **half)))
         figures = {column: json.loads(kept.read_text())[column] for column in ("score", "cpu_s")}
         rows[str(path)] = {"domain": domain, "learner": low, "settings": name, **figures}
-    judging: dict[str, Any] = {"data.dataset": f"hpamdp/{domain}/mixed-v0", "offline.updates": 8000, "seed": SEED}
+    judging: dict[str, Any] = {"data.dataset": mixed(domain), "offline.updates": 8000, "seed": SEED}
     for found in hpamdp.judge(*rows, data="minari", episodes=40, **judging):
         rows[found["agent"]] |= {
             "judged": round(found["return"], 4),

@@ -88,6 +88,11 @@ def described(domain: str, name: str) -> dict[str, Any]:
     }
 
 
+def mixed(domain: str) -> str:
+    """Return the name of the data set from which the learners learn."""
+    return f"hpamdp/{domain}/mixed-v0"
+
+
 def settings_of(low: str, domain: str) -> dict[str, Any]:
     """Return the settings of a learner that were chosen with the simulator."""
     return {**(OTHERS.get(low) or ACTOR_CRITIC[domain]), **MORE.get((low, domain), {})}
@@ -102,7 +107,7 @@ def candidates(low: str, domain: str) -> dict[str, dict[str, Any]]:
 def add_rows(low: str, domain: str, seeds: Iterable[int], settings: Mapping[str, Any], chosen_by: str) -> None:
     """Score settings with each seed, and add the rows to results.csv."""
     for seed in seeds:
-        row = {"data_set": f"hpamdp/{domain}/mixed-v0", "learner": low, "chosen_by": chosen_by, "seed": seed}
+        row = {"data_set": mixed(domain), "learner": low, "chosen_by": chosen_by, "seed": seed}
         row |= scored(low, domain, settings, seed=seed, eval_seed=seed)
         write_tables(HERE, {"results": [*read_csv(HERE / "results.csv"), row]})
 
@@ -131,7 +136,7 @@ def scored(
         film=False,
         **{
             "data": "minari",
-            "data.dataset": f"hpamdp/{domain}/mixed-v0",
+            "data.dataset": mixed(domain),
             "offline.eval_every": 0,
             "eval.layouts": 1,
             **settings,
@@ -169,7 +174,7 @@ def results_table(rows: Rows, judged: Rows) -> str:
 
 def result(low: str, domain: str, chosen_by: str, rows: Rows, judged: Rows) -> str:
     """Return the normalised scores of a learner in words, with the number of seeds unless it is ten."""
-    same = {"data_set": f"hpamdp/{domain}/mixed-v0", "learner": low, "chosen_by": chosen_by}
+    same = {"data_set": mixed(domain), "learner": low, "chosen_by": chosen_by}
     scores = [normalised(row) for row in rows if same.items() <= row.items()]
     if scores:
         return f"{spread(scores)}{'' if len(scores) == 10 else f' ({len(scores)})'}"
@@ -178,7 +183,7 @@ def result(low: str, domain: str, chosen_by: str, rows: Rows, judged: Rows) -> s
 
 
 def chosen_of(judged: Rows) -> dict[str, Any]:
-    """Return the candidate that the judge chooses, without a look at those that the simulator chose."""
+    """Return the candidate that the judge chooses; the one with the simulator's settings may not be chosen."""
     return max((row for row in judged if row["settings"] != "tuned"), key=lambda row: row["judged"])
 
 
@@ -205,7 +210,7 @@ def regret(judged: Rows) -> float:
 
 def score_of(row: dict[str, Any]) -> float:
     """Return the normalised score of a candidate."""
-    return normalised({"data_set": f"hpamdp/{row['domain']}/mixed-v0", **row})
+    return normalised({"data_set": mixed(row["domain"]), **row})
 
 
 def data_table(data: Rows) -> str:
