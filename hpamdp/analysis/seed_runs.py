@@ -34,7 +34,8 @@ from hpamdp.run_files import (
 
 FINISHED, UNFINISHED, FAILED = "finished", "unfinished", "failed"
 _SEED, _CHOICE = "seed", "choices."
-_EFFORT = {"frames", "wall_s", "cpu_s", "eval_cpu_s", "compile_cpu_s", "evaluated_frames", "kept_frames", "kept_score"}
+_TIMES = {"wall_s", "cpu_s", "eval_cpu_s", "compile_cpu_s"}
+_EFFORT = {"frames", "eval_steps", "evaluated_frames", "kept_frames", "kept_score"} | _TIMES
 _NO_METRICS = {"episodes", "finished", _SEED} | _EFFORT  # numbers of a summary
 _LARGEST = 1e100  # of a number in a statistic or a figure, so that their arithmetic does not overflow
 _LONGEST = 40  # letters of a value in a name

@@ -121,10 +121,17 @@ class OfflineConfig(Settings):
 class EvalConfig(Settings):
     """Settings of evaluations."""
 
-    every: NonNegativeInt
-    """Steps between two evaluations. If 0, only at the start and at the end. Default: the learner's recommendation."""
-    layouts: NumAtOnce = 1000
-    """Number of episodes of an evaluation. The agent acts greedily, and every evaluation has the same episodes."""
+    every: NonNegativeInt | Literal["auto"]
+    """Steps between two evaluations. If 0, only at the start and at the end. Default: the learner's recommendation.
+
+    `auto`: a fifth of `total_frames`, at most 40,000, and none at the start. After the first, an evaluation waits for
+    the next turn while those before have taken more than a twentieth as many steps as training.
+    """
+    layouts: NumAtOnce
+    """Number of episodes of an evaluation. The agent acts greedily, and every evaluation has the same episodes.
+
+    Default: 1,000, or what the learner or the problem recommends.
+    """
     seed: Seed = 0
     """Seed of these episodes."""
     stop_score: float | None = None
@@ -197,7 +204,14 @@ class RunConfig(Settings):
     @property
     def eval_every(self) -> int:
         """Distance between two evaluations, in the unit of `num_frames`; 0 if only at the start and at the end."""
-        return self.offline.eval_every if self.mode == "offline" else self.eval.every
+        if self.mode == "offline":
+            return self.offline.eval_every
+        return max(1, min(40_000, self.total_frames // 5)) if self.eval.every == "auto" else self.eval.every
+
+    @property
+    def limits_evaluations(self) -> bool:
+        """Whether evaluations wait until they take few steps beside those of training."""
+        return self.mode == "train" and self.eval.every == "auto"
 
     def resolve_device(self) -> torch.device:
         """Return the device to run on.

@@ -29,6 +29,7 @@ class Evaluation:
         filmed_steps: largest number of their steps that is kept. If None, all of them.
 
     Attributes:
+        steps: environment steps of all episodes so far.
         one_action: a line if the agent took one discrete action at every step of the last `run_agent`, else empty.
         states: the `film_state` of these episodes at the start and after every step, columns `[num_filmed, ...]`;
             empty before the first `run_agent`, or if the problem has none.
@@ -41,6 +42,7 @@ class Evaluation:
         self.filmed_steps = filmed_steps
         self.states: list[dict[str, Tensor]] = []
         self.one_action: list[str] = []
+        self.steps = 0
         self._only_action: Tensor | None = None  # of all steps of the last `run`; None if actions differ
         self.problem.warn_if_seed_is_ignored(seed)
         self.episodes = env.fixed_episodes(seed)
@@ -116,6 +118,7 @@ class Evaluation:
             row, limit = int((~over).nonzero()[0]), self.env.max_steps
             raise ProblemError(f"{self.problem.title}: evaluation episode {row} has not ended after max_steps={limit}")
         self._only_action = None if differ else first_action
+        self.steps += int(steps.sum())
         played: dict[str, Tensor] = {"return": total, "steps": steps, "score": total, **self.known}
         if options[0] is not None:
             played["option"] = options[0]

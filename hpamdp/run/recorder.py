@@ -53,7 +53,7 @@ class Recorder:
         metrics: the rows so far.
         summary: see `summarise`; empty before `finish`.
         training_return: mean return of the exploring episodes in the last batch in which some ended; None before.
-        eval_cpu_s: CPU time of the evaluations so far.
+        eval_cpu_s, eval_steps: CPU time and environment steps of the evaluations so far, with those of random play.
         measured: means of the last evaluation, also if it was before a resumption; empty before the first one.
         evaluated_frames: frames of training before it; None before the first one.
     """
@@ -70,6 +70,7 @@ class Recorder:
         self._ended: list[TensorDictBase] = []
         self._scalars: dict[str, float] = {}
         self.eval_cpu_s = 0.0
+        self.eval_steps = 0
         self._played: dict[str, np.ndarray] | None = None  # the last evaluation of this process
         self._is_current = False  # whether the agent is as it was then
         self.measured: dict[str, float] = {}
@@ -77,8 +78,7 @@ class Recorder:
         self._action_counts: Tensor | None = None  # steps with each discrete action, since the last row
         self._callback_metrics: Mapping[str, float] = {}  # the last metrics of callbacks
         self._option_scores: dict[str, float] = {}  # scores with each option held, at the last evaluation
-        random = random_agent(parts.agent.specs, parts.device, parts.agent.option_lengths)
-        self._random_scores = parts.evaluation.measure(parts.evaluation.run(random.policy))
+        self._random_scores: dict[str, float] = {}  # empty before the first evaluation
 
     def resume_from(self, folder: Path, frames: int) -> None:
         """Start the metrics with the rows of the run in `folder`, up to `frames`; warn if it has no such row."""
@@ -116,13 +116,15 @@ class Recorder:
             "held": dict(self._option_scores),
             "own": dict(self._callback_metrics),
             "actions": [] if self._action_counts is None else self._action_counts.tolist(),
+            "random": dict(self._random_scores),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`. Checkpoints of 0.3 lack its last two entries."""
+        """Continue from a `state`. Checkpoints of 0.3 lack its last three entries."""
         self._ended = [TensorDict(ended).auto_batch_size_(1) for ended in state["ended"]]
         self._scalars, self._option_scores = state["scalars"], state["held"]
         self._callback_metrics = state.get("own", {})
+        self._random_scores = state.get("random", {})
         if state.get("actions"):
             self._action_counts = torch.tensor(state["actions"], device=self.parts.device)
 
@@ -225,7 +227,8 @@ class Recorder:
         if is_finished:
             self._measure(frames)
         measured = self.measured
-        effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s, "eval_cpu_s": self.eval_cpu_s}
+        effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
+        effort |= {"eval_cpu_s": self.eval_cpu_s, "eval_steps": self.eval_steps}
         if self.evaluated_frames not in (None, frames):
             effort[EVALUATED_FRAMES] = self.evaluated_frames
         env = self.parts.evaluation.problem
@@ -296,9 +299,15 @@ class Recorder:
     def play(self) -> dict[str, np.ndarray]:
         """Evaluate the agent unless it is as it was at the last evaluation, and return `Evaluation.run_agent`."""
         if self._played is None or not self._is_current:
-            cpu_before = time.process_time()
-            self._played = self.parts.evaluation.run_agent(self.parts.agent)
+            cpu_before, evaluation = time.process_time(), self.parts.evaluation
+            steps_before = evaluation.steps
+            if not self._random_scores:
+                specs, lengths = self.parts.agent.specs, self.parts.agent.option_lengths
+                random = random_agent(specs, self.parts.device, lengths)
+                self._random_scores = evaluation.measure(evaluation.run(random.policy))
+            self._played = evaluation.run_agent(self.parts.agent)
             self.eval_cpu_s += time.process_time() - cpu_before
+            self.eval_steps += evaluation.steps - steps_before
             self._is_current = True
         return self._played
 

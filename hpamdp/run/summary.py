@@ -43,7 +43,7 @@ def summarise(
         measured: means of the agent's final evaluation, from `Evaluation.measure`; empty if there was none.
         random: the same means for the uniformly random agent.
         effort: `frames` of training, and `wall_s` and `cpu_s` of this run. With `mode=eval`, they are the times of
-            the evaluation, otherwise of training with its evaluations, which took `eval_cpu_s`.
+            the evaluation, otherwise of training with its evaluations, which took `eval_cpu_s` for `eval_steps` steps.
         is_finished: whether the run reached its end.
     """
     return {
@@ -154,6 +154,7 @@ def _shares(summary: Mapping[str, Any]) -> str:
     total = summary.get("cpu_s") or 0.0
     if total < 1.0:
         return ""
-    named = {"evaluations": summary.get("eval_cpu_s", 0.0), "compiling": summary.get("compile_cpu_s", 0.0)}
+    played = f"evaluations of {summary.get('eval_steps', 0):,.0f} steps"
+    named = {played: summary.get("eval_cpu_s", 0.0), "compiling": summary.get("compile_cpu_s", 0.0)}
     shares = [f"{name} {seconds / total:.0%}" for name, seconds in named.items() if seconds >= 0.005 * total]
     return f" ({total:.0f} CPU s" + (f": {', '.join(shares)})" if shares else ")")

@@ -103,6 +103,7 @@ class Trainer:
         self.wall_s = progress["wall_s"]
         self.cpu_s = progress["cpu_s"]
         self.recorder.eval_cpu_s = progress.get("eval_cpu_s", 0.0)
+        self.recorder.eval_steps = progress.get("eval_steps", 0)
         self.last_score = progress["last_score"]
         self.is_evaluation_due = progress.get("evaluation_due", False)
         if not is_training:
@@ -302,7 +303,7 @@ class Trainer:
             if is_new and self._saved is None and self.parts.data is not None:
                 self.parts.agent.add_demonstrations(self.parts.data.batch, self.parts.data.decisions)
             self._call(lambda callback: callback.on_start(self))
-            if is_new or self.is_evaluation_due:
+            if (is_new and not run.limits_evaluations) or self.is_evaluation_due:
                 self._evaluate(bar, request)
             while not self.is_over() and request.signal is None:
                 num = self._learn(collection)
@@ -312,7 +313,9 @@ class Trainer:
                 bar.update(num)
                 self._show(bar)
                 self._call(lambda callback: callback.on_batch(self))
-                if self.is_over() or _is_due(last, self.frames, run.eval_every):
+                is_turn = _is_due(last, self.frames, run.eval_every)
+                is_affordable = not run.limits_evaluations or self.recorder.eval_steps <= 0.05 * self.frames
+                if self.is_over() or (is_turn and is_affordable):
                     self._evaluate(bar, request)
                 elif _is_due(last, self.frames, run.log_every):
                     own = metrics_of(self.callbacks, self)
@@ -460,6 +463,7 @@ class Trainer:
             "wall_s": self.wall_s,
             "cpu_s": self.cpu_s,
             "eval_cpu_s": self.recorder.eval_cpu_s,
+            "eval_steps": self.recorder.eval_steps,
             "last_score": self.last_score,
             "evaluation_due": self.is_evaluation_due,
             **self._kept,
