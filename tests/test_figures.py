@@ -73,6 +73,8 @@ def test_learning_curves_show_the_logged_values_between_the_references(tmp_path)
     assert {(0.0, 0.5, 1.0, 1.5), (-0.9, -0.9), (3.6, 3.6)} <= lines
     written = {text.get_text() for text in axes.texts}
     assert written == {"random \u22120.90", "ceiling 3.60", "this agent 1.50", "exploring 0.30"}
+    few = learning_curves(rows[:2], {}, (Metric("score", "Score"),)).axes[0].lines[:2]
+    assert [line.get_linestyle() for line in few] == ["None", "None"]  # points, without a line that nobody measured
 
 
 def arrays_of(folder):
