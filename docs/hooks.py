@@ -414,6 +414,7 @@ def runs_table(words: str) -> str:
     """
     from experiments.study_tables import FEWEST_SEEDS, groups, standing_rows, with_enough_seeds
     from hpamdp.analysis.statistics import spread
+    from hpamdp.figure_style import with_minus
 
     path, _, condition = words.partition(": ")
     column, _, values = condition.partition("=")
@@ -434,7 +435,7 @@ def runs_table(words: str) -> str:
         table.append([*numbers, str(len(same)), *spreads])
     if len(table) == 2:
         return f"No {FEWEST_SEEDS} seeds of it have been run yet."
-    return "\n".join(f"| {' | '.join(row)} |" for row in table)
+    return with_minus("\n".join(f"| {' | '.join(row)} |" for row in table))
 
 
 DIRECTIVES: dict[str, Callable[[str], str]] = {

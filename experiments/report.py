@@ -21,6 +21,7 @@ from types import ModuleType
 
 import fill_numbers
 
+from hpamdp.figure_style import with_minus
 from hpamdp.messages import exit_code
 
 HERE = Path(__file__).resolve().parent
@@ -70,7 +71,7 @@ def run(script: Path) -> str:
 
 
 def tables_in(printed: str) -> str:
-    """Return the printed lines from the first of the first table to the last of the last table.
+    """Return the printed lines from the first of the first table to the last of the last table, with minus signs.
 
     Raises:
         ValueError: there is no table.
@@ -79,7 +80,7 @@ def tables_in(printed: str) -> str:
     rows = [number for number, line in enumerate(lines) if line.startswith("|")]
     if not rows:
         raise ValueError("it prints no table")
-    return "\n".join(lines[rows[0] : rows[-1] + 1])
+    return with_minus("\n".join(lines[rows[0] : rows[-1] + 1]))
 
 
 def renew(page: Path, tables: Mapping[str, str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,6 +63,11 @@ def draw_spread(axes: Axes, x: ArrayLike, mean: np.ndarray, deviation: np.ndarra
     axes.fill_between(x, mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
 
 
+def with_minus(text: str) -> str:
+    """Return a text whose negative numbers have the minus sign of the axes; settings such as `x=-1` stay."""
+    return re.sub(r"(?<![^\s(])-(?=[\d.])", "\u2212", text)
+
+
 def label_ends(axes: Axes, labels: list[tuple[float, str, str]], ends: float = 1.0) -> None:
     """Write labels (height, text, colour) to the right of the axes, at least a line's height apart.
 
@@ -80,7 +86,9 @@ def label_ends(axes: Axes, labels: list[tuple[float, str, str]], ends: float = 1
             clip_on=False,
             transform=axes.transAxes,
         )
-        axes.annotate(text, (1.04, place), xycoords="axes fraction", color=colour, va="center", fontsize=8.5)
+        axes.annotate(
+            with_minus(text), (1.04, place), xycoords="axes fraction", color=colour, va="center", fontsize=8.5
+        )
 
 
 def apart(heights: list[float], gap: float) -> list[float]:

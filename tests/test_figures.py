@@ -72,7 +72,9 @@ def test_learning_curves_show_the_logged_values_between_the_references(tmp_path)
     lines = {tuple(line.get_ydata()) for line in axes.lines}
     assert {(0.0, 0.5, 1.0, 1.5), (-0.9, -0.9), (3.6, 3.6)} <= lines
     written = {text.get_text() for text in axes.texts}
-    assert written == {"random -0.90", "ceiling 3.60", "this agent 1.50", "exploring 0.30"}
+    assert written == {"random \u22120.90", "ceiling 3.60", "this agent 1.50", "exploring 0.30"}
+    few = learning_curves(rows[:2], {}, (Metric("score", "Score"),)).axes[0].lines[:2]
+    assert [line.get_linestyle() for line in few] == ["None", "None"]  # points, without a line that nobody measured
 
 
 def arrays_of(folder):
@@ -85,7 +87,7 @@ def test_trajectories_show_the_paths_and_scores_from_the_best_to_the_worst(tmp_p
     evaluation = arrays_of(tmp_path)
     panels = boats.draw(evaluation, {})["trajectories.png"].axes
     order = np.lexsort((evaluation["outcome"], -evaluation["score"]))
-    assert [float(axes.get_title().split()[0]) for axes in panels] == pytest.approx(
+    assert [float(axes.get_title().split()[0].replace("\u2212", "-")) for axes in panels] == pytest.approx(
         evaluation["score"][order], abs=5e-3
     )
     for axes, episode in zip(panels, order, strict=True):

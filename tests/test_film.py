@@ -55,13 +55,14 @@ def test_the_film_of_an_evaluation_ends_with_the_picture_of_every_end(played):
     assert any((one != other).any() for one, other in itertools.pairwise(pictures))
 
 
-def test_other_problems_are_filmed_by_their_own_pictures():
-    player = load_agent(None, ["env=sliding", "high=none", "low=random", "eval.layouts=1", "film=true"])
+@pytest.mark.parametrize(("problem", "together"), [("sliding", (60, 120, 3)), ("platform", (60, 180, 3))])
+def test_other_problems_are_filmed_by_their_own_pictures(problem, together):
+    player = load_agent(None, [f"env={problem}", "high=none", "low=random", "eval.layouts=2", "film=true"])
     states = []
     player.evaluation().run(player.agent.policy, states)
-    (track,) = film.tracks_of(states, num_steps=3)
-    pictures = list(player.evaluation().problem.film(track, 8.0, 60))
-    assert len(pictures) == 2 * len(track) and pictures[0].shape == (60, 60, 3)
+    tracks = film.tracks_of(states, num_steps=3)
+    assert len(list(player.evaluation().problem.film(tracks[0], 8.0, 60))) == 2 * len(tracks[0])
+    assert next(film.film(player.evaluation().problem, tracks, 8.0, 60)).shape == together
 
 
 def test_a_film_without_pictures_or_of_another_ending_is_refused(tmp_path):

@@ -27,6 +27,7 @@ from experiments.study_tables import (
     write_tables,
 )
 from hpamdp.analysis.statistics import mean_interval, spread
+from hpamdp.figure_style import with_minus
 
 EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
 CONFIG = (
@@ -476,4 +477,4 @@ def test_a_share_on_crossing_is_of_the_best_return_from_the_same_places(tmp_path
 
 def test_the_page_of_lengths_has_the_table_of_its_stored_runs(capsys):
     study("lengths").main([])
-    assert capsys.readouterr().out in (EXPERIMENTS / "lengths" / "README.md").read_text()
+    assert with_minus(capsys.readouterr().out) in (EXPERIMENTS / "lengths" / "README.md").read_text()

@@ -36,27 +36,29 @@ class NoPictureError(FilmError):
     """Raised if there is no picture to write."""
 
 
-def grid(num_episodes: int) -> tuple[int, int]:
+def grid(num_episodes: int, most_columns: int = COLUMNS) -> tuple[int, int]:
     """Return how many episodes a film shows below each other, and how many side by side."""
-    columns = min(COLUMNS, num_episodes)
+    columns = min(most_columns, num_episodes)
     return -(-num_episodes // columns), columns
 
 
 def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> Iterator[np.ndarray]:
     """Yield the pictures of episodes side by side, uint8 `[height, width, 3]`, or none if the problem draws none.
 
+    Pictures three times as wide as high have a row each.
+
     Args:
         env: the problem, which draws the pictures.
         tracks: the `film_state` of each episode at the start and after every step, columns `[1, ...]`.
         fps: pictures per second.
-        size: width of one episode, px.
+        size: height and width of one episode whose pictures are square, px.
     """
     episodes = [iter(env.film(track, fps, size)) for track in tracks]
     shown = [picture for episode in episodes if (picture := next(episode, None)) is not None]
     if not episodes or len(shown) < len(episodes):
         return
     while True:
-        together = _side_by_side(shown)
+        together = _side_by_side(shown, max(1, COLUMNS * size // shown[0].shape[1]))
         yield together
         following = [next(episode, None) for episode in episodes]
         if all(picture is None for picture in following):
@@ -66,8 +68,8 @@ def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> Itera
     yield from itertools.repeat(together, round(_PAUSE * fps))
 
 
-def _side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    rows, columns = grid(len(pictures))
+def _side_by_side(pictures: Sequence[np.ndarray], most_columns: int) -> np.ndarray:
+    rows, columns = grid(len(pictures), most_columns)
     blank = np.full_like(pictures[0], 255)
     shown = [*pictures, *[blank] * (rows * columns - len(pictures))]
     return np.concatenate([np.concatenate(shown[row * columns : (row + 1) * columns], 1) for row in range(rows)])

@@ -376,12 +376,12 @@ class PAMDPEnv(EnvBase):
         return {name: column[:num].cpu().clone() for name, column in self.env_state().items()}
 
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterable[np.ndarray]:
-        """Return the pictures of one episode, uint8 `[size, size, 3]` each; none if the problem has no pictures.
+        """Return the pictures of one episode, uint8 `[height, width, 3]` each; none if the problem has no pictures.
 
         Args:
             track: its `film_state` at the start and after every step, columns `[1, ...]`.
             fps: pictures a second.
-            size: px from edge to edge.
+            size: height and width of square pictures, px.
         """
         return ()
 

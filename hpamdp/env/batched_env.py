@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
@@ -247,7 +247,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         raise NotImplementedError(f"{type(self).__name__} has no hand-written player")
 
     def draw(self, track: Sequence[EpisodeState]) -> np.ndarray:
-        """Return a picture of an episode so far, uint8 `[480, 480, 3]`.
+        """Return a picture of an episode so far, uint8 `[480, 480, 3]`, or of another shape: films shrink all alike.
 
         Args:
             track: the states of one environment from the start on, columns `[1]`.
@@ -260,8 +260,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             return
         states = [type(self._state)(**columns) for columns in track]
         for i in range(1, len(states) + 1):
-            picture = np.array(Image.fromarray(self.draw(states[:i])).resize((size, size), Image.Resampling.LANCZOS))
-            yield from itertools.repeat(picture, max(1, round(fps * self.seconds_per_step)))
+            picture = ImageOps.scale(Image.fromarray(self.draw(states[:i])), size / 480, Image.Resampling.LANCZOS)
+            yield from itertools.repeat(np.array(picture), max(1, round(fps * self.seconds_per_step)))
 
     @property
     def position(self) -> Tensor | None:

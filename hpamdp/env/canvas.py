@@ -19,7 +19,7 @@ BAD, BAD_EDGE = "#f1cbbd", "#b9503a"
 # Shapes are drawn SMOOTH times too large and then averaged down. Text is written afterwards, because Pillow smooths
 # text itself.
 SMOOTH = 3
-PAPER = 480.0  # width and height of every picture in units of paper
+PAPER = 480.0  # width of every picture in units of paper, and height of the square ones
 
 
 class Canvas:
@@ -31,9 +31,9 @@ class Canvas:
         self._unit = image.width / PAPER
 
     @classmethod
-    def for_shapes(cls, size: int) -> Canvas:
-        """Return an empty canvas for shapes. `smoothed` then returns a canvas of `size` px for the labels."""
-        return cls(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
+    def for_shapes(cls, size: int, height: float = PAPER) -> Canvas:
+        """Return an empty canvas for shapes. `smoothed` then returns a canvas `size` px wide for the labels."""
+        return cls(Image.new("RGB", (size * SMOOTH, round(size * SMOOTH * height / PAPER)), BACKGROUND))
 
     def smoothed(self) -> Canvas:
         """Return a canvas for labels, with the shapes averaged down."""

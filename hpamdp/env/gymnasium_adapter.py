@@ -117,7 +117,7 @@ class GymnasiumAdapter(gymnasium.Env):
 
     Args:
         problem: the environment with NumPy in and out.
-        render_mode: None or `rgb_array` (`render` returns uint8 `[480, 480, 3]`).
+        render_mode: None or `rgb_array` (`render` returns uint8 `[height, width, 3]`).
 
     `reset(seed=s)` starts the first episode of seed s, `reset()` continues with the next one. The generators of torch,
     NumPy and Python are neither read nor moved.
@@ -164,7 +164,7 @@ class GymnasiumAdapter(gymnasium.Env):
         self._problem.is_reset = False
 
     def render(self) -> np.ndarray | None:
-        """Return a picture of the episode so far, uint8 `[480, 480, 3]`; None without a render mode."""
+        """Return a picture of the episode so far, uint8 `[height, width, 3]`; None without a render mode."""
         if self.render_mode is None:
             name = type(self).__name__
             gymnasium.logger.warn(f'{name}: render needs an environment that was made with render_mode="rgb_array"')

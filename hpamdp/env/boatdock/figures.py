@@ -17,7 +17,7 @@ from hpamdp.env.boatdock.harbour import CONGRUENT, INCONGRUENT, NOT_CHOSEN
 from hpamdp.env.boatdock.physics import DOCK_RADIUS, HARBOUR_RADIUS, OUTCOMES, SUCCESS
 from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 from hpamdp.env.boatdock.task import Outcome
-from hpamdp.figure_style import AGENT, FAINT, INK, REFERENCES, label_ends
+from hpamdp.figure_style import AGENT, FAINT, INK, REFERENCES, label_ends, with_minus
 
 _WATER, _RIM, _DOCK, _DOCK_EDGE = "#eef4f6", "#9fb9c2", "#f4dfb0", "#c8963e"
 
@@ -101,7 +101,8 @@ def _draw_episode(axes: Axes, evaluation: Mapping[str, np.ndarray], episode: int
     axes.set_xlim(-HARBOUR_RADIUS - 3, HARBOUR_RADIUS + 3)
     axes.set_ylim(HARBOUR_RADIUS + 3, -HARBOUR_RADIUS - 3)  # y points down
     axes.set_aspect("equal")
-    axes.set_title(episode_title(evaluation, episode, names), fontsize=8.5, fontweight="normal", loc="center", pad=2)
+    title = with_minus(episode_title(evaluation, episode, names))
+    axes.set_title(title, fontsize=8.5, fontweight="normal", loc="center", pad=2)
 
 
 def episode_title(evaluation: Mapping[str, np.ndarray], episode: int, names: tuple[str, ...] = ()) -> str:

@@ -65,7 +65,7 @@ class PlatformEnv(KernelEnv[PlatformState]):
         return [-1.0] * len(self.observation_names), [1.0] * len(self.observation_names)
 
     def draw(self, track: Sequence[PlatformState]) -> np.ndarray:
-        """Return a picture of the course, uint8 `[480, 480, 3]`."""
+        """Return a picture of the course, uint8 `[240, 1440, 3]`."""
         return rendering.draw(track)
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:

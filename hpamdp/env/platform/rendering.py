@@ -12,18 +12,17 @@ from hpamdp.env.platform.rules import PlatformState
 
 _GROUND, _AGENT, _ENEMY, _PATH = "#8a9a7b", "#2f6690", "#b9503a", "#86aecb"
 _SCALE = (PAPER - 40.0) / (rules.END + rules.BODY_WIDTH)  # units of paper for each px
-_LEFT, _TOP = 20.0, 270.0  # where the course begins, and the height of the platforms' tops
-_DEPTH = 16.0  # of the platforms
+_LEFT, _TOP = 20.0, 60.0  # where the course begins, and the height of the platforms' tops
+_DEPTH, _HEIGHT = 10.0, 80.0  # of the platforms, and of the picture
 
 
-def draw(track: Sequence[PlatformState], size: int = 480) -> np.ndarray:
-    """Return a picture of an episode, uint8 `[size, size, 3]`.
+def draw(track: Sequence[PlatformState]) -> np.ndarray:
+    """Return a picture of an episode, uint8 `[240, 1440, 3]`.
 
     Args:
         track: the states of one environment at the start and after each action, columns `[1]`.
-        size: px from edge to edge.
     """
-    canvas = Canvas.for_shapes(size)
+    canvas = Canvas.for_shapes(1440, _HEIGHT)
     for left, right in zip(rules.LEFT, rules.RIGHT, strict=True):
         corners = [(left, 0.0), (right, 0.0), (right, -_DEPTH / _SCALE), (left, -_DEPTH / _SCALE)]
         canvas.polygon([_on_paper(x, y) for x, y in corners], _GROUND)
@@ -38,8 +37,8 @@ def draw(track: Sequence[PlatformState], size: int = 480) -> np.ndarray:
     has_fallen = int(last.outcome) == rules.FELL
     _draw_body(canvas, float(last.x), _AGENT, -rules.BODY_HEIGHT if has_fallen else 0.0)
     finished = canvas.smoothed()
-    finished.caption(int(last.steps), int(last.outcome), rules.OUTCOMES, word="action")
-    finished.write((PAPER - 18.0, 22.0), f"{100.0 * float(last.x) / rules.END:.0f} % of the course", INK, anchor="rm")
+    finished.caption(int(last.steps), int(last.outcome), rules.OUTCOMES, word="action", top=14.0, bottom=14.0)
+    finished.write((PAPER / 2.0, 14.0), f"{100.0 * float(last.x) / rules.END:.0f} % of the course", INK, anchor="mm")
     return np.array(finished.image)
 
 
