@@ -253,7 +253,7 @@ def choosing_class(group: str, cls: type) -> str:
     if stored is not None and stored.node.get(TARGET) != dotted:
         _shared_names.add((group, name))
     check_base_class(group, name, dotted)
-    more: dict[str, Any] = {"low": {"budget": _BUDGET}, "env": USUAL_LEARNER}.get(group, {})
+    more = {"low": {"budget": _BUDGET}, "env": USUAL_LEARNER}.get(group, {})
     settings = defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group]))
     ConfigStore.instance().store(name=name, group=group, node={TARGET: dotted, **settings, **more})
     return name
