@@ -9,6 +9,8 @@ from contextlib import contextmanager
 
 from hpamdp.search_path import is_clone
 
+# Ctrl-C, a cluster's stop, the warning of SLURM and others before the time limit, and a closed terminal.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGXCPU)
 # If this variable is set, Python 3.11 or later does not put the working directory first.
 _VARIABLE, _OURS = "PYTHONSAFEPATH", "hpamdp"
 

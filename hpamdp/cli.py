@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from hpamdp.children import children_protected, unprotect_children
-from hpamdp.config.command_line import CommandLine, completed, parse, saved_run, usual_learner
+from hpamdp.config.command_line import CommandLine, completed, parse, saved_run
 from hpamdp.config.compose import conf_dir, job_overrides
 from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.hydra_errors import BEFORE_A_JOB, explained
@@ -126,7 +126,6 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
         return _run_job(cfg, start)
 
     try:
-        line = line.with_words(usual_learner({name: each.value() for name, each in line.given().items()}))
         line = completed(_with_saved_choices(line), conf)
         sys.argv[1:] = line.argv()  # which Hydra parses
         hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()

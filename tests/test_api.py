@@ -23,8 +23,8 @@ from torchrl.collectors import Collector
 from toy_environments import Toy
 
 import hpamdp
-from hpamdp.config.command_line import usual_learner
 from hpamdp.env.errors import ProblemError
+from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run_files import CHECKPOINT_NAME, METRICS_NAME
 
@@ -94,6 +94,10 @@ def test_a_two_level_agent_holds_its_option_for_an_episode_in_gymnasium(boat_age
     assert np.mean(scores) > 3.0
 
 
+class Ledges(PlatformEnv):
+    """A batched problem of a user."""
+
+
 @pytest.mark.parametrize(
     ("settings", "low"),
     [
@@ -109,10 +113,8 @@ def test_hppo_learns_problems_that_nobody_knows_unless_a_learner_is_chosen(setti
     assert f"low={low}," in repr(agent)
     named = hpamdp.train("gymnasium", **{**TINY, "env.id": "hpamdp/Goal-v0", **settings, "folder": "named"})
     assert f"low={low}," in repr(named)
-    for usual in ({}, {"mode": "train"}, {"checkpoint": None, "resume": None}, {"resume": ""}, {"resume": "auto"}):
-        assert usual_learner({"env": "rddl", **usual}) == ["low=hppo"]
-    for chosen in ({"env": "boatdock"}, {"env": "rddl", "checkpoint": "run"}, {"env": "gymnasium", "mode": "offline"}):
-        assert usual_learner(chosen) == []
+    of_class = hpamdp.train(Ledges, **{**TINY, **settings, "folder": "class"})
+    assert f"low={low}," in repr(of_class)
 
 
 def test_an_own_environment_object_is_trained_in_a_cell_and_stays_as_it_is():

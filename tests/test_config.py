@@ -10,6 +10,7 @@ from conftest import CONF, choices, compose_config, make_config
 from omegaconf import OmegaConf
 from pydantic import Field, PositiveInt
 
+from hpamdp.config.command_line import search_word
 from hpamdp.config.components import (
     CALLBACK,
     GROUPS,
@@ -249,6 +250,7 @@ def test_a_yaml_holds_only_what_differs_from_its_class_and_every_setting_has_its
     for group, name in (*FILES, *((CALLBACK, name) for name in choices(CALLBACK))):
         given = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())
         target = given.pop("_target_")
+        given.pop("defaults", None)
         if target is not None:
             model = settings_model(load_class(target), SUPPLIED_ARGUMENTS.get(group, ()))
             defaults = defaults_of(model)
@@ -256,6 +258,36 @@ def test_a_yaml_holds_only_what_differs_from_its_class_and_every_setting_has_its
             nameless = sorted(model.model_fields.keys() - meanings_of(model).keys())
             offenders += [f"{group}/{name}: {key}" for key in (*same, *nameless)]
     assert not offenders
+
+
+@pytest.mark.parametrize(
+    ("words", "low"),
+    [
+        ("env=platform", "hyar"),
+        ("env=gymnasium env.id=CartPole-v1", "hppo"),
+        ("env=gymnasium env.id=CartPole-v1 low=pdqn", "pdqn"),
+        ("env=rddl", "hppo"),
+        ("env=own", "hppo"),
+        ("env=pole", "hppo"),
+        ("env=ledges", "hyar"),
+        ("experiment=pole", "hppo"),
+        ("experiment=pole low=hsac", "hsac"),
+        ("experiment=chosen", "pdqn"),
+    ],
+)
+def test_hppo_learns_the_problems_of_users_unless_a_learner_is_chosen(words, low, tmp_path):
+    files = {
+        "env/own": "_target_: hpamdp.env.platform.environment.PlatformEnv",
+        "env/pole": "defaults: [gymnasium]\nid: CartPole-v1",
+        "env/ledges": "defaults: [platform]",
+        "experiment/pole": "# @package _global_\ndefaults: [override /env: pole]",
+        "experiment/chosen": "# @package _global_\ndefaults: [override /env: gymnasium, override /low: pdqn]",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.yaml").write_text(text)
+    cfg = compose_config([search_word([str(tmp_path)]), "high=none", *words.split()])
+    assert read(cfg).low.name == low
 
 
 def test_a_learner_gets_what_it_needs_on_a_problem_and_the_command_line_has_the_last_word():

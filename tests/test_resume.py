@@ -12,8 +12,8 @@ from test_grid import SHORT, SHORT_SELECTORS
 from tqdm import tqdm
 
 import hpamdp
+from hpamdp.children import STOP_SIGNALS
 from hpamdp.run import checkpoint
-from hpamdp.run.stopping import STOP_SIGNALS
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=320", "eval.layouts=2", "eval.every=0", "log_every=64"]

@@ -11,12 +11,14 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
+import yaml
 from conftest import CONF, choices
 
 from hpamdp import messages
 from hpamdp.config.command_line import completed, parse
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import read_saved
 from hpamdp.messages import warn
 from hpamdp.run import sweep as run_sweep
 from hpamdp.run import train
@@ -72,6 +74,12 @@ def test_a_failing_job_loses_no_other_and_is_named_at_the_end(command, jobs, tmp
     assert "Traceback" in (tmp_path / "sweep/2/error.txt").read_text()
     assert out.endswith("4 jobs: 2 finished; 1 refused; 1 failed\n"), "there is no best one of one configuration"
     assert {path.name for path in (tmp_path / "sweep").iterdir()} == {"0", "1", "2", "3", "multirun.yaml", "report.csv"}
+
+
+def test_each_job_of_a_sweep_over_problems_has_the_usual_learner_of_its_problem(command, jobs, tmp_path):
+    code, *_ = command("-m", "env=gymnasium,rddl,platform", "high=none", "hydra.sweep.dir=sweep")
+    saved = [read_saved(yaml.safe_load((tmp_path / f"sweep/{number}/config.yaml").read_text())) for number in range(3)]
+    assert code == 0 and [each.low.name for each in saved] == ["hppo", "hppo", "hyar"]
 
 
 def test_the_best_score_is_the_highest_mean_over_seeds(command, jobs):

@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
+from hpamdp.children import STOP_SIGNALS
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.registration import register
 from hpamdp.env.traffic import network
@@ -299,13 +300,16 @@ def test_a_sumo_that_dies_is_told_in_one_line(make):
     assert "\n" not in str(raised.value)
 
 
-def test_the_process_of_sumo_and_its_files_are_gone_after_close():
+def test_the_process_of_sumo_ends_with_its_files_at_once_on_close_and_by_no_signal_of_the_run():
     env = TrafficLights(minutes=1)
     env.reset(seed=0)
     process, folder = env._simulation._process, env._simulation._folder.name
+    for number in STOP_SIGNALS:  # a cluster may send them to all processes of a run
+        os.kill(process.pid, number)
+    env.step(action(0))
     assert process.poll() is None and os.path.isdir(folder)
     env.close()
-    assert process.poll() == 0 and not os.path.exists(folder)
+    assert process.poll() == -signal.SIGKILL and not os.path.exists(folder)
 
 
 def test_the_files_of_a_run_that_was_killed_are_removed_by_its_simulation():

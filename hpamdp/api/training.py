@@ -13,7 +13,7 @@ from typing import Any
 from hpamdp.api.agent import Agent
 from hpamdp.api.arguments import Problem, choices_and_settings, flag, path_argument, problem_of
 from hpamdp.api.loading import check_problem, check_shared_names, loaded, torch_restored
-from hpamdp.config.command_line import SEARCH_PATH, parsed_words, usual_learner
+from hpamdp.config.command_line import SEARCH_PATH
 from hpamdp.config.compose import job_overrides, setting_of
 from hpamdp.config.errors import ConfigError, problems_explained
 from hpamdp.config.outside_jobs import check_no_sweep, composed, own_hydra, searching
@@ -143,9 +143,7 @@ def _given(
     if problem.num_envs is not None:
         settings = {"num_envs": problem.num_envs, **settings}
     choices, own = choices_and_settings(settings)
-    words = [*problem.words, *choices]
-    words += usual_learner({**dict(own), **{each.key_or_group: each.value() for each in parsed_words(words)}})
-    words = [*searching(config_dirs), *words]
+    words = [*searching(config_dirs), *problem.words, *choices]
     if settings.get("resume") is not None:
         resumed, trust = str(settings["resume"]), ["trust=true"] if settings.get("trust") is True else []
         check_shared_names(checkpoint.find(resumed, "resume"), words)

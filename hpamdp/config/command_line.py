@@ -32,8 +32,6 @@ GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
 SEARCH_PATH = "hydra.searchpath"
 # The folder of conf/ with what `hpamdp tune` searches for each learner.
 SEARCH = "search"
-# Problems that users write themselves. H-PPO has recipes for them.
-_UNKNOWN_PROBLEMS = ("gymnasium", "rddl")
 # Flags of Hydra, with their short forms and their arguments for argparse.
 _SWITCH: dict[str, Any] = {"action": "store_true"}
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -251,19 +249,6 @@ def saved_run(line: CommandLine) -> tuple[str, str] | None:
         return None  # the command line alone describes the run
     is_refused = where == "checkpoint" and values.get("mode") != "eval"
     return None if is_refused else (source, where)
-
-
-def usual_learner(given: Mapping[str, Any]) -> list[str]:
-    """Return the word for H-PPO if a run trains on a problem that users write, and settings choose no learner.
-
-    An experiment and a saved run have a learner.
-
-    Args:
-        given: settings by name.
-    """
-    is_saved = bool(given.get("checkpoint")) or (given.get("resume") or RESUME_AUTO) != RESUME_AUTO
-    is_chosen = is_saved or "low" in given or given.get("experiment") or (given.get("mode") or "train") != "train"
-    return [] if is_chosen or given.get("env") not in _UNKNOWN_PROBLEMS else ["low=hppo"]
 
 
 def completed(line: CommandLine, conf: Path) -> CommandLine:

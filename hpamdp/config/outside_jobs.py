@@ -22,6 +22,7 @@ from hpamdp.config.command_line import folder_path, parse, search_word
 from hpamdp.config.components import (
     SUPPLIED_ARGUMENTS,
     TARGET,
+    USUAL_LEARNER,
     check_base_class,
     defaults_of,
     file_of,
@@ -252,7 +253,7 @@ def choosing_class(group: str, cls: type) -> str:
     if stored is not None and stored.node.get(TARGET) != dotted:
         _shared_names.add((group, name))
     check_base_class(group, name, dotted)
-    budget = {"budget": _BUDGET} if group == "low" else {}
+    more = {"low": {"budget": _BUDGET}, "env": USUAL_LEARNER}.get(group, {})
     settings = defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group]))
-    ConfigStore.instance().store(name=name, group=group, node={TARGET: dotted, **settings, **budget})
+    ConfigStore.instance().store(name=name, group=group, node={TARGET: dotted, **settings, **more})
     return name

@@ -19,6 +19,7 @@ from hpamdp.config.components import (
     CALLBACK,
     GROUPS,
     TARGET,
+    USUAL_LEARNER,
     defaults_of,
     model_of,
 )
@@ -43,7 +44,9 @@ class CompletedFiles(_FileSource):
         """Read a yaml file, and add the settings that it does not give."""
         result: ConfigResult = super().load_config(config_path)
         if isinstance(result.config, DictConfig):
-            result.config = OmegaConf.merge(_defaults(config_path, result.config), result.config)
+            is_own_problem = self.provider != "main" and config_path.startswith("env/")
+            learner = USUAL_LEARNER if is_own_problem else {}
+            result.config = OmegaConf.merge(learner, _defaults(config_path, result.config), result.config)
         return result
 
 

@@ -12,10 +12,9 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, ClassVar
 
+from hpamdp.children import STOP_SIGNALS
 from hpamdp.messages import one_line
 
-# Ctrl-C, a cluster's stop, the warning of SLURM and others before the time limit, and a closed terminal.
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGXCPU)
 _URGENT = (signal.SIGINT, signal.SIGTERM)
 _SAME_REQUEST_S = 1.0  # `timeout 60 make run` and some launchers deliver a signal twice
 

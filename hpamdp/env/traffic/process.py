@@ -13,11 +13,12 @@ from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
+from hpamdp.children import STOP_SIGNALS, children_without
 from hpamdp.env.errors import ProblemError
 from hpamdp.env.traffic.simulation import FOLDER_PREFIX, Seen, Simulation, Task
 
 _PROGRAM = f"from {Simulation.__module__} import serve; serve()"
-_PATIENCE_S = 2.0  # until a process that has nothing more to do ends
+_PATIENCE_S = 2.0  # until a dead process has an exit code
 
 
 class SimulationProcess:
@@ -43,16 +44,16 @@ class SimulationProcess:
         self._connection, other = Pipe()
         # The folder is the working directory, so that Python imports nothing from the user's.
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _PROGRAM, str(other.fileno())],
-            env=environment,
-            cwd=self._folder.name,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            pass_fds=[other.fileno()],
-            start_new_session=True,  # Ctrl-C in a terminal is for the run alone
-        )
+        with children_without(*STOP_SIGNALS):  # they are for the run alone
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _PROGRAM, str(other.fileno())],
+                env=environment,
+                cwd=self._folder.name,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                pass_fds=[other.fileno()],
+            )
         other.close()
         try:
             self._call("__init__", (task, Path(self._folder.name)))
@@ -85,11 +86,8 @@ class SimulationProcess:
         return f"died (exit code {code})" if code >= 0 else f"died (signal {-code}, {signal.Signals(-code).name})"
 
     def close(self) -> None:
-        """End the process and remove its files."""
+        """End the process at once, also inside an episode, and remove its files."""
         self._connection.close()
-        try:
-            self._process.wait(_PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._process.kill()
+        self._process.wait()
         self._folder.cleanup()

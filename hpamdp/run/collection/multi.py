@@ -10,7 +10,7 @@ from typing import Any
 
 from torchrl.collectors import MultiSyncCollector
 
-from hpamdp.children import children_protected, children_without, how_it_ended
+from hpamdp.children import STOP_SIGNALS, children_protected, children_without, how_it_ended
 from hpamdp.config.schema import Config
 from hpamdp.limits import SHARED_MEMORY
 from hpamdp.messages import warn
@@ -18,7 +18,6 @@ from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.options import CARDS, WorkerOptions
 from hpamdp.run.collection.worker import EnvShard, SharedMemoryCollector
 from hpamdp.run.collection.workers import WorkerCollection
-from hpamdp.run.stopping import STOP_SIGNALS
 
 _PATIENCE_S = 2.0  # from the moment a worker's pipe is closed until it has an exit code
 

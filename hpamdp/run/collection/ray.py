@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 from torchrl.collectors.distributed import RayCollector
 
-from hpamdp.children import children_without
+from hpamdp.children import STOP_SIGNALS, children_without
 from hpamdp.config.schema import Config
 from hpamdp.messages import first_line, one_line, warn
 from hpamdp.run.assemble import AssembledRun
@@ -20,7 +20,6 @@ from hpamdp.run.collection.base import CollectionError
 from hpamdp.run.collection.options import CARDS, RayOptions
 from hpamdp.run.collection.worker import EnvShard, ShardCollector
 from hpamdp.run.collection.workers import WorkerCollection
-from hpamdp.run.stopping import STOP_SIGNALS
 
 
 class RayCollection(WorkerCollection):
