@@ -66,7 +66,7 @@ def train_hppo(domain: str, name: dict, seed: int, file: Path, limit: float) -> 
 
     problem = {"name": "rddl", "domain": domain, **SETTINGS.get(domain, {})}
     scorer = Scorer(EPISODE_SEEDS, name, file, limit)
-    hpamdp.train(problem, low="hppo", seed=seed, progress=False, callbacks=[scorer], total_frames=10**8)
+    hpamdp.train(problem, low="hppo", seed=seed, progress=False, callbacks=[scorer])
 
 
 def train_ppo(domain: str, name: dict, seed: int, file: Path, limit: float) -> None:
