@@ -268,6 +268,7 @@ def test_a_yaml_holds_only_what_differs_from_its_class_and_every_setting_has_its
         ("env=gymnasium env.id=CartPole-v1 low=pdqn", "pdqn"),
         ("env=rddl", "hppo"),
         ("env=own", "hppo"),
+        ("env=whole", "hppo"),
         ("env=pole", "hppo"),
         ("env=ledges", "hyar"),
         ("experiment=pole", "hppo"),
@@ -278,6 +279,7 @@ def test_a_yaml_holds_only_what_differs_from_its_class_and_every_setting_has_its
 def test_hppo_learns_the_problems_of_users_unless_a_learner_is_chosen(words, low, tmp_path):
     files = {
         "env/own": "_target_: hpamdp.env.platform.environment.PlatformEnv",
+        "env/whole": "defaults: [_self_]\n_target_: hpamdp.env.platform.environment.PlatformEnv",
         "env/pole": "defaults: [gymnasium]\nid: CartPole-v1",
         "env/ledges": "defaults: [platform]",
         "experiment/pole": "# @package _global_\ndefaults: [override /env: pole]",

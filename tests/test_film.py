@@ -104,8 +104,8 @@ class Endless:
 def test_pictures_are_made_when_they_are_asked_for():
     env = Endless()
     pictures = film.film(env, [None, None], 10.0, 20)
-    assert next(pictures).shape == (20, 40, 3) and env.asked == 2
-    assert len(list(itertools.islice(pictures, 4))) == 4 and env.asked == 10
+    assert next(pictures).shape == (20, 40, 3) and env.asked == 3  # one more than two shows the shape
+    assert len(list(itertools.islice(pictures, 4))) == 4 and env.asked == 11
 
 
 def test_watch_writes_a_film(tmp_path, command):
@@ -127,6 +127,10 @@ def test_watch_writes_a_film(tmp_path, command):
         (
             ["low=planner", "--size", "4096", "--episodes", "4"],
             "--size 4096 --episodes 4: a picture would have 12288 x 8192 px, but at most 8192 px on each side",
+        ),
+        (
+            ["env=platform", "low=random", "high=none", "--size", "3000", "--episodes", "1"],
+            "--size 3000 --episodes 1: a picture would have 9000 x 1500 px",
         ),
         (["low=random", "high=none"], "needs a selector"),
     ],

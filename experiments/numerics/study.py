@@ -52,7 +52,7 @@ def run(folder: Path, low: str, numerics: str) -> None:
         return
     words, variables = NUMERICS[numerics]
     fixed = ["high=none", "env.controller=congruent", f"low={low}", *LEARNERS[low].split(), "compile_updates=false"]
-    fixed += ["eval.every=0", "film=false", "seed=501", f"hydra.run.dir={folder}"]
+    fixed += ["eval.every=0", "eval.layouts=1000", "film=false", "seed=501", f"hydra.run.dir={folder}"]
     given = {word.partition("=")[0]: word for word in [*fixed, *words]}
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **variables}
     subprocess.run([sys.executable, str(ROOT / "run.py"), *given.values()], env=environment, check=True)

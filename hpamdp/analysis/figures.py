@@ -91,7 +91,7 @@ def _draw_curve(
     bold = {"linewidth": 2.0, "marker": "o", "markersize": 3.5, "zorder": 3, "clip_on": False}
     for (frames, values), label, line in ((evaluated, "this agent", bold), (trained, "exploring", faint)):
         if len(values):
-            if len(values) < 3:  # nobody measured what lies between
+            if len(values) < 3:  # too few for a curve
                 line |= {"linestyle": "", "marker": "o", "clip_on": False}
             axes.plot(frames, values, color=AGENT, **line)
             labels.append((values[-1], f"{label} {write(values[-1])}", AGENT))

@@ -22,6 +22,7 @@ GIF_FPS = 50  # largest number of pictures per second of a GIF
 COLUMNS = 3
 MOST_FPS = 240
 MOST_PIXELS = 8192  # from edge to edge of a film
+_SAMPLE = 60  # size at which a first picture shows how wide and high the others are
 _PAUSE = 1.5  # seconds for which the last picture stays
 _GIF_COLOURS = 128
 
@@ -36,29 +37,41 @@ class NoPictureError(FilmError):
     """Raised if there is no picture to write."""
 
 
-def grid(num_episodes: int, most_columns: int = COLUMNS) -> tuple[int, int]:
-    """Return how many episodes a film shows below each other, and how many side by side."""
-    columns = min(most_columns, num_episodes)
-    return -(-num_episodes // columns), columns
+class TooLargeError(FilmError):
+    """Raised if the pictures would be too large. The message lacks the sizes that were asked for."""
 
 
 def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> Iterator[np.ndarray]:
     """Yield the pictures of episodes side by side, uint8 `[height, width, 3]`, or none if the problem draws none.
 
-    Pictures three times as wide as high have a row each.
+    A row is at most `COLUMNS * size` px wide, so strips three times as wide as `size` have a row each.
 
     Args:
         env: the problem, which draws the pictures.
         tracks: the `film_state` of each episode at the start and after every step, columns `[1, ...]`.
         fps: pictures per second.
         size: height and width of one episode whose pictures are square, px.
+
+    Raises:
+        TooLargeError: a picture would have more than `MOST_PIXELS` on a side.
     """
+    sample = next(iter(env.film(tracks[0], fps, _SAMPLE)), None) if tracks else None
+    if sample is None:
+        return
+    height, width = (edge * size // _SAMPLE for edge in sample.shape[:2])
+    columns = min(max(1, COLUMNS * size // width), len(tracks))
+    rows = -(-len(tracks) // columns)
+    if max(rows * height, columns * width) > MOST_PIXELS:
+        raise TooLargeError(
+            f"a picture would have {columns * width} x {rows * height} px, but at most {MOST_PIXELS} px on each side "
+            "are possible"
+        )
     episodes = [iter(env.film(track, fps, size)) for track in tracks]
     shown = [picture for episode in episodes if (picture := next(episode, None)) is not None]
-    if not episodes or len(shown) < len(episodes):
+    if len(shown) < len(episodes):
         return
     while True:
-        together = _side_by_side(shown, max(1, COLUMNS * size // shown[0].shape[1]))
+        together = _side_by_side(shown, rows, columns)
         yield together
         following = [next(episode, None) for episode in episodes]
         if all(picture is None for picture in following):
@@ -68,8 +81,7 @@ def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> Itera
     yield from itertools.repeat(together, round(_PAUSE * fps))
 
 
-def _side_by_side(pictures: Sequence[np.ndarray], most_columns: int) -> np.ndarray:
-    rows, columns = grid(len(pictures), most_columns)
+def _side_by_side(pictures: Sequence[np.ndarray], rows: int, columns: int) -> np.ndarray:
     blank = np.full_like(pictures[0], 255)
     shown = [*pictures, *[blank] * (rows * columns - len(pictures))]
     return np.concatenate([np.concatenate(shown[row * columns : (row + 1) * columns], 1) for row in range(rows)])

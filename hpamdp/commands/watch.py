@@ -37,11 +37,11 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     parser.description = _DESCRIPTION
     parser.add_argument("player", nargs="*", metavar="AGENT or GROUP=CHOICE", help="who plays, and at what")
     parser.add_argument("--to", type=Path, default=Path("episodes.gif"), help="file to write, .gif or .mp4")
-    parser.add_argument("--episodes", type=whole_number(1, 10_000), default=6, help="how many, side by side (6)")
+    parser.add_argument("--episodes", type=whole_number(1, 10_000), default=6, help="how many (6)")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes; those of evaluations have seed 0")
     parser.add_argument("--fps", type=whole_number(1, film.MOST_FPS), default=25, help="pictures a second (25)")
     parser.add_argument(
-        "--size", type=whole_number(20, 4096), default=320, help="px of an episode, from edge to edge (320)"
+        "--size", type=whole_number(20, 4096), default=320, help="height and width of a square picture, px (320)"
     )
     add_config_dir(parser)
     options = parser.parse_intermixed_args(words)
@@ -67,6 +67,8 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
         film.write(options.to, pictures, float(options.fps))
     except film.NoPictureError as error:
         raise ConfigError(lack) from error
+    except film.TooLargeError as error:
+        raise ConfigError(f"--size {options.size} --episodes {options.episodes}: {error}") from error
     except film.FilmError as error:
         raise ConfigError(f"--to {error}") from error
     except OSError as error:
@@ -81,9 +83,3 @@ def _check_film(options: argparse.Namespace) -> None:
         raise ConfigError(f"--to {options.to}: must end in {' or '.join(film.SUFFIXES)}")
     if options.to.suffix == ".gif" and options.fps > film.GIF_FPS:
         raise ConfigError(f"--fps {options.fps}: a GIF shows at most {film.GIF_FPS} pictures a second; write an .mp4")
-    rows, columns = film.grid(options.episodes)
-    if max(rows, columns) * options.size > film.MOST_PIXELS:
-        raise ConfigError(
-            f"--size {options.size} --episodes {options.episodes}: a picture would have {columns * options.size} x "
-            f"{rows * options.size} px, but at most {film.MOST_PIXELS} px on each side are possible"
-        )

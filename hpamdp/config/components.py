@@ -38,7 +38,7 @@ GROUPS = tuple(SUPPLIED_ARGUMENTS)
 # The group of conf/ whose classes are listed in a value of the run, `callbacks`.
 CALLBACK = "callback"
 TARGET = "_target_"
-# What Hydra reads in a yaml file of a problem that users write: without `low`, H-PPO learns it.
+# Defaults list of a user's problem: H-PPO learns it unless `low` is given.
 USUAL_LEARNER: dict[str, Any] = {"defaults": [{"override /low@_global_.low": "hppo"}]}
 # Values of a group that the run reads itself. The group's class does not get them.
 RUN_VALUES: dict[str, tuple[str, ...]] = {

@@ -122,10 +122,11 @@ class EvalConfig(Settings):
     """Settings of evaluations."""
 
     every: NonNegativeInt | Literal["auto"]
-    """Steps between two evaluations. If 0, only at the start and at the end. Default: the learner's recommendation.
+    """Steps between two evaluations. If 0, only at the start and at the end.
 
-    `auto`: a fifth of `total_frames`, at most 40,000, and none at the start. After the first, an evaluation waits for
-    the next turn while those before have taken more than a twentieth as many steps as training.
+    Default: what the learner or the problem recommends. `auto`: a fifth of `total_frames`, at most 40,000, and none at
+    the start. After the first, evaluations are skipped while they have taken more than 5 % as many steps as training.
+    The last one is never skipped.
     """
     layouts: NumAtOnce
     """Number of episodes of an evaluation. The agent acts greedily, and every evaluation has the same episodes.
@@ -203,14 +204,14 @@ class RunConfig(Settings):
 
     @property
     def eval_every(self) -> int:
-        """Distance between two evaluations, in the unit of `num_frames`; 0 if only at the start and at the end."""
+        """Distance between two turns for an evaluation, in the unit of `num_frames`; 0 if only at start and end."""
         if self.mode == "offline":
             return self.offline.eval_every
         return max(1, min(40_000, self.total_frames // 5)) if self.eval.every == "auto" else self.eval.every
 
     @property
     def limits_evaluations(self) -> bool:
-        """Whether evaluations wait until they take few steps beside those of training."""
+        """Whether evaluations are skipped while they have taken many steps."""
         return self.mode == "train" and self.eval.every == "auto"
 
     def resolve_device(self) -> torch.device:

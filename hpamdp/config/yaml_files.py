@@ -41,12 +41,14 @@ class CompletedFiles(_FileSource):
         return SCHEME
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """Read a yaml file, and add the settings that it does not give."""
+        """Read a yaml file, and add settings that it does not give, and the default learner of a user's problem."""
         result: ConfigResult = super().load_config(config_path)
         if isinstance(result.config, DictConfig):
-            is_own_problem = self.provider != "main" and config_path.startswith("env/")
-            learner = USUAL_LEARNER if is_own_problem else {}
-            result.config = OmegaConf.merge(learner, _defaults(config_path, result.config), result.config)
+            result.config = OmegaConf.merge(_defaults(config_path, result.config), result.config)
+            defaults = [*result.config.get("defaults", [])]
+            extends_none = all(each == "_self_" for each in defaults)
+            if self.provider != "main" and config_path.startswith("env/") and extends_none:
+                result.config["defaults"] = [*defaults, *USUAL_LEARNER["defaults"]]
         return result
 
 

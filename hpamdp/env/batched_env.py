@@ -247,7 +247,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         raise NotImplementedError(f"{type(self).__name__} has no hand-written player")
 
     def draw(self, track: Sequence[EpisodeState]) -> np.ndarray:
-        """Return a picture of an episode so far, uint8 `[480, 480, 3]`, or of another shape: films shrink all alike.
+        """Return a picture of an episode so far, uint8 `[height, width, 3]`; films scale it by their `size` / 480.
 
         Args:
             track: the states of one environment from the start on, columns `[1]`.

@@ -32,7 +32,7 @@ class Canvas:
 
     @classmethod
     def for_shapes(cls, size: int, height: float = PAPER) -> Canvas:
-        """Return an empty canvas for shapes. `smoothed` then returns a canvas `size` px wide for the labels."""
+        """Return an empty canvas for shapes. `smoothed` then returns one `size` px wide; `height` is in paper."""
         return cls(Image.new("RGB", (size * SMOOTH, round(size * SMOOTH * height / PAPER)), BACKGROUND))
 
     def smoothed(self) -> Canvas:

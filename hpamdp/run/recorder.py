@@ -53,7 +53,7 @@ class Recorder:
         metrics: the rows so far.
         summary: see `summarise`; empty before `finish`.
         training_return: mean return of the exploring episodes in the last batch in which some ended; None before.
-        eval_cpu_s, eval_steps: CPU time and environment steps of the evaluations so far, with those of random play.
+        eval_cpu_s, eval_steps: CPU time and environment steps of the evaluations so far, random play included.
         measured: means of the last evaluation, also if it was before a resumption; empty before the first one.
         evaluated_frames: frames of training before it; None before the first one.
     """

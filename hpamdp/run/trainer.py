@@ -30,6 +30,7 @@ from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
 from hpamdp.run.summary import KEPT_FRAMES, KEPT_SCORE
 from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME
 
+_MOST_EVALUATION = 0.05  # steps of evaluations for each step of training, with `eval.every=auto`
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
 
 
@@ -314,7 +315,7 @@ class Trainer:
                 self._show(bar)
                 self._call(lambda callback: callback.on_batch(self))
                 is_turn = _is_due(last, self.frames, run.eval_every)
-                is_affordable = not run.limits_evaluations or self.recorder.eval_steps <= 0.05 * self.frames
+                is_affordable = not run.limits_evaluations or self.recorder.eval_steps <= _MOST_EVALUATION * self.frames
                 if self.is_over() or (is_turn and is_affordable):
                     self._evaluate(bar, request)
                 elif _is_due(last, self.frames, run.log_every):

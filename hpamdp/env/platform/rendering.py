@@ -13,7 +13,8 @@ from hpamdp.env.platform.rules import PlatformState
 _GROUND, _AGENT, _ENEMY, _PATH = "#8a9a7b", "#2f6690", "#b9503a", "#86aecb"
 _SCALE = (PAPER - 40.0) / (rules.END + rules.BODY_WIDTH)  # units of paper for each px
 _LEFT, _TOP = 20.0, 60.0  # where the course begins, and the height of the platforms' tops
-_DEPTH, _HEIGHT = 10.0, 80.0  # of the platforms, and of the picture
+_DEPTH = 10.0  # of the platforms
+_HEIGHT = 80.0  # of the picture, units of paper
 
 
 def draw(track: Sequence[PlatformState]) -> np.ndarray:

@@ -44,7 +44,7 @@ class SimulationProcess:
         self._connection, other = Pipe()
         # The folder is the working directory, so that Python imports nothing from the user's.
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
-        with children_without(*STOP_SIGNALS):  # they are for the run alone
+        with children_without(*STOP_SIGNALS):  # these signals are for the run alone
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _PROGRAM, str(other.fileno())],
                 env=environment,

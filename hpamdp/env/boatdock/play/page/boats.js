@@ -2,7 +2,7 @@
 // People's task: two boats whose arrows are shown, beside agents and the best plans.
 
 playGame((game, tools) => {
-  const { data, mean, share, signed, percent, escape, swatch, colourOf, COLOURS } = tools;
+  const { data, mean, share, withMinus, percent, escape, swatch, colourOf, COLOURS } = tools;
   const { rules } = data;
   const crew = makeAgents(data, tools.physics);
   const MODES = { practice: "Practice", round: "Rounds", free: "Free play" };
@@ -60,11 +60,11 @@ playGame((game, tools) => {
   function describe(result) {
     const chosen = game.layout.people;
     return [
-      `<p>${swatch(COLOURS.you, "solid")}You, ${result.controller}: <b>${signed(result.score)}</b>, ` +
+      `<p>${swatch(COLOURS.you, "solid")}You, ${result.controller}: <b>${withMinus(result.score)}</b>, ` +
         `${percent(result.fuel)} fuel left</p>`,
-      `<p>${swatch(COLOURS.plan, "dashed")}Best plan, ${result.better}: ${signed(result.best)}</p>`,
+      `<p>${swatch(COLOURS.plan, "dashed")}Best plan, ${result.better}: ${withMinus(result.best)}</p>`,
       ...result.agents.map((sailed, i) =>
-        `<p>${swatch(colourOf(i), "solid")}${escape(titles[i])}${choiceOf(i, sailed)}: ${signed(sailed.score)}</p>`),
+        `<p>${swatch(colourOf(i), "solid")}${escape(titles[i])}${choiceOf(i, sailed)}: ${withMinus(sailed.score)}</p>`),
       `<p>People at this bearing: ${percent(chosen)} chose the congruent boat, ${percent(1 - chosen)} the incongruent one.</p>`,
     ].join("");
   }
@@ -82,7 +82,7 @@ playGame((game, tools) => {
   function endText(isStopped) {
     const results = played();
     let text = `${MODES[game.mode]}: ${results.length} episodes${isStopped || isDone() ? "" : " so far"}, ` +
-      `mean score ${signed(mean(results.map((r) => r.score)))}, ${percent(share(results))} docked.`;
+      `mean score ${withMinus(mean(results.map((r) => r.score)))}, ${percent(share(results))} docked.`;
     if (game.mode === "round") {
       const blocks = data.people.success_by_block.map((people, i) => {
         const own = results.slice(i * rules.block, (i + 1) * rules.block);
@@ -95,13 +95,13 @@ playGame((game, tools) => {
 
   function table(results) {
     const has = results.length > 0;
-    const meansOf = (own) => (has ? [signed(mean(own.map((r) => r.score))), percent(share(own))] : ["", ""]);
+    const meansOf = (own) => (has ? [withMinus(mean(own.map((r) => r.score))), percent(share(own))] : ["", ""]);
     return tools.tableOf("Means; agents and ceiling on your layouts", ["", "score", "docked"], [
       ["you", `You, ${results.length} ${results.length === 1 ? "episode" : "episodes"}`, ...meansOf(results)],
-      ["", "People, mean", signed(data.people.mean), percent(data.people.success)],
-      ["", "Best of 40 people", signed(data.people.best), percent(data.people.best_success)],
+      ["", "People, mean", withMinus(data.people.mean), percent(data.people.success)],
+      ["", "Best of 40 people", withMinus(data.people.best), percent(data.people.best_success)],
       ...titles.map((title, i) => ["", escape(title), ...meansOf(results.map((r) => r.agents[i]))]),
-      ["", "Ceiling", has ? signed(mean(results.map((r) => r.best))) : "", has ? "100 %" : ""],
+      ["", "Ceiling", has ? withMinus(mean(results.map((r) => r.best))) : "", has ? "100 %" : ""],
     ]);
   }
 

@@ -346,7 +346,7 @@ function playGame(makeTask) {
   const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
   const share = (results) => mean(results.map((r) => (r.outcome === "success" ? 1 : 0)));
   const cssPercent = (value) => `${100 * value}%`;
-  const signed = (value, digits = 2) => value.toFixed(digits).replace("-", "\u2212");
+  const withMinus = (value, digits = 2) => value.toFixed(digits).replace("-", "\u2212");
   const percent = (value) => `${(100 * value).toFixed(0)} %`;
   const colourOf = (i) => COLOURS.agents[i];
   const swatch = (colour, dashes) => `<span class="swatch" style="border-color:${colour};border-top-style:${dashes}"></span>`;
@@ -496,7 +496,7 @@ function playGame(makeTask) {
     for (let score = -1; score <= 5; score++) {
       line(pen, [left, Y(score)], [width - right, Y(score)], "#e8e4d8", 1, []);
       pen.fillStyle = "#7d8b92";
-      pen.fillText(signed(score, 0), left - 8, Y(score) + 4);
+      pen.fillText(withMinus(score, 0), left - 8, Y(score) + 4);
     }
     pen.textAlign = "left";
     pen.fillText(axis, left, height - 10);
@@ -505,14 +505,14 @@ function playGame(makeTask) {
     const labels = [];
     for (const { value, colour, text, dashes } of levels) {
       line(pen, [left, Y(value)], [width - right, Y(value)], colour, 1.3, dashes);
-      labels.push([Y(value), colour, `${text} ${signed(value)}`]);
+      labels.push([Y(value), colour, `${text} ${withMinus(value)}`]);
     }
     for (const [n, score] of dots) disc(pen, [X(n), Y(score)], 2.5, "#9fb3c0");
     for (const { values, colour, text, thickness } of curves) {
       values.slice(1).forEach(([n, score], i) =>
         line(pen, [X(values[i][0]), Y(values[i][1])], [X(n), Y(score)], colour, thickness, []));
       const [, last] = values[values.length - 1];
-      labels.push([Y(last), colour, `${text} ${signed(last)}`]);
+      labels.push([Y(last), colour, `${text} ${withMinus(last)}`]);
     }
     labels.sort((a, b) => a[0] - b[0]);
     let lowest = 0;
@@ -543,7 +543,7 @@ function playGame(makeTask) {
   game.player = Array.from(bytes, (byte) => byte.toString(16).padStart(2, "0")).join("");
   game.resolution = clockStep();
   const hasAgreed = () => $("#consent").checked;
-  const task = makeTask(game, { data, physics, sailed, hasAgreed, mean, share, signed, percent, escape, swatch, colourOf,
+  const task = makeTask(game, { data, physics, sailed, hasAgreed, mean, share, withMinus, percent, escape, swatch, colourOf,
     tableOf, picture, compass, COLOURS });
   $("#consent-text").textContent = `Record my ${task.noun}s: the times and keys of my presses, the layout, the boat and the ` +
     "outcome. They carry a random number, which changes each time the page is loaded. " +

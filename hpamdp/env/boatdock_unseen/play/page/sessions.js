@@ -2,7 +2,7 @@
 // Sessions of trips with a boat that the player does not know. What the keys do is shown when the session is over.
 
 playGame((game, tools) => {
-  const { data, mean, share, signed, percent, swatch, COLOURS } = tools;
+  const { data, mean, share, withMinus, percent, swatch, COLOURS } = tools;
   const rules = data.session_rules;
   const NAMES = ["first", "second"];
   const FAMILIES = {
@@ -37,7 +37,7 @@ playGame((game, tools) => {
   function status() {
     if (game.screen === "end") return "";
     const trip = trips.length + (game.screen === "result" ? 0 : 1);
-    const last = trips.length ? `; last score ${signed(trips.at(-1).score)}` : "";
+    const last = trips.length ? `; last score ${withMinus(trips.at(-1).score)}` : "";
     return `Session ${begun}, trip ${trip} of ${rules.trips}${last}`;
   }
 
@@ -63,11 +63,11 @@ playGame((game, tools) => {
   }
 
   function describe(result) {
-    const own = `<p>${swatch(COLOURS.you, "solid")}You: <b>${signed(result.score)}</b>, ${percent(result.fuel)} fuel left</p>`;
+    const own = `<p>${swatch(COLOURS.you, "solid")}You: <b>${withMinus(result.score)}</b>, ${percent(result.fuel)} fuel left</p>`;
     if (!isOver()) return own;
     const best = mean(game.session.trips.map((trip) => trip.best));
-    return `${own}<h3>The session is over</h3><p>Your mean score: <b>${signed(mean(trips.map((trip) => trip.score)))}</b>. ` +
-      `The best plans, which know the boat: ${signed(best)}.</p>${game.session.boats.map(revealed).join("")}`;
+    return `${own}<h3>The session is over</h3><p>Your mean score: <b>${withMinus(mean(trips.map((trip) => trip.score)))}</b>. ` +
+      `The best plans, which know the boat: ${withMinus(best)}.</p>${game.session.boats.map(revealed).join("")}`;
   }
 
   function revealed(boat, i) {
@@ -83,8 +83,8 @@ playGame((game, tools) => {
   }
 
   const table = (results) => tools.tableOf("Mean score by number of the trip", ["trip", "you", "trips", "best plans*"],
-    byTrip(results).map(([trip, own]) => ["", trip, signed(mean(own.map((r) => r.score))), own.length,
-      signed(mean(own.map((r) => r.best)))])) + (results.length ? "<tfoot><tr><td colspan=4>* know the boat</td></tr></tfoot>" : "");
+    byTrip(results).map(([trip, own]) => ["", trip, withMinus(mean(own.map((r) => r.score))), own.length,
+      withMinus(mean(own.map((r) => r.best)))])) + (results.length ? "<tfoot><tr><td colspan=4>* know the boat</td></tr></tfoot>" : "");
 
   function curve(results) {
     const means = (of) => byTrip(results).map(([trip, own]) => [trip, mean(own.map((r) => r[of]))]);
@@ -100,7 +100,7 @@ playGame((game, tools) => {
   function endText() {
     const { session } = game.results;
     return `${session.length} ${session.length === 1 ? "trip" : "trips"}, ` +
-      `mean score ${signed(mean(session.map((r) => r.score)))}, ${percent(share(session))} docked.`;
+      `mean score ${withMinus(mean(session.map((r) => r.score)))}, ${percent(share(session))} docked.`;
   }
 
   const boats = rules.boats === 1 ? "a boat that you do not know" : "two boats that you do not know; you choose one for each trip";
