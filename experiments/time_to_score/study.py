@@ -28,6 +28,9 @@ PEOPLE, BOAT_GOAL, WHOLE_GOAL = 1.97, 3.3, 3.5
 PLAYERS: dict[str, tuple[dict[str, Any], tuple[float, ...], int]] = {
     "one boat, hppo": ({**BOAT, "low": "hppo", "eval.every": 40_000}, (PEOPLE, BOAT_GOAL), 4_000_000),
     "one boat, hsac": ({**BOAT, "low": "hsac", "eval.every": 4_000}, (PEOPLE, BOAT_GOAL), 200_000),
+    "one boat, pdqn": ({**BOAT, "low": "pdqn", "eval.every": 10_000}, (PEOPLE, BOAT_GOAL), 200_000),
+    "one boat, hyar": ({**BOAT, "low": "hyar", "eval.every": 10_000}, (PEOPLE, BOAT_GOAL), 120_000),
+    "one boat, dlpa": ({**BOAT, "low": "dlpa", "eval.every": 128}, (PEOPLE, BOAT_GOAL), 2_048),
     "one boat, pets": ({**BOAT, "low": "pets", "eval.every": 32}, (PEOPLE, BOAT_GOAL), 1_024),
     "whole task, meta_critic hppo": (
         {"env": "boatdock", "high": "meta_critic", "low": "hppo", "eval.every": 40_000}, (PEOPLE, WHOLE_GOAL), 4_000_000
@@ -36,8 +39,14 @@ PLAYERS: dict[str, tuple[dict[str, Any], tuple[float, ...], int]] = {
         {"env": "boatdock", "high": "value", "low": "pets", "eval.every": 32}, (PEOPLE, WHOLE_GOAL), 1_024
     ),
     "platform, hppo": ({"env": "platform", "low": "hppo", "eval.every": 4_000}, (0.997,), 400_000),
+    "platform, pdqn": ({"env": "platform", "low": "pdqn", "eval.every": 4_000}, (0.997,), 80_000),
+    "platform, hyar": ({"env": "platform", "low": "hyar", "eval.every": 4_000}, (0.997,), 80_000),
     "goal, pdqn": ({"env": "goal", "low": "pdqn", "eval.every": 10_000}, (0.809,), 400_000),
     "catch_point, pets": ({"env": "catch_point", "low": "pets", "eval.every": 250}, (0.938,), 4_000),
+    "catch_point, pdqn": ({"env": "catch_point", "low": "pdqn", "eval.every": 10_000}, (0.938,), 200_000),
+    "catch_point, hppo": ({"env": "catch_point", "low": "hppo", "eval.every": 40_000}, (0.938,), 1_000_000),
+    "hard_move, pets": ({"env": "hard_move", "low": "pets", "eval.every": 250}, (0.942,), 4_000),
+    "hard_move, pdqn": ({"env": "hard_move", "low": "pdqn", "eval.every": 10_000}, (0.942,), 100_000),
     "hard_move, hppo": ({"env": "hard_move", "low": "hppo", "eval.every": 20_000}, (0.942,), 1_000_000),
 }  # fmt: skip
 
@@ -97,10 +106,9 @@ def table(rows: Rows) -> str:
         median = float(np.median(seconds))
         spread = f"{min(reached):.0f} to {max(reached):.0f} s" if reached else ""
         shown = f"{median:.0f} s" if np.isfinite(median) else "never"
-        steps, start = (np.median([run[name] for run in runs]) for name in ("steps", "start_s"))
-        count = f"{len(reached)} of {len(runs)}"
-        lines.append([player, f"{goal:g}", count, shown, spread, f"{steps:,.0f}", f"{start:.1f} s"])
-    return markdown_table("player | score | reached | CPU, median | of those | steps, median | of it start", lines)
+        steps = np.median([run["steps"] for run in runs])
+        lines.append([player, f"{goal:g}", f"{len(reached)} of {len(runs)}", shown, spread, f"{steps:,.0f}"])
+    return markdown_table("player | score | reached | CPU, median | of those | steps, median", lines)
 
 
 def main(words: Sequence[str]) -> int:
