@@ -1,6 +1,7 @@
 """A resumed run is the run that was never stopped, to the last bit."""
 
 import itertools
+import json
 import shutil
 import signal
 from pathlib import Path
@@ -14,6 +15,7 @@ from tqdm import tqdm
 import hpamdp
 from hpamdp.children import STOP_SIGNALS
 from hpamdp.run import checkpoint
+from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=320", "eval.layouts=2", "eval.every=0", "log_every=64"]
@@ -95,6 +97,26 @@ def words_of(high: str, low: str) -> list[str]:
 @pytest.mark.parametrize(("high", "low"), [("meta_critic", "random"), ("ucb", "hppo")])
 def test_a_resumed_run_is_the_run_that_was_never_stopped(high, low, tmp_path):
     stop_and_resume([*words_of(high, low), EVALUATED], tmp_path, signal.SIGINT)
+
+
+def test_a_run_cut_in_its_first_evaluation_makes_those_of_the_whole_run(tmp_path, monkeypatch, capsys):
+    given = ["env=platform", "high=none", "low=random", *SMALL, "eval.every=auto", "total_frames=1280", "log_every=0"]
+    assert run(compose_config(given), tmp_path / "whole", given) == 0
+
+    def cut(*_):
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Evaluation, "run_agent", cut)  # after random play
+    interrupt(given, tmp_path / "cut")
+    words = [f"resume={tmp_path / 'cut'}"]
+    assert run(compose_config(words), tmp_path / "resumed", words) == 0
+    assert "damaged" not in capsys.readouterr().err  # the cut run has no rows
+    assert rows_without_times(tmp_path / "resumed") == rows_without_times(tmp_path / "whole")
+    words = [f"resume={tmp_path / 'resumed'}", "eval.seed=9", "total_frames=1312"]
+    assert run(compose_config(words), tmp_path / "other", words) == 0
+    random = [json.loads((tmp_path / name / "summary.json").read_text())["references"] for name in ("resumed", "other")]
+    assert random[0] != random[1]
 
 
 def test_a_run_of_the_selector_alone_resumes_to_the_last_bit(tmp_path):

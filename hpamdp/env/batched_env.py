@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps
+from PIL import Image
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
@@ -136,6 +136,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     limit_terminates = False  # whether the time limit terminates an episode instead of truncating it
     float_type = torch.float32  # of observations and rewards
     seconds_per_step: ClassVar[float] = 0.25  # in films
+    film_shape: ClassVar[tuple[float, float]] = (1.0, 1.0)  # width and height of films, in units of their size
 
     def __init__(
         self,
@@ -247,7 +248,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         raise NotImplementedError(f"{type(self).__name__} has no hand-written player")
 
     def draw(self, track: Sequence[EpisodeState]) -> np.ndarray:
-        """Return a picture of an episode so far, uint8 `[height, width, 3]`; films scale it by their `size` / 480.
+        """Return a picture of an episode so far, uint8 `[height, width, 3]`.
 
         Args:
             track: the states of one environment from the start on, columns `[1]`.
@@ -260,8 +261,9 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             return
         states = [type(self._state)(**columns) for columns in track]
         for i in range(1, len(states) + 1):
-            picture = ImageOps.scale(Image.fromarray(self.draw(states[:i])), size / 480, Image.Resampling.LANCZOS)
-            yield from itertools.repeat(np.array(picture), max(1, round(fps * self.seconds_per_step)))
+            shape = [round(size * edge) for edge in self.film_shape]
+            picture = np.array(Image.fromarray(self.draw(states[:i])).resize(shape, Image.Resampling.LANCZOS))
+            yield from itertools.repeat(picture, max(1, round(fps * self.seconds_per_step)))
 
     @property
     def position(self) -> Tensor | None:

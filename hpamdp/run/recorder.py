@@ -53,7 +53,8 @@ class Recorder:
         metrics: the rows so far.
         summary: see `summarise`; empty before `finish`.
         training_return: mean return of the exploring episodes in the last batch in which some ended; None before.
-        eval_cpu_s, eval_steps: CPU time and environment steps of the evaluations so far, random play included.
+        eval_cpu_s: CPU time of the evaluations so far, random play included.
+        eval_steps: environment steps of the agent's evaluations so far.
         measured: means of the last evaluation, also if it was before a resumption; empty before the first one.
         evaluated_frames: frames of training before it; None before the first one.
     """
@@ -80,11 +81,11 @@ class Recorder:
         self._option_scores: dict[str, float] = {}  # scores with each option held, at the last evaluation
         self._random_scores: dict[str, float] = {}  # empty before the first evaluation
 
-    def resume_from(self, folder: Path, frames: int) -> None:
-        """Start the metrics with the rows of the run in `folder`, up to `frames`; warn if it has no such row."""
+    def resume_from(self, folder: Path, frames: int, *, has_rows: bool) -> None:
+        """Start the metrics with the rows of the run in `folder`, up to `frames`; warn if it has lost those it had."""
         source = folder / METRICS_NAME
         rows = rows_up_to(frames, source)
-        if not rows and frames > 0:
+        if not rows and has_rows:
             warn(f"{source}: is missing or damaged; the run goes on without the rows up to {FRAMES}={frames}")
         self.metrics = Metrics(self.metrics.path, rows)
         for row in rows:
@@ -117,16 +118,23 @@ class Recorder:
             "own": dict(self._callback_metrics),
             "actions": [] if self._action_counts is None else self._action_counts.tolist(),
             "random": dict(self._random_scores),
+            "episodes": self._episodes(),
+            "has_rows": bool(self.metrics.rows()),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`. Checkpoints of 0.3 lack its last three entries."""
+        """Continue from a `state`. Checkpoints of 0.3 lack its last five entries."""
         self._ended = [TensorDict(ended).auto_batch_size_(1) for ended in state["ended"]]
         self._scalars, self._option_scores = state["scalars"], state["held"]
         self._callback_metrics = state.get("own", {})
-        self._random_scores = state.get("random", {})
+        if state.get("episodes") == self._episodes():
+            self._random_scores = state["random"]
         if state.get("actions"):
             self._action_counts = torch.tensor(state["actions"], device=self.parts.device)
+
+    def _episodes(self) -> list[int]:
+        """Return what tells the episodes of evaluations: their number and their seed."""
+        return [self.config.run.eval.layouts, self.config.run.eval.seed]
 
     def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
         """Note a collected batch `[N, T]`, if there is one, and the scalars that the agent returned from learning."""
@@ -300,11 +308,11 @@ class Recorder:
         """Evaluate the agent unless it is as it was at the last evaluation, and return `Evaluation.run_agent`."""
         if self._played is None or not self._is_current:
             cpu_before, evaluation = time.process_time(), self.parts.evaluation
-            steps_before = evaluation.steps
             if not self._random_scores:
                 specs, lengths = self.parts.agent.specs, self.parts.agent.option_lengths
                 random = random_agent(specs, self.parts.device, lengths)
                 self._random_scores = evaluation.measure(evaluation.run(random.policy))
+            steps_before = evaluation.steps
             self._played = evaluation.run_agent(self.parts.agent)
             self.eval_cpu_s += time.process_time() - cpu_before
             self.eval_steps += evaluation.steps - steps_before

@@ -113,9 +113,10 @@ class Trainer:
         self.resumed_from = source.parent
         # An evaluation that is due writes the row of these frames again.
         frames = self.frames - 1 if self.is_evaluation_due else self.frames
-        self.recorder.resume_from(source.parent, frames)
+        recorded = saved.states["recorder"]
+        self.recorder.resume_from(source.parent, frames, has_rows=frames > 0 and recorded.get("has_rows", True))
         try:
-            self.recorder.set_state(saved.states["recorder"])
+            self.recorder.set_state(recorded)
             self._restore_callbacks(saved.states["callbacks"])
         except (KeyError, TypeError, ValueError) as error:
             raise ConfigError(f"{source}: does not fit this run ({first_line(error)})") from error

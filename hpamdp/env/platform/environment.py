@@ -44,6 +44,7 @@ class PlatformEnv(KernelEnv[PlatformState]):
     row_kernel = staticmethod(rules.advance)
     state_type = PlatformState
     num_columns = (4, 3)
+    film_shape = (3.0, 0.5)
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the factor on the noise."""
