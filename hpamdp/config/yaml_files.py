@@ -43,12 +43,13 @@ class CompletedFiles(_FileSource):
     def load_config(self, config_path: str) -> ConfigResult:
         """Read a yaml file, and add settings that it does not give, and the default learner of a user's problem."""
         result: ConfigResult = super().load_config(config_path)
-        if isinstance(result.config, DictConfig):
-            result.config = OmegaConf.merge(_defaults(config_path, result.config), result.config)
-            defaults = [*result.config.get("defaults", [])]
+        given = result.config
+        if isinstance(given, DictConfig):
+            defaults = [*(given.get("defaults") or [])]
             extends_none = all(each == "_self_" for each in defaults)
-            if self.provider != "main" and config_path.startswith("env/") and extends_none:
-                result.config["defaults"] = [*defaults, *USUAL_LEARNER["defaults"]]
+            is_own_problem = self.provider != "main" and config_path.startswith("env/")
+            learner = {"defaults": [*defaults, *USUAL_LEARNER["defaults"]]} if is_own_problem and extends_none else {}
+            result.config = OmegaConf.merge(_defaults(config_path, given), given, learner)
         return result
 
 
