@@ -30,7 +30,7 @@ PLAYERS: dict[str, tuple[dict[str, Any], tuple[float, ...], int]] = {
     "one boat, hsac": ({**BOAT, "low": "hsac", "eval.every": 4_000}, (PEOPLE, BOAT_GOAL), 200_000),
     "one boat, pdqn": ({**BOAT, "low": "pdqn", "eval.every": 10_000}, (PEOPLE, BOAT_GOAL), 200_000),
     "one boat, hyar": ({**BOAT, "low": "hyar", "eval.every": 10_000}, (PEOPLE, BOAT_GOAL), 120_000),
-    "one boat, dlpa": ({**BOAT, "low": "dlpa", "eval.every": 128}, (PEOPLE, BOAT_GOAL), 2_048),
+    "one boat, dlpa": ({**BOAT, "low": "dlpa", "eval.every": 1_000}, (PEOPLE, BOAT_GOAL), 20_000),
     "one boat, pets": ({**BOAT, "low": "pets", "eval.every": 32}, (PEOPLE, BOAT_GOAL), 1_024),
     "whole task, meta_critic hppo": (
         {"env": "boatdock", "high": "meta_critic", "low": "hppo", "eval.every": 40_000}, (PEOPLE, WHOLE_GOAL), 4_000_000
