@@ -128,7 +128,7 @@ class Recorder:
         self._scalars, self._option_scores = state["scalars"], state["held"]
         self._callback_metrics = state.get("own", {})
         if state.get("episodes") == self._episodes():
-            self._random_scores = state["random"]
+            self._random_scores = {name: float(value) for name, value in state["random"].items()}
         if state.get("actions"):
             self._action_counts = torch.tensor(state["actions"], device=self.parts.device)
 
