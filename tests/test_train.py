@@ -4,6 +4,8 @@ import itertools
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from unittest import mock
 
@@ -13,6 +15,7 @@ import torch
 from conftest import compose_config, make_config, rows_of, signal_after
 from PIL import Image
 
+import hpamdp
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.environment import BoatDockEnv
@@ -47,6 +50,21 @@ def test_a_run_leaves_numbers_pictures_and_a_closing_table(tmp_path, capsys, wit
     assert summary["human_normalised"] == human_normalised(summary["score"])
     printed = capsys.readouterr().out
     assert "score" in printed and "ceiling" in printed and str(tmp_path) in printed
+
+
+class Compiles(hpamdp.Callback):
+    """Stands for an update that another process compiles."""
+
+    def on_start(self, trainer):
+        with trainer.parts.agent.learners[0].while_compiling():
+            subprocess.run([sys.executable, "-c", "sum(range(20_000_000))"], check=True)
+
+
+def test_the_cpu_time_of_a_run_counts_the_compilers(tmp_path):
+    short = {"high": None, "num_envs": 4, "steps_per_batch": 4, "total_frames": 16, "eval.layouts": 2, "film": False}
+    hpamdp.train("platform", low="random", folder=tmp_path, callbacks=[Compiles()], **short)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["cpu_s"] >= summary["compile_cpu_s"] > 0.2
 
 
 def test_a_run_leaves_a_film_of_three_episodes(tmp_path):

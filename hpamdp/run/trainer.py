@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tqdm import tqdm
@@ -52,7 +54,7 @@ class Trainer:
     Attributes:
         frames: frames so far.
         wall_s, cpu_s: wall time and CPU time of training so far, evaluations and compiling included.
-        compile_cpu_s: CPU time of compiling updates in this process.
+        compile_cpu_s: CPU time of compiling updates since this process began, compilers that it started included.
         last_score: score of the last evaluation; None before the first one.
         stopped_by: class of the callback that has ended training; None if none has.
         stop_reason: why a callback has ended training; empty if none has, or if it gave no reason.
@@ -85,6 +87,7 @@ class Trainer:
         self.wall_s = 0.0
         self.cpu_s = 0.0
         self.compile_cpu_s = 0.0
+        self._compilers_cpu_s = 0.0  # of it, the time of other processes
         self.last_score: float | None = None
         self.is_evaluation_due = False
         self._kept: dict[str, Any] = {}  # progress of the best agent, if the run ended with it
@@ -286,7 +289,7 @@ class Trainer:
 
         def take_time() -> None:
             self.wall_s = wall_before + time.perf_counter()
-            self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
+            self.cpu_s = cpu_before + time.process_time() + self._compilers_cpu_s + collection.cpu_s
 
         bar = tqdm(
             total=run.num_frames,
@@ -376,11 +379,13 @@ class Trainer:
     def _compiling(self, bar: tqdm) -> Iterator[None]:
         """Say before the bar that updates are compiled, and take the time, while the block runs."""
         bar.set_description_str("compiling the updates")
-        cpu_before = time.process_time()
+        before = os.times()
         try:
             yield
         finally:
-            self.compile_cpu_s += time.process_time() - cpu_before
+            own, own_system, compilers, compilers_system, _ = np.subtract(os.times(), before).tolist()
+            self._compilers_cpu_s += compilers + compilers_system
+            self.compile_cpu_s += own + own_system + compilers + compilers_system
             bar.set_description_str(None)
 
     def _evaluate(self, bar: tqdm, request: StopRequest) -> None:
