@@ -52,7 +52,7 @@ def run(folder: Path) -> Rows:
     """Train the candidates that are missing, judge them with each fold; return a row for each candidate and fold."""
     for name, words in CANDIDATES.items():
         if not (folder / name / "summary.json").exists():
-            settings = f"seed={SEED} eval.seed={SEED} film=false hydra.run.dir={folder / name}"
+            settings = f"seed={SEED} eval.seed={SEED} eval.layouts=1000 film=false hydra.run.dir={folder / name}"
             subprocess.run([sys.executable, "run.py", *words.split(), *settings.split()], check=True)
     agents = {name: str(folder / name) for name in CANDIDATES} | {"hppo-linucb": "linucb_hppo"}
     scores = {name: json.loads((folder / name / "summary.json").read_text())["score"] for name in CANDIDATES}

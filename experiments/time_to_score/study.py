@@ -100,6 +100,7 @@ def train(player: str, seed: int) -> Rows:
 def table(rows: Rows) -> str:
     """Return the medians over seeds."""
     lines = []
+    rows = sorted(rows, key=lambda row: [*PLAYERS].index(row["player"]))
     for (player, goal), runs in groups(rows, "player", "goal").items():
         seconds = [float("inf") if run["cpu_s"] == "" else run["cpu_s"] for run in runs]
         reached = [second for second in seconds if np.isfinite(second)]

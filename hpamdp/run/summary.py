@@ -154,7 +154,7 @@ def _shares(summary: Mapping[str, Any]) -> str:
     total = summary.get("cpu_s") or 0.0
     if total < 1.0:
         return ""
-    played = f"evaluations of {summary.get('eval_steps', 0):,.0f} steps"
+    played = f"evaluations of {summary.get('eval_steps', 0):,.0f} steps and random play"
     named = {played: summary.get("eval_cpu_s", 0.0), "compiling": summary.get("compile_cpu_s", 0.0)}
     shares = [f"{name} {seconds / total:.0%}" for name, seconds in named.items() if seconds >= 0.005 * total]
     return f" ({total:.0f} CPU s" + (f": {', '.join(shares)})" if shares else ")")

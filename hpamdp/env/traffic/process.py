@@ -53,7 +53,7 @@ class SimulationProcess:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 pass_fds=[other.fileno()],
-                start_new_session=True,  # nor are others to all processes of a terminal
+                start_new_session=True,  # nor do others of a terminal reach it
             )
         other.close()
         try:
