@@ -355,7 +355,8 @@ def test_a_run_saves_before_it_waits_for_a_replacement_and_a_signal_ends_the_wai
         return workers[-1]
 
     def kill_and_stop():
-        wait_until(lambda: (tmp_path / "run/metrics.csv").is_file(), seconds=60)
+        metrics = tmp_path / "run/metrics.csv"  # the third line is that of the first batches
+        wait_until(lambda: metrics.is_file() and len(metrics.read_text().splitlines()) > 2, seconds=60)
         workers[0].deaths.append("collect")
         wait_until(file.is_file, seconds=30)
         time.sleep(0.5)
