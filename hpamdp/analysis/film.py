@@ -22,7 +22,6 @@ GIF_FPS = 50  # largest number of pictures per second of a GIF
 COLUMNS = 3
 MOST_FPS = 240
 MOST_PIXELS = 8192  # from edge to edge of a film
-_SAMPLE = 60  # size at which a first picture shows how wide and high the others are
 _PAUSE = 1.5  # seconds for which the last picture stays
 _GIF_COLOURS = 128
 
@@ -55,10 +54,9 @@ def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> Itera
     Raises:
         TooLargeError: a picture would have more than `MOST_PIXELS` on a side.
     """
-    sample = next(iter(env.film(tracks[0], fps, _SAMPLE)), None) if tracks else None
-    if sample is None:
+    if not tracks:
         return
-    height, width = (edge * size // _SAMPLE for edge in sample.shape[:2])
+    width, height = (round(edge * size) for edge in env.film_shape)
     columns = min(max(1, COLUMNS * size // width), len(tracks))
     rows = -(-len(tracks) // columns)
     if max(rows * height, columns * width) > MOST_PIXELS:

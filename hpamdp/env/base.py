@@ -106,6 +106,8 @@ class PAMDPEnv(EnvBase):
 
     # What the class declares; see `ProblemCard`.
     card: ClassVar[ProblemCard] = ProblemCard()
+    # Width and height of the pictures of `film`, in units of its `size`.
+    film_shape: ClassVar[tuple[float, float]] = (1.0, 1.0)
 
     # Rows of the closing table, and panels of the learning curves.
     table_metrics: ClassVar[tuple[Metric, ...]] = (
@@ -377,6 +379,8 @@ class PAMDPEnv(EnvBase):
 
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterable[np.ndarray]:
         """Return the pictures of one episode, uint8 `[height, width, 3]` each; none if the problem has no pictures.
+
+        Height and width are those of `film_shape`.
 
         Args:
             track: its `film_state` at the start and after every step, columns `[1, ...]`.

@@ -136,7 +136,6 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     limit_terminates = False  # whether the time limit terminates an episode instead of truncating it
     float_type = torch.float32  # of observations and rewards
     seconds_per_step: ClassVar[float] = 0.25  # in films
-    film_shape: ClassVar[tuple[float, float]] = (1.0, 1.0)  # width and height of films, in units of their size
 
     def __init__(
         self,
